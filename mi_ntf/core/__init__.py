@@ -1,0 +1,1 @@
+"""Formulas and the file format. NumPy only; the oracle for ``infer`` and ``train``."""

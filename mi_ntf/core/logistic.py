@@ -1,0 +1,68 @@
+"""Transmittance of a ray as one logistic (method.md, section 4; Shafiei et al. 2021, eq. 7).
+
+    τ(t) = S(a (t − b)),      S(z) = 1/(1 + e^−z)
+
+τ is the transmittance from the point at t to the light-side end of the chord: 1 near the light, falling away from it.
+`a` > 0 is the slope in inverse field units (a quarter of it is the largest dτ/dt), `b` the place where half of the light
+is gone. All forms have finite values and gradients in float32 for every finite input.
+"""
+
+MAX_LOG_SLOPE = 6.5
+"""ln of the largest slope, a ≤ 665: a step of width 0.007 of the unit sphere's radius. Learned skins are no sharper, and
+above it float32 products a·(t − b) lose the fourth digit of τ."""
+MAX_CENTRE = 1.2
+"""|b| stays below this many half chords. Beyond 1, so that an empty central chord can reach τ = 1 at its far end."""
+_CLIP = 80.0  # e^80 is finite in float32; S differs from 0 or 1 by less than any float32 can tell.
+
+
+def sigmoid(ops, z):
+    """S(z), clipped where float32 exponentials would overflow."""
+    z = ops.minimum(ops.maximum(z, -_CLIP), _CLIP)
+    return 1 / (1 + ops.exp(-z))
+
+
+def softplus(ops, z):
+    """ln(1 + e^z) without overflow: max(z, 0) + ln(1 + e^−|z|)."""
+    return ops.maximum(z, 0.0) + ops.log(1 + ops.exp(-ops.abs(z)))
+
+
+def transmittance(ops, t, a, b):
+    """τ(t) = S(a (t − b)), in [0, 1], monotone in t."""
+    return sigmoid(ops, a * (t - b))
+
+
+def optical_depth(ops, t, a, b):
+    """−ln τ(t) = softplus(−a (t − b)); finite where τ itself has long underflowed."""
+    return softplus(ops, -a * (t - b))
+
+
+def mean_transmittance(ops, t0, t1, a, b):
+    """Mean of τ over [t0, t1], t1 > t0: a box filter that keeps gradients below 1 for slopes of any steepness.
+
+    [softplus(a (t1 − b)) − softplus(a (t0 − b))] / (a (t1 − t0))
+    """
+    return (softplus(ops, a * (t1 - b)) - softplus(ops, a * (t0 - b))) / (a * (t1 - t0))
+
+
+def parameters(ops, raw_a, raw_b, h):
+    """Network outputs to ``(a, b)``: a = exp(raw_a) bounded by exp(±MAX_LOG_SLOPE), |b| ≤ MAX_CENTRE · h.
+
+    The bound on ln a is a scaled tanh: identity to first order around 0, finite gradients everywhere.
+    """
+    log_a = MAX_LOG_SLOPE * tanh(ops, raw_a / MAX_LOG_SLOPE)
+    return ops.exp(log_a), MAX_CENTRE * h * tanh(ops, raw_b)
+
+
+def tanh(ops, z):
+    """2 S(2z) − 1."""
+    return 2 * sigmoid(ops, 2 * z) - 1
+
+
+def through_quantiles(ops, t75, t50, t25):
+    """The logistic through three crossings, ``(a, b)`` in closed form.
+
+    `t75`, `t50`, `t25`: where τ is 3/4, 1/2, 1/4 (t75 ≥ t50 ≥ t25: τ falls away from the light, towards smaller t).
+    logit(3/4) − logit(1/4) = 2 ln 3, hence a = 2 ln 3/(t75 − t25); b = t50.
+    """
+    slope = 2.1972245773362196 / ops.maximum(t75 - t25, 1e-6)
+    return ops.minimum(slope, 665.0), t50

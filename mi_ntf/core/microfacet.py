@@ -1,0 +1,60 @@
+"""The field's reflectance: Lambert plus GGX (method.md, section 1; Walter et al. 2007, eqs. 33, 34, 20).
+
+    ρ = (1 − s) k/π + s D(h; α) G1(ω_i) G1(ω_o) / (4 ⟨n,ω_i⟩ ⟨n,ω_o⟩),        α = roughness²
+
+k: diffuse albedo (linear RGB, [0, 1]); s: specular weight in [0, 1]; roughness in [MIN_ROUGHNESS, 1]. There is no Fresnel
+term: photographs with the light at the camera see the half vector along the view direction only and cannot tell one. It
+is Mitsuba's ``blendbsdf`` of ``diffuse`` and a GGX ``roughconductor`` with ``material = none``.
+
+ω_i points to the light, ω_o to the viewer, n is the normal: unit 3-component tuples. The diffuse lobe needs only
+⟨n,ω_i⟩ > 0; the specular lobe also needs ⟨n,ω_o⟩ > 0. So ρ is reciprocal where both are positive, and the directional
+albedo ∫ ρ ⟨n,ω_i⟩ dω_i is at most (1 − s) k + s ≤ 1 everywhere.
+"""
+
+import math
+
+from .ops import dot, normalize
+
+MIN_ROUGHNESS = 0.15
+INV_PI = 1 / math.pi
+
+
+def ggx(cos_h, alpha):
+    """D(h): density of microfacet normals; `cos_h` = ⟨n,h⟩ ≥ 0, `alpha` = roughness²."""
+    a2 = alpha * alpha
+    k = cos_h * cos_h * (a2 - 1) + 1
+    return a2 / (math.pi * k * k)
+
+
+def smith_g1(ops, cos_v, alpha):
+    """G1: visible share of the microfacets, 2c/(c + sqrt(α² + (1 − α²) c²)) at the cosine c = `cos_v` ≥ 0."""
+    a2 = alpha * alpha
+    return 2 * cos_v / (cos_v + ops.sqrt(a2 + (1 - a2) * cos_v * cos_v))
+
+
+def lobes(ops, wi, wo, n, roughness):
+    """The two lobes times the light's cosine: ``(diffuse, specular)``, scalars, 1/sr.
+
+    ρ·⟨n,ω_i⟩⁺ = (1 − s)·k·diffuse + s·specular. Split so that colour enters outside, once for any number of channels.
+    """
+    cos_i, cos_o = dot(n, wi), dot(n, wo)
+    lit = ops.maximum(cos_i, 0.0)
+    # G1(ω)/(2⟨n,ω⟩) in one piece: finite at grazing directions, where both factors vanish.
+    alpha = roughness * roughness
+    a2 = alpha * alpha
+    gi = 1 / (lit + ops.sqrt(a2 + (1 - a2) * lit * lit))
+    co = ops.maximum(cos_o, 0.0)
+    go = 1 / (co + ops.sqrt(a2 + (1 - a2) * co * co))
+    half = normalize(ops, tuple(a + b for a, b in zip(wi, wo, strict=True)))
+    d = ggx(ops.maximum(dot(n, half), 0.0), alpha)
+    specular = ops.where(cos_o > 0, d * gi * go * lit, 0.0 * lit)
+    return lit * INV_PI, specular
+
+
+def lobes_collocated(ops, cos, roughness):
+    """:func:`lobes` for light and viewer in one direction at cosine `cos` to the normal: the half vector is that direction."""
+    c = ops.maximum(cos, 0.0)
+    alpha = roughness * roughness
+    a2 = alpha * alpha
+    g = 1 / (c + ops.sqrt(a2 + (1 - a2) * c * c))
+    return c * INV_PI, ggx(c, alpha) * g * g * c

@@ -1,0 +1,75 @@
+"""The networks in NumPy float64: the oracle that the PyTorch and Dr.Jit twins are held against. Slow, short, exact.
+
+Conventions that the twins share. Points are (n, 3) in field coordinates, inside [−1, 1]³. A plane of resolution r has its
+texel centres at u = (i + ½)/r with u = (x + 1)/2; the first named coordinate runs along the last spatial axis; beyond the
+outermost centres the border texel is repeated. Layers compute W x + b; every layer but the last is followed by ReLU.
+"""
+
+import numpy as np
+
+from . import logistic, ops, spheres
+from .architecture import MAX_LOG_DENSITY, MIN_LOG_DENSITY, Architecture, Encoding
+from .microfacet import MIN_ROUGHNESS
+
+PLANES = ((0, 1), (0, 2), (1, 2))
+
+
+def bilinear(plane: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Values (n, channels) of a plane (rows v, columns u, channels) at u, v in [0, 1]."""
+    r = plane.shape[0]
+    x, y = np.clip(u * r - 0.5, 0, r - 1), np.clip(v * r - 0.5, 0, r - 1)
+    i, j = np.minimum(x.astype(int), r - 2), np.minimum(y.astype(int), r - 2)
+    fx, fy = (x - i)[:, None], (y - j)[:, None]
+    return ((1 - fy) * ((1 - fx) * plane[j, i] + fx * plane[j, i + 1])
+            + fy * ((1 - fx) * plane[j + 1, i] + fx * plane[j + 1, i + 1]))
+
+
+def encode(encoding: Encoding, tensors: dict, name: str, x: np.ndarray) -> np.ndarray:
+    """Features (n, encoding.width) of the points `x` (n, 3)."""
+    if encoding.kind == "frequency":
+        angles = [np.pi * 2.0**k * x for k in range(encoding.octaves)]
+        return np.concatenate([x, *(f(a) for a in angles for f in (np.sin, np.cos))], axis=1)
+    u = (x + 1) / 2
+    levels = []
+    for i in range(len(encoding.resolutions)):
+        planes = tensors[f"{name}.planes.{i}"].astype(np.float64)
+        levels.append(np.prod([bilinear(p, u[:, a], u[:, b]) for p, (a, b) in zip(planes, PLANES, strict=True)], axis=0))
+    return np.concatenate(levels, axis=1)
+
+
+def perceptron(tensors: dict, name: str, x: np.ndarray) -> np.ndarray:
+    """The layers ``name.layers.*`` applied to `x` (n, inputs)."""
+    count = sum(k.startswith(f"{name}.layers.") and k.endswith("weight") for k in tensors)
+    for i in range(count):
+        w, b = (tensors[f"{name}.layers.{i}.{p}"].astype(np.float64) for p in ("weight", "bias"))
+        x = x @ w.T + b
+        if i + 1 < count:
+            x = np.maximum(x, 0)
+    return x
+
+
+def density(arch: Architecture, tensors: dict, x: np.ndarray) -> np.ndarray:
+    """σ (n,), 1/(unit-sphere radius)."""
+    raw = perceptron(tensors, "density", encode(arch.density.encoding, tensors, "density", x))[:, 0]
+    return np.exp(np.clip(raw, MIN_LOG_DENSITY, MAX_LOG_DENSITY))
+
+
+def reflectance(arch: Architecture, tensors: dict, x: np.ndarray) -> np.ndarray:
+    """(n, 8): unit normal, albedo in [0, 1], roughness in [MIN_ROUGHNESS, 1], specular weight in [0, 1]."""
+    raw = perceptron(tensors, "reflectance", encode(arch.reflectance.encoding, tensors, "reflectance", x))
+    normal = np.stack(ops.normalize(ops, tuple(raw[:, :3].T)), axis=1)
+    rest = logistic.sigmoid(ops, raw[:, 3:])
+    rest[:, 3] = MIN_ROUGHNESS + (1 - MIN_ROUGHNESS) * rest[:, 3]
+    return np.concatenate([normal, rest], axis=1)
+
+
+def transmittance_parameters(arch: Architecture, tensors: dict, o: np.ndarray, d: np.ndarray):
+    """``(hit, a, b)``, each (n,), of the rays through `o` (n, 3) along the unit directions `d` towards the light."""
+    net = arch.transmittance
+    hit, m, h = spheres.chord(ops, tuple(o.T), tuple(d.T))
+    p1, p2 = (np.stack(p, axis=1) for p in spheres.end_points(m, tuple(d.T), h))
+    share = (np.arange(net.points) + 0.5) / net.points
+    features = [encode(net.encoding, tensors, "transmittance", p1 + s * (p2 - p1)) for s in share]
+    raw = perceptron(tensors, "transmittance", np.concatenate([*features, p1, p2], axis=1))
+    a, b = logistic.parameters(ops, raw[:, 0], raw[:, 1], h)
+    return hit, a, b

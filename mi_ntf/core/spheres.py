@@ -1,0 +1,62 @@
+"""Rays as ordered pairs of points on the unit sphere (method.md, section 3; Shafiei et al. 2021, section 3.1).
+
+Symbols, used everywhere in this project:
+
+    x, o     points, in field coordinates (the object lies inside the unit sphere at the origin)
+    d        unit direction; ω' (`d` of a light ray) points *towards the light*
+    p1, p2   entry ω¹ and exit ω² of the line on the unit sphere, so that d = (p2 − p1)/|p2 − p1|
+    m        midpoint o' of the chord; it is perpendicular to d
+    h        half chord, in (0, 1]; the chord covers t' ∈ [−h, h]
+    t        t' = ⟨x, d⟩, the signed distance from m along d
+
+Every argument named above is a 3-component tuple (points, directions) or a scalar array; `ops` is the namespace of
+elementary functions (:mod:`mi_ntf.core.ops`).
+"""
+
+from .ops import dot, normalize
+
+MIN_HALF_CHORD = 0.05
+"""Chords shorter than twice this graze the sphere, where no captured object reaches (the similarity leaves a margin) and
+where float32 loses the end points: their transmittance is 1 by definition. A uniform ray has such a chord with
+probability h² = 0.25 %."""
+
+
+def chord(ops, o, d):
+    """The chord that the line through `o` along the unit vector `d` cuts from the unit sphere.
+
+    Returns ``(hit, m, h)``: `hit` is true where the line meets the sphere in a chord of half length above
+    ``MIN_HALF_CHORD``; `m` the midpoint; `h` the half chord (``MIN_HALF_CHORD`` at least, so that gradients are finite
+    where `hit` is false).
+
+    disc = b² − (|o|² − 1) with b = ⟨o, d⟩ loses all digits far from the sphere, so it is taken from the midpoint,
+    disc = 1 − |o − b d|².
+    """
+    b = dot(o, d)
+    m = tuple(oi - b * di for oi, di in zip(o, d, strict=True))
+    # A second projection removes the rounding error of the first when |o| is large.
+    c = dot(m, d)
+    m = tuple(mi - c * di for mi, di in zip(m, d, strict=True))
+    disc = 1 - dot(m, m)
+    hit = disc > MIN_HALF_CHORD**2
+    h = ops.sqrt(ops.maximum(disc, MIN_HALF_CHORD**2))
+    return hit, m, h
+
+
+def end_points(m, d, h):
+    """Entry and exit ``(p1, p2)`` of the chord with midpoint `m`, unit direction `d` and half length `h`."""
+    p1 = tuple(mi - h * di for mi, di in zip(m, d, strict=True))
+    p2 = tuple(mi + h * di for mi, di in zip(m, d, strict=True))
+    return p1, p2
+
+
+def from_end_points(ops, p1, p2):
+    """Inverse of :func:`end_points`: ``(m, d, h)`` of the chord from `p1` to `p2`, two distinct points of the unit sphere."""
+    m = tuple((a + b) / 2 for a, b in zip(p1, p2, strict=True))
+    span = tuple(b - a for a, b in zip(p1, p2, strict=True))
+    h = ops.sqrt(ops.maximum(dot(span, span), 1e-20)) / 2
+    return m, normalize(ops, span), h
+
+
+def coordinate(x, d):
+    """t' = ⟨x, ω'⟩: the place of `x` on its ray. No origin is needed, since the midpoint is perpendicular to ω'."""
+    return dot(x, d)
