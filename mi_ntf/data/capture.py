@@ -1,0 +1,195 @@
+"""A virtual camera with a flash: photographs any ordinary Mitsuba scene of surfaces into a data set (`schema`).
+
+Every view has a point light exactly at the camera (collocated capture, method of Bi et al. 2020), so that the light's
+transmittance is the view's. The scene's own sensors and emitters are left out; its shapes, materials and, where it is
+a surface path tracer, its integrator are kept. The one file of `data` that uses Mitsuba.
+"""
+
+import hashlib
+import json
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from mi_ntf.core.errors import MiNtfError
+from mi_ntf.data import schema
+
+DISTANCE = 3.2  # camera to object's centre, in radii of the bounding sphere
+MARGIN = 1.04   # bounding sphere over the object's extent: room for a soft surface in the field
+SURFACE_INTEGRATORS = ("PathIntegrator", "DirectIntegrator")
+
+
+def bounding_sphere(points: np.ndarray) -> tuple[np.ndarray, float]:
+    """Centre (3,) and radius of a sphere around `points` (P, 3), near the smallest, without margin.
+
+    Source: Badoiu and Clarkson 2003, "Smaller core-sets for balls": step by 1/(i+1) towards the farthest point.
+    """
+    points = np.asarray(points, dtype=np.float64)
+    center = 0.5 * (points.min(0) + points.max(0))
+    best, radius = center, float(np.linalg.norm(points - center, axis=1).max())
+    for i in range(1, 200):
+        distance = np.linalg.norm(points - center, axis=1)
+        if distance.max() < radius:
+            best, radius = center, float(distance.max())
+        center = center + (points[distance.argmax()] - center) / (i + 1)
+    return best, radius
+
+
+def view_directions(count: int, rng: np.random.Generator) -> np.ndarray:
+    """Unit directions (count, 3) from the object to the cameras: a Fibonacci lattice, turned at random."""
+    i = np.arange(count) + 0.5
+    z, phi = 1.0 - 2.0 * i / count, np.pi * (1.0 + 5.0**0.5) * i
+    lattice = np.stack([np.cos(phi) * np.sqrt(1 - z * z), np.sin(phi) * np.sqrt(1 - z * z), z], -1)
+    q, r = np.linalg.qr(rng.normal(size=(3, 3)))
+    return lattice @ (q * np.sign(np.diag(r))).T
+
+
+def camera_to_world(position: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """OpenGL camera-to-world (4, 4) of a camera at `position` that looks at `target`, y up (z at the poles)."""
+    back = (position - target) / np.linalg.norm(position - target)
+    right = np.cross((0.0, 1.0, 0.0) if abs(back[1]) < 0.99 else (0.0, 0.0, 1.0), back)
+    right /= np.linalg.norm(right)
+    c2w = np.eye(4)
+    c2w[:3, :] = np.stack([right, np.cross(back, right), back, position], -1)
+    return c2w
+
+
+def _load(path: Path):
+    """The scene's shapes that emit no light, and its integrator (or None where it is no surface path tracer)."""
+    import mitsuba as mi
+
+    if mi.variant() is None:
+        mi.set_variant("llvm_ad_rgb")
+    if "rgb" not in mi.variant():
+        raise MiNtfError(f"variant '{mi.variant()}' is active; photographs are linear RGB: set an rgb variant "
+                         "such as llvm_ad_rgb")
+    if not Path(path).is_file():
+        raise MiNtfError(f"{path} does not exist; name a Mitsuba scene file (.xml)")
+    scene = mi.load_file(str(path))
+    if not isinstance(scene, mi.Scene):
+        raise MiNtfError(f"{path}: holds a {type(scene).__name__}, not a scene; the root element must be <scene>")
+    shapes = [shape for shape in scene.shapes() if not shape.is_emitter()]
+    if not shapes:
+        raise MiNtfError(f"{path}: {len(scene.shapes())} shapes, none that reflects light; add the object to photograph")
+    media = [shape.id() for shape in shapes if shape.interior_medium() or shape.exterior_medium()]
+    if media:
+        raise MiNtfError(f"{path}: shape '{media[0]}' holds a medium; only surfaces are photographed, remove it")
+    integrator = scene.integrator()
+    return shapes, integrator if type(integrator).__name__ in SURFACE_INTEGRATORS else None
+
+
+def _outline(shapes: list) -> np.ndarray:
+    """Points (P, 3) whose hull holds every shape: the vertices of meshes, the box corners of everything else."""
+    import mitsuba as mi
+
+    points = []
+    for shape in shapes:
+        if shape.is_mesh():
+            points.append(np.array(mi.traverse(shape)["vertex_positions"]).reshape(-1, 3))
+        else:
+            points.append(np.array([np.array(shape.bbox().corner(i)).ravel() for i in range(8)]))
+    return np.concatenate(points).astype(np.float64)
+
+
+def _fingerprint(scene) -> str:
+    """Hash of all parameters of a Mitsuba scene (vertices, materials): tells a changed object from the same one."""
+    import mitsuba as mi
+
+    digest = hashlib.sha256()
+    for key, value in sorted(mi.traverse(scene), key=lambda item: item[0]):
+        digest.update(key.encode())
+        digest.update(np.array(value).tobytes() if hasattr(value, "__len__") else repr(value).encode())
+    return digest.hexdigest()[:16]
+
+
+def _studio(shapes: list, integrator, angle: float, size: int):
+    """Scene of the shapes with a perspective camera (box filter, RGBA) and a point light, both still to be placed."""
+    import mitsuba as mi
+
+    film = {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgba", "component_format": "float32",
+            "rfilter": {"type": "box"}}
+    contents = {f"shape_{i:04d}": shape for i, shape in enumerate(shapes)}
+    return mi.load_dict({
+        "type": "scene",
+        "integrator": integrator or {"type": "path", "max_depth": 6, "hide_emitters": True},
+        "sensor": {"type": "perspective", "fov": float(np.degrees(angle)), "near_clip": 1e-4, "far_clip": 1e6,
+                   "film": film, "sampler": {"type": "independent"}},
+        "light": {"type": "point", "position": [0, 0, 0], "intensity": {"type": "rgb", "value": [1.0, 1.0, 1.0]}},
+        **contents,
+    })
+
+
+def _open_manifest(out: Path, settings: dict) -> None:
+    """Note the settings in `capture.json`, or hold them against those of the run that this one resumes."""
+    path = out / "capture.json"
+    if path.exists():
+        before = json.loads(path.read_text())
+        for key, value in settings.items():
+            if before.get(key) != value:
+                raise MiNtfError(f"{path}: this folder was captured with {key} = {before.get(key)}, now {key} = {value}; "
+                                 "use another folder, delete this one, or give the former value to resume")
+        return
+    temporary = path.with_suffix(".json.tmp")
+    temporary.write_text(json.dumps(settings, indent=1) + "\n")
+    os.replace(temporary, path)
+
+
+def _plan(counts: dict[str, int], center: np.ndarray, radius: float, seed: int) -> dict[str, list[schema.Frame]]:
+    """The frames of every split; the flash has I = pi d^2: a white diffuse surface at the centre has radiance 1."""
+    rng = np.random.default_rng(seed)
+    distance = DISTANCE * radius
+    intensity = np.full(3, np.pi * distance**2)
+    plan = {}
+    for split, count in counts.items():
+        poses = [camera_to_world(center + distance * d, center) for d in view_directions(count, rng)]
+        plan[split] = [schema.Frame(f"{split}/{i:04d}.exr", c2w, c2w[:3, 3], intensity) for i, c2w in enumerate(poses)]
+    return plan
+
+
+def capture(scene: Path, out: Path, *, views: int = 100, size: int = 128, test_views: int = 20, spp: int = 64,
+            seed: int = 0) -> dict:
+    """Photograph `scene` (Mitsuba XML of surfaces) into the data set `out`; resumes what an earlier run began.
+
+    `views` train, max(4, views // 20) val and `test_views` test photographs of size x size pixels, `spp` paths a pixel.
+    Returns center, radius, the number of images rendered and kept, and the seconds taken. Raises MiNtfError for a scene
+    that cannot be photographed and for a folder that holds a capture with other settings.
+    """
+    import mitsuba as mi
+
+    for name, value in (("views", views), ("size", size), ("test_views", test_views), ("spp", spp)):
+        if value < 1:
+            raise MiNtfError(f"capture: {name} is {value}, must be 1 or more")
+    start = time.monotonic()
+    out = Path(out)
+    shapes, integrator = _load(scene)
+    center, radius = bounding_sphere(_outline(shapes))
+    radius *= MARGIN
+    angle = float(2.0 * np.arcsin(1.0 / DISTANCE))
+    studio = _studio(shapes, integrator, angle, size)
+    counts = {"train": views, "val": max(4, views // 20), "test": test_views}
+    out.mkdir(parents=True, exist_ok=True)
+    _open_manifest(out, {"scene": Path(scene).name, "object": _fingerprint(studio), "views": views, "size": size,
+                         "test_views": test_views, "spp": spp, "seed": seed})
+    plan = _plan(counts, center, radius, seed)
+    frames = [frame for split in plan.values() for frame in split]
+    params, rendered = mi.traverse(studio), 0
+    columns = (TextColumn("capture"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, transient=True) as progress:
+        for index, frame in enumerate(progress.track(frames)):
+            path = out / frame.file
+            if path.exists():
+                continue
+            path.parent.mkdir(exist_ok=True)
+            params["sensor.to_world"] = mi.Transform4f(mi.Matrix4f(schema.mitsuba_to_opengl(frame.c2w).tolist()))
+            params["light.position"] = mi.Point3f(frame.light_pos.tolist())
+            params["light.intensity.value"] = mi.Color3f(frame.light_intensity.tolist())
+            params.update()
+            schema.write_exr(path, np.array(mi.render(studio, spp=spp, seed=seed * len(frames) + index)))
+            rendered += 1
+    for split, entries in plan.items():
+        schema.write_transforms(out, split, schema.Transforms(angle, size, size, center, radius, entries))
+    return {"center": center.tolist(), "radius": radius, "rendered": rendered, "kept": len(frames) - rendered,
+            "seconds": time.monotonic() - start}
