@@ -10,6 +10,7 @@ The third sees the ray (p1, p2) as the encodings of `points` equidistant points 
 six coordinates of p1 and p2.
 """
 
+import math
 from dataclasses import asdict, dataclass, field
 from itertools import pairwise
 
@@ -92,13 +93,13 @@ class Header:
 
 def header_from_json(data: dict, source: str) -> Header:
     """Parse and check a header; `source` (a file name) starts every error text."""
-    version = data.get("format")
+    version = data.get("format") if isinstance(data, dict) else None
     if version != FORMAT:
         raise MiNtfError(f"{source}: field format {version!r}, this build reads {FORMAT}; train or export the field anew")
     try:
         nets = {name: _network(data["architecture"][name]) for name in WIDTHS}
         sim = Similarity(tuple(map(float, data["similarity"]["center"])), float(data["similarity"]["radius"]))
-        if len(sim.center) != 3 or not sim.radius > 0:
+        if len(sim.center) != 3 or not sim.radius > 0 or not all(map(math.isfinite, (*sim.center, sim.radius))):
             raise ValueError(f"similarity {sim}")
         return Header(Architecture(**nets), sim, dict(data.get("provenance", {})))
     except (KeyError, TypeError, ValueError) as error:
@@ -110,7 +111,11 @@ def _network(data: dict) -> Network:
     encoding = Encoding(e["kind"], tuple(e["resolutions"]), e["channels"], e["octaves"])
     if encoding.kind not in ("planes", "frequency"):
         raise ValueError(f"encoding kind {encoding.kind!r}, expected 'planes' or 'frequency'")
-    return Network(encoding, tuple(data["hidden"]), data["points"])
+    network = Network(encoding, tuple(data["hidden"]), data["points"])
+    sizes = (*encoding.resolutions, *network.hidden, network.points)
+    if not all(isinstance(n, int) and n > 0 for n in sizes) or any(r < 2 for r in encoding.resolutions):
+        raise ValueError(f"sizes {sizes}, expected positive integers and resolutions of at least 2")
+    return network
 
 
 FAST = Architecture(

@@ -21,7 +21,11 @@ def save(path: str | Path, header: Header, tensors: dict[str, np.ndarray], dtype
     interpolation and a trained perceptron smooth anyway and halves the file.
     """
     _check(str(path), header, tensors)
-    data = {k: np.ascontiguousarray(v, dtype if ".planes." in k else np.float32) for k, v in tensors.items()}
+    with np.errstate(over="ignore"):  # a float16 overflow is reported by the check below, by name
+        data = {k: np.ascontiguousarray(v, dtype if ".planes." in k else np.float32) for k, v in tensors.items()}
+    _check(f"{path} as {np.dtype(dtype).name}", header, data)
+    if not Path(path).absolute().parent.is_dir():
+        raise MiNtfError(f"cannot write {path}: folder {Path(path).parent} does not exist; create it first")
     temporary = Path(f"{path}.part")
     safetensors.numpy.save_file(data, temporary, metadata={_KEY: json.dumps(header.to_json())})
     os.replace(temporary, path)

@@ -13,6 +13,7 @@ above it float32 products a·(t − b) lose the fourth digit of τ."""
 MAX_CENTRE = 1.2
 """|b| stays below this many half chords. Beyond 1, so that an empty central chord can reach τ = 1 at its far end."""
 _CLIP = 80.0  # e^80 is finite in float32; S differs from 0 or 1 by less than any float32 can tell.
+_SERIES = 0.5
 
 
 def sigmoid(ops, z):
@@ -22,8 +23,16 @@ def sigmoid(ops, z):
 
 
 def softplus(ops, z):
-    """ln(1 + e^z) without overflow: max(z, 0) + ln(1 + e^−|z|)."""
-    return ops.maximum(z, 0.0) + ops.log(1 + ops.exp(-ops.abs(z)))
+    """ln(1 + e^z) without overflow: max(z, 0) + ln(1 + e^−|z|).
+
+    max(z, 0) is written (z + |z|)/2: frameworks disagree on the derivative of a tie, this form has ½ at 0 in all of them.
+    """
+    return (z + ops.abs(z)) / 2 + _bend(ops, z)
+
+
+def _bend(ops, z):
+    """softplus(z) − max(z, 0), in (0, ln 2]."""
+    return ops.log(1 + ops.exp(-ops.abs(z)))
 
 
 def transmittance(ops, t, a, b):
@@ -37,11 +46,26 @@ def optical_depth(ops, t, a, b):
 
 
 def mean_transmittance(ops, t0, t1, a, b):
-    """Mean of τ over [t0, t1], t1 > t0: a box filter that keeps gradients below 1 for slopes of any steepness.
+    """Mean of τ over [t0, t1], t1 ≥ t0: a box filter that keeps gradients below 1 for slopes of any steepness.
 
-    [softplus(a (t1 − b)) − softplus(a (t0 − b))] / (a (t1 − t0))
+    [softplus(a (t1 − b)) − softplus(a (t0 − b))] / Δ with Δ = a (t1 − t0). For Δ below ½ the difference would cancel (in
+    float32 all digits are gone at Δ = 1e-7), so there the series around the middle c of the step takes over:
+
+        S + S″ δ²/6 + S⁗ δ⁴/120,   S = S(a (c − b)),  δ = Δ/2,  S′ = S (1 − S),  S″ = S′ (1 − 2S),  S⁗ = S″ (1 − 12 S′)
+
+    whose first neglected term is below 2e-8.
     """
-    return (softplus(ops, a * (t1 - b)) - softplus(ops, a * (t0 - b))) / (a * (t1 - t0))
+    width = a * (t1 - t0)
+    centre = transmittance(ops, (t0 + t1) / 2, a, b)
+    slope = centre * (1 - centre)
+    d2 = width * width / 4
+    series = centre + slope * (1 - 2 * centre) * (d2 / 6) * (1 + (1 - 12 * slope) * (d2 / 20))
+    z0, z1 = a * (t0 - b), a * (t1 - b)
+    # max(z1, 0) − max(z0, 0) as a clamp: exactly Δ where both are large. `maximum` below keeps the gradient of the branch
+    # not taken finite at Δ = 0.
+    rise = ops.minimum(ops.maximum(z1, 0.0), width)
+    difference = (rise + _bend(ops, z1) - _bend(ops, z0)) / ops.maximum(width, _SERIES)
+    return ops.where(width < _SERIES, series, difference)
 
 
 def parameters(ops, raw_a, raw_b, h):

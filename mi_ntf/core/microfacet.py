@@ -13,16 +13,19 @@ albedo ∫ ρ ⟨n,ω_i⟩ dω_i is at most (1 − s) k + s ≤ 1 everywhere.
 
 import math
 
-from .ops import dot, normalize
+from .ops import cross, dot, normalize
 
 MIN_ROUGHNESS = 0.15
 INV_PI = 1 / math.pi
 
 
-def ggx(cos_h, alpha):
-    """D(h): density of microfacet normals; `cos_h` = ⟨n,h⟩ ≥ 0, `alpha` = roughness²."""
+def ggx(sin2_h, alpha):
+    """D(h): density of microfacet normals; `sin2_h` = 1 − ⟨n,h⟩² with ⟨n,h⟩ ≥ 0, `alpha` = roughness².
+
+    The sine, not the cosine: at α = 0.02 the rounding of a float32 cosine near 1 moves the peak of D by 5e-4.
+    """
     a2 = alpha * alpha
-    k = cos_h * cos_h * (a2 - 1) + 1
+    k = a2 + (1 - a2) * sin2_h
     return a2 / (math.pi * k * k)
 
 
@@ -46,7 +49,9 @@ def lobes(ops, wi, wo, n, roughness):
     co = ops.maximum(cos_o, 0.0)
     go = 1 / (co + ops.sqrt(a2 + (1 - a2) * co * co))
     half = normalize(ops, tuple(a + b for a, b in zip(wi, wo, strict=True)))
-    d = ggx(ops.maximum(dot(n, half), 0.0), alpha)
+    # ⟨n,h⟩ > 0 wherever the lobe is not zero, so D needs no sign of it.
+    across = cross(n, half)
+    d = ggx(dot(across, across), alpha)
     specular = ops.where(cos_o > 0, d * gi * go * lit, 0.0 * lit)
     return lit * INV_PI, specular
 
@@ -57,4 +62,4 @@ def lobes_collocated(ops, cos, roughness):
     alpha = roughness * roughness
     a2 = alpha * alpha
     g = 1 / (c + ops.sqrt(a2 + (1 - a2) * c * c))
-    return c * INV_PI, ggx(c, alpha) * g * g * c
+    return c * INV_PI, ggx((1 - c) * (1 + c), alpha) * g * g * c

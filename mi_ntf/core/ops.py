@@ -16,6 +16,11 @@ def dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
+def cross(a, b):
+    """Vector product of two 3-component tuples."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
 def normalize(ops, a, tiny=1e-20):
     """`a` over its length; a zero vector stays zero and has finite gradients."""
     scale = 1 / ops.sqrt(ops.maximum(dot(a, a), tiny))

@@ -1,0 +1,162 @@
+"""Field files: what is written comes back, and every fault is named with its remedy."""
+
+import json
+
+import numpy as np
+import pytest
+import safetensors.numpy
+
+from mi_ntf.core import field_file
+from mi_ntf.core.architecture import (FAST, Architecture, Encoding, Header, Network, Similarity, header_from_json)
+from mi_ntf.core.errors import MiNtfError
+
+SMALL = Architecture(
+    density=Network(Encoding("planes", (4, 6), 2), (5,)),
+    reflectance=Network(Encoding("frequency", octaves=2), (4, 3)),
+    transmittance=Network(Encoding("planes", (4,), 2), (7,), points=3),
+)
+
+
+def make_tensors(architecture, seed=0):
+    rng = np.random.default_rng(seed)
+    return {k: np.float32(rng.normal(size=s)) for k, s in architecture.skeleton().items()}
+
+
+@pytest.fixture
+def saved(tmp_path):
+    path = tmp_path / "field.safetensors"
+    tensors = make_tensors(SMALL)
+    header = Header(SMALL, Similarity((0.5, -1.0, 2.0), 3.0), {"views": 7})
+    field_file.save(path, header, tensors)
+    return path, header, tensors
+
+
+def test_skeleton_by_hand():
+    shapes = SMALL.skeleton()
+    assert shapes["density.planes.1"] == (3, 6, 6, 2)
+    assert shapes["density.layers.0.weight"] == (5, 4)  # two resolutions of two channels
+    assert shapes["density.layers.1.bias"] == (1,)
+    assert shapes["reflectance.layers.0.weight"] == (4, 15)  # 3 + 2 octaves · (sin, cos) · 3
+    assert shapes["reflectance.layers.2.weight"] == (8, 3)
+    assert shapes["transmittance.layers.0.weight"] == (7, 3 * 2 + 6)
+    assert shapes["transmittance.layers.1.weight"] == (2, 7)
+    assert len(shapes) == 2 + 4 + 6 + 1 + 4
+
+
+def test_round_trip(saved):
+    path, header, tensors = saved
+    header2, tensors2 = field_file.load(path)
+    assert header2 == header
+    assert field_file.load_header(path) == header
+    assert set(tensors2) == set(tensors)
+    for name, value in tensors.items():
+        stored = value.astype(np.float16) if ".planes." in name else value  # planes are halved on purpose
+        np.testing.assert_array_equal(tensors2[name], stored.astype(np.float32))
+        assert tensors2[name].dtype == np.float32
+    assert [p.name for p in path.parent.iterdir()] == [path.name]  # no temporary left
+
+
+def test_float32_planes_are_exact(tmp_path):
+    tensors = make_tensors(SMALL)
+    field_file.save(tmp_path / "f", Header(SMALL), tensors, dtype=np.float32)
+    for name, value in field_file.load(tmp_path / "f")[1].items():
+        np.testing.assert_array_equal(value, tensors[name])
+
+
+def test_describe_counts_parameters(saved):
+    path, _, tensors = saved
+    info = field_file.describe(path)
+    assert sum(info["parameters"].values()) == sum(v.size for v in tensors.values())
+    assert info["parameters"]["reflectance"] == 15 * 4 + 4 + 4 * 3 + 3 + 3 * 8 + 8
+    assert info["bytes"] == path.stat().st_size and info["similarity"]["radius"] == 3.0
+    json.dumps(info)
+
+
+def test_fast_preset_survives_json():
+    assert header_from_json(json.loads(json.dumps(Header(FAST).to_json())), "x").architecture == FAST
+
+
+@pytest.mark.parametrize(("change", "text"), [
+    (lambda t: t.pop("density.planes.0"), "missing tensor density.planes.0"),
+    (lambda t: t.update(extra=np.zeros(2, np.float32)), "unknown tensor extra"),
+    (lambda t: t.update({"density.layers.0.bias": np.zeros(4, np.float32)}),
+     r"density.layers.0.bias: expected shape \(5,\), found \(4,\)"),
+    (lambda t: t["density.layers.0.bias"].__setitem__(slice(0, 2), np.nan), "density.layers.0.bias: 2 values are NaN or infinite"),
+    (lambda t: t.update({"density.layers.0.bias": np.zeros(5, np.int32)}),
+     "density.layers.0.bias: expected floating point, found int32"),
+])
+def test_wrong_tensors_are_named_on_saving_and_on_loading(tmp_path, change, text):
+    tensors = make_tensors(SMALL)
+    change(tensors)
+    path = tmp_path / "field.safetensors"
+    with pytest.raises(MiNtfError, match=text):
+        field_file.save(path, Header(SMALL), tensors)
+    assert not path.exists()
+    safetensors.numpy.save_file(tensors, path, metadata={"mi_ntf": json.dumps(Header(SMALL).to_json())})
+    with pytest.raises(MiNtfError, match=text) as caught:
+        field_file.load(path)
+    assert str(path) in str(caught.value) and "anew" in str(caught.value)
+
+
+def test_all_faults_come_in_one_error(tmp_path):
+    tensors = make_tensors(SMALL)
+    del tensors["density.planes.0"], tensors["transmittance.layers.1.bias"]
+    with pytest.raises(MiNtfError, match="missing tensor density.planes.0; missing tensor transmittance.layers.1.bias"):
+        field_file.save(tmp_path / "f", Header(SMALL), tensors)
+
+
+def test_features_beyond_half_precision_are_refused_when_saving(tmp_path):
+    tensors = make_tensors(SMALL)
+    tensors["density.planes.0"][0, 0, 0, 0] = 1e5
+    with pytest.raises(MiNtfError, match="as float16 .*density.planes.0: 1 values are NaN or infinite"):
+        field_file.save(tmp_path / "f", Header(SMALL), tensors)
+
+
+def test_truncated_file(saved):
+    path = saved[0]
+    data = path.read_bytes()
+    for size in (0, 6, len(data) // 2, len(data) - 1):
+        path.write_bytes(data[:size])
+        with pytest.raises(MiNtfError, match="is no field file or is truncated .*make it anew with `mi-ntf train`"):
+            field_file.load(path)
+
+
+def test_foreign_and_absent_files(tmp_path):
+    path = tmp_path / "foreign.safetensors"
+    safetensors.numpy.save_file({"w": np.zeros(2, np.float32)}, path)
+    with pytest.raises(MiNtfError, match="safetensors file of another program .*pass a file of `mi-ntf train`"):
+        field_file.load(path)
+    path.write_bytes(b"\x80\x04K\x01.")  # a pickle
+    with pytest.raises(MiNtfError, match="is no field file or is truncated"):
+        field_file.load(path)
+    with pytest.raises(MiNtfError, match="does not exist; make one with `mi-ntf train DATASET -o nowhere.safetensors`"):
+        field_file.load(tmp_path / "nowhere.safetensors")
+    with pytest.raises(MiNtfError, match="folder .*no does not exist; create it first"):
+        field_file.save(tmp_path / "no" / "f", Header(SMALL), make_tensors(SMALL))
+
+
+@pytest.mark.parametrize(("change", "text"), [
+    (lambda d: d.update(format=2), "field format 2, this build reads 1; train or export the field anew"),
+    (lambda d: d.pop("architecture"), "incomplete .*architecture"),
+    (lambda d: d["architecture"].pop("transmittance"), "incomplete .*transmittance"),
+    (lambda d: d["architecture"]["density"]["encoding"].update(kind="hash"), "'hash', expected 'planes' or 'frequency'"),
+    (lambda d: d["architecture"]["density"]["encoding"].update(resolutions=[1]), "resolutions of at least 2"),
+    (lambda d: d["architecture"]["density"].update(hidden=[0]), "expected positive integers"),
+    (lambda d: d["similarity"].update(radius=0), "incomplete .*similarity"),
+    (lambda d: d["similarity"].update(radius=float("nan")), "incomplete .*similarity"),
+    (lambda d: d["similarity"].update(center=[0, float("inf"), 0]), "incomplete .*similarity"),
+    (lambda d: d["similarity"].update(center=[0, 1]), "incomplete .*similarity"),
+])
+def test_wrong_headers(change, text):
+    data = json.loads(json.dumps(Header(SMALL).to_json()))
+    change(data)
+    with pytest.raises(MiNtfError, match=text) as caught:
+        header_from_json(data, "some.file")
+    assert str(caught.value).startswith("some.file: ")
+
+
+@pytest.mark.parametrize("text", ["no json", "[]", "3"])
+def test_headers_that_are_no_description(tmp_path, text):
+    safetensors.numpy.save_file({"w": np.zeros(2, np.float32)}, tmp_path / "f", metadata={"mi_ntf": text})
+    with pytest.raises(MiNtfError, match="header is not JSON|field format None"):
+        field_file.load(tmp_path / "f")
