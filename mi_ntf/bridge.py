@@ -60,11 +60,23 @@ def register(name: str, variant: str) -> None:
     with _lock:
         mi.set_variant(variant)
         if name in OWN_PLUGINS:
-            import mi_ntf.render
+            from mi_ntf.render import register as register_own_plugins
 
-            mi_ntf.render.register()
+            register_own_plugins()
         else:
             mi.register_integrator(name, _stock_constructor(name, variant))
+
+
+def register_all(variant: str) -> None:
+    """Make `variant` current and register every plugin that can run in it (for use from Python)."""
+    for name in PLUGIN_NAMES:
+        # Mitsuba may load the native entry of a name on first mention, and thereby overwrite
+        # what Python has registered: mention it before.
+        mi.PluginManager.instance().plugin_type(name)
+        try:
+            register(name, variant)
+        except MiNtfError:
+            continue
 
 
 def check_variant(name: str, variant: str) -> None:
@@ -88,7 +100,13 @@ def _stock_constructor(name: str, variant: str) -> Any:
         stock = getattr(getattr(mi.ad.integrators, name), STOCK_INTEGRATORS[name])
 
         def render(
-            self: Any, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, develop: bool = True, evaluate: bool = True
+            self: Any,
+            scene: Any,
+            sensor: Any = 0,
+            seed: Any = 0,
+            spp: int = 0,
+            develop: bool = True,
+            evaluate: bool = True,
         ) -> Any:
             image = stock.render(self, scene, sensor, seed, spp, True, evaluate)
             return image if develop else mi.TensorXf()

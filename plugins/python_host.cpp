@@ -33,6 +33,9 @@ bool python_is_running() {
     return check && check();
 }
 
+/// Marks, for all copies of this library, that Python is a guest of a C++ program here.
+constexpr const char *guest_mark = "_mi_ntf_guest";
+
 /// Holds the GIL for a scope.
 struct Gil {
     int state = PYTHON(PyGILState_Ensure, int)();
@@ -114,6 +117,9 @@ void become_launcher(const Environment &env) {
  * Leave at once when the program ends. Destructors of extension modules would run without
  * the GIL and abort, and Py_FinalizeEx waits for threads that are gone; by now the image is
  * on disk and only buffered text is left to write.
+ *
+ * Exit handlers and destructors of loaded libraries run in one order, last registered first:
+ * this one is registered again after each step that may have loaded a library.
  */
 void leave(int status, void *) {
     PYTHON(PyGILState_Ensure, int)();
@@ -144,12 +150,14 @@ void start_python(const fs::path &site_packages) {
     wchar_t *name = PYTHON(Py_DecodeLocale, wchar_t *, const char *, size_t *)(env.python.c_str(), nullptr);
     PYTHON(Py_SetProgramName, void, const wchar_t *)(name);
     PYTHON(Py_InitializeEx, void, int)(0);                   // 0: Ctrl-C keeps ending the program
-    on_exit(leave, nullptr);
 
+    PYTHON(PyRun_SimpleStringFlags, int, const char *, void *)
+        ((std::string("import sys; sys.") + guest_mark + " = True").c_str(), nullptr);
     bool imported = PYTHON(PyImport_ImportModule, PyObject *, const char *)("mi_ntf.bridge") != nullptr;
     if (!imported)
         PYTHON(PyErr_Print, void)();                         // message and traceback go to stderr
     PYTHON(PyEval_SaveThread, void *)();                     // other threads may use Python now
+    on_exit(leave, nullptr);
     if (!imported)
         throw std::runtime_error("mi_ntf: Python could not import mi_ntf (see above); run `mi-ntf doctor`");
 }
@@ -167,6 +175,8 @@ std::string register_from_python(const std::string &name, const std::string &var
         PYTHON(PyErr_Print, void)();
         return "mi_ntf.bridge failed (see above)";
     }
+    if (PYTHON(PySys_GetObject, PyObject *, const char *)(guest_mark))
+        on_exit(leave, nullptr);
     std::string result = utf8;
     PYTHON(Py_DecRef, void, PyObject *)(text);
     PYTHON(Py_DecRef, void, PyObject *)(module);

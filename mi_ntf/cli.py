@@ -1,0 +1,247 @@
+"""The command `mi-ntf`. Exit code 0: done, 1: the work failed, 2: bad usage.
+
+Each command imports what it needs when it runs, so that `info` needs no renderer and
+`render` no PyTorch.
+"""
+
+import json
+import os
+import sys
+import traceback
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from tyro.conf import Positional, UseAppendAction, arg, subcommand
+
+Output = Annotated[Path, arg(aliases=("-o",), metavar="FILE")]
+
+
+class UsageError(Exception):
+    """Arguments that parse but do not fit together (exit code 2)."""
+
+
+@dataclass
+class Capture:
+    """Photograph a mesh scene with the light at the camera, as training data for a field."""
+
+    scene: Positional[Path]
+    """Mitsuba scene made of meshes."""
+    folder: Positional[Path]
+    """Data set to write; an interrupted capture goes on where it stopped."""
+    views: int = 100
+    """Photographs for training and validation."""
+    size: int = 128
+    """Width and height in pixels."""
+    test_views: int = 20
+    """Photographs held back for tests."""
+    spp: int = 64
+    """Samples per pixel."""
+    seed: int = 0
+    """Seed of view directions and samples."""
+
+    def run(self) -> None:
+        from mi_ntf.data.capture import capture
+
+        capture(
+            self.scene,
+            self.folder,
+            views=self.views,
+            size=self.size,
+            test_views=self.test_views,
+            spp=self.spp,
+            seed=self.seed,
+        )
+
+
+@dataclass
+class Train:
+    """Train a field and its transmittance network on a data set."""
+
+    dataset: Positional[Path]
+    """Folder with transforms_train.json."""
+    output: Output
+    """Field file to write."""
+    preset: str = "fast"
+    """Architecture and schedule."""
+    minutes: float | None = None
+    """Stop after so many minutes."""
+    steps: int | None = None
+    """Stop after so many steps."""
+    seed: int = 0
+    """Seed of weights and samples."""
+
+    def run(self) -> None:
+        if self.minutes is not None and self.steps is not None:
+            raise UsageError("give --minutes or --steps, not both")
+        from mi_ntf.train import train
+
+        train(self.dataset, self.output, preset=self.preset, minutes=self.minutes, steps=self.steps, seed=self.seed)
+
+
+@dataclass
+class Swap:
+    """Write a copy of a scene in which a field takes the place of the meshes."""
+
+    scene: Positional[Path]
+    """Mitsuba scene made of meshes."""
+    field_file: Annotated[Positional[Path], arg(metavar="FIELD")]
+    """Trained field."""
+    output: Output
+    """Scene to write."""
+
+    def run(self) -> None:
+        from mi_ntf.render.swap import swap
+
+        swap(self.scene, self.field_file, self.output)
+
+
+@dataclass
+class Render:
+    """Render a scene; takes the flags of the program `mitsuba` (see `mi-ntf render -h`)."""
+
+    arguments: Positional[tuple[str, ...]] = ()
+    """Flags and scene files of the program `mitsuba`."""
+
+    def run(self) -> None:
+        from mi_ntf.launcher import main as launch
+
+        launch(self.arguments)
+
+
+@dataclass
+class Compare:
+    """Measure an image against a reference."""
+
+    image: Positional[Path]
+    """Image to judge, EXR."""
+    reference: Positional[Path]
+    """Image taken as truth, EXR."""
+    json: bool = False
+    """Print JSON in place of a table."""
+
+    def run(self) -> None:
+        from mi_ntf.evaluate.compare import compare, print_table
+
+        _report(compare(self.image, self.reference), self.json, print_table)
+
+
+@dataclass
+class Explain:
+    """Say how a scene would be rendered: fields, lights, visibility, and why."""
+
+    scene: Positional[Path]
+    """Scene with an nrf medium."""
+    define: Annotated[UseAppendAction[tuple[str, ...]], arg(aliases=("-D",), metavar="KEY=VALUE")] = field(
+        default_factory=tuple
+    )
+    """Value of $KEY in the scene."""
+    json: bool = False
+    """Print JSON in place of a table."""
+
+    def run(self) -> None:
+        parameters = dict(item.partition("=")[::2] for item in self.define)
+        if not all("=" in item for item in self.define):
+            raise UsageError(f"-D needs KEY=VALUE, got {' '.join(self.define)}")
+        from mi_ntf.render.explain import explain, print_table
+
+        _report(explain(self.scene, parameters), self.json, print_table)
+
+
+@dataclass
+class Info:
+    """Describe a field file."""
+
+    field_file: Annotated[Positional[Path], arg(metavar="FIELD")]
+    """Trained field."""
+    json: bool = False
+    """Print JSON in place of a table."""
+
+    def run(self) -> None:
+        from mi_ntf.core.field_file import describe
+
+        _report(describe(self.field_file), self.json, _print_pairs)
+
+
+@dataclass
+class Doctor:
+    """Check Python, Mitsuba, LLVM, CUDA, the bridge and the extras; name the remedy of each fault."""
+
+    json: bool = False
+    """Print JSON in place of a table."""
+
+    def run(self) -> int:
+        from mi_ntf.doctor import examine, print_table
+
+        report = examine()
+        _report(report, self.json, print_table)
+        return 0 if report["ok"] else 1
+
+
+Command = (
+    Annotated[Capture, subcommand("capture")]
+    | Annotated[Train, subcommand("train")]
+    | Annotated[Swap, subcommand("swap")]
+    | Annotated[Render, subcommand("render")]
+    | Annotated[Compare, subcommand("compare")]
+    | Annotated[Explain, subcommand("explain")]
+    | Annotated[Info, subcommand("info")]
+    | Annotated[Doctor, subcommand("doctor")]
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command line (default: sys.argv) and return the exit code."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    debug = os.environ.get("MI_NTF_DEBUG") == "1"
+    try:
+        return parse(words).run() or 0
+    except SystemExit as leave:  # argument parsers end this way, with 0 after help and 2 on bad usage
+        return leave.code if isinstance(leave.code, int) else 2
+    except UsageError as error:
+        print(f"mi-ntf: error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+    except (ValueError, OSError, RuntimeError) as error:
+        if debug:
+            traceback.print_exc()
+        print(f"mi-ntf: error: {error}", file=sys.stderr)
+    except ImportError as error:
+        if debug:
+            traceback.print_exc()
+        print(f"mi-ntf: error: {error}; `mi-ntf doctor` names the package to install", file=sys.stderr)
+    except Exception:  # a defect of this package: the traceback is what a report needs
+        traceback.print_exc()
+    return 1
+
+
+def parse(words: list[str]) -> Any:
+    """The command object for a command line. Raises SystemExit as argparse does."""
+    if words[:1] == ["render"]:  # its flags belong to another parser
+        return Render(tuple(words[1:]))
+    return tyro.cli(Command, prog="mi-ntf", description=__doc__, args=words, config=(tyro.conf.FlagCreatePairsOff,))
+
+
+def _report(result: Any, as_json: bool, print_table: Any) -> None:
+    if as_json:
+        print(json.dumps(result, indent=2, default=str))
+    else:
+        print_table(result)
+
+
+def _print_pairs(values: dict[str, Any], indent: str = "") -> None:
+    """One `key  value` a line; nested mappings indented."""
+    width = max((len(str(key)) for key in values), default=0)
+    for key, value in values.items():
+        if isinstance(value, dict):
+            print(f"{indent}{key}")
+            _print_pairs(value, indent + "  ")
+        else:
+            print(f"{indent}{key:<{width}}  {value}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,227 @@
+"""`mi-ntf doctor`: what this machine has, what it lacks, and the command that mends it.
+
+Everything that may abort the process (a bad LLVM does) is tried in a child process.
+"""
+
+import ctypes
+import importlib.metadata
+import importlib.util
+import os
+import platform
+import subprocess
+import sys
+import sysconfig
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from mi_ntf import __version__
+
+PYTHON_MINIMUM = (3, 11)
+MITSUBA = "3.9.1"
+"""The version that pyproject.toml pins: the bridge binds to its C++ interface."""
+LLVM_MINIMUM = 17
+EXTRAS = {
+    "train": ("torch", "tensorboard", "torchmetrics"),
+    "eval": ("skimage", "flip_evaluator", "matplotlib", "trimesh"),
+}
+"""Extras of this package and the modules that they bring."""
+
+# With LLVM 15 or 16 exactly this kind of kernel ends the process.
+_LLVM_PROBE = """
+import drjit as dr, mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+assert dr.minimum(mi.Float(1, 3), 2)[1] == 2
+print(".".join(map(str, dr.detail.llvm_version())))
+for line in open("/proc/self/maps"):
+    if "libLLVM" in line:
+        print(line.split()[-1])
+        break
+"""
+_CUDA_PROBE = """
+import drjit as dr, mitsuba as mi
+mi.set_variant("cuda_ad_rgb")
+assert dr.minimum(mi.Float(1, 3), 2)[1] == 2
+print(".".join(map(str, dr.detail.cuda_version())))
+"""
+
+
+@dataclass(frozen=True)
+class Check:
+    """One finding. `needed`: rendering is impossible without it. `remedy`: empty if nothing is to be done."""
+
+    name: str
+    ok: bool
+    needed: bool
+    found: str
+    remedy: str = ""
+
+
+def examine() -> dict[str, Any]:
+    """All findings as plain data: `ok` (every needed check passed), `version`, `checks` (list of Check fields)."""
+    checks = [check_python(), *check_mitsuba(), check_llvm(), check_cuda(), check_bridge(), check_libpython()]
+    checks += [check_extra(name) for name in EXTRAS]
+    return {
+        "ok": all(check.ok for check in checks if check.needed),
+        "version": __version__,
+        "checks": [asdict(check) for check in checks],
+    }
+
+
+def print_table(report: dict[str, Any]) -> None:
+    """Print the findings, faults with their remedy below."""
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    table = Table(title=f"mi-ntf {report['version']}", title_justify="left", show_header=False, box=None)
+    table.add_column()
+    table.add_column()
+    table.add_column(overflow="fold")
+    for check in report["checks"]:
+        mark = "[green]✔" if check["ok"] else "[red]✘" if check["needed"] else "[yellow]–"
+        table.add_row(mark, check["name"], check["found"])
+    console.print(table)
+    for check in report["checks"]:
+        if check["remedy"]:  # never wrapped, so that commands can be copied
+            console.print(f"{check['name']}: {check['remedy']}", soft_wrap=True, markup=False, highlight=False)
+
+
+def check_python() -> Check:
+    """The interpreter that runs this."""
+    minimum = ".".join(map(str, PYTHON_MINIMUM))
+    ok = sys.version_info >= PYTHON_MINIMUM
+    return Check(
+        "Python",
+        ok,
+        True,
+        f"{platform.python_version()} ({sys.executable})",
+        "" if ok else f"make the environment with Python {minimum} or newer",
+    )
+
+
+def check_mitsuba() -> list[Check]:
+    """Mitsuba at the version that this package pins, and the Dr.Jit that belongs to it."""
+    checks = []
+    for package, wanted in (("mitsuba", MITSUBA), ("drjit", "")):
+        found = _version(package)
+        ok = bool(found) and wanted in ("", found)
+        remedy = "" if ok else f"{sys.executable} -m pip install --force-reinstall mitsuba=={MITSUBA}"
+        checks.append(Check(package, ok, True, found or "not installed", remedy))
+    return checks
+
+
+def check_llvm() -> Check:
+    """Dr.Jit's LLVM back end runs a kernel with a minimum."""
+    code, lines, error = _probe(_LLVM_PROBE)
+    version = lines[0] if lines else ""
+    path = lines[1] if len(lines) > 1 else "path unknown"
+    ok = code == 0 and int(version.split(".")[0]) >= LLVM_MINIMUM
+    if ok:
+        return Check("LLVM", True, True, f"{version} ({path})")
+    found = f"{version} ({path})" if version else f"not usable: {error}"
+    return Check(
+        "LLVM",
+        False,
+        True,
+        found,
+        f"install LLVM {LLVM_MINIMUM} or newer (Debian: sudo apt-get install libllvm19) and run "
+        "`export DRJIT_LIBLLVM_PATH=$(ls /usr/lib/*-linux-gnu/libLLVM.so.19.1)`",
+    )
+
+
+def check_cuda() -> Check:
+    """A GPU is welcome and not needed."""
+    code, lines, _ = _probe(_CUDA_PROBE)
+    return Check("CUDA", code == 0, False, lines[0] if code == 0 and lines else "not available; LLVM is used")
+
+
+def check_bridge() -> Check:
+    """The C++ plugins lie where the stock program looks, and belong to the installed Mitsuba."""
+    if not _version("mitsuba"):
+        return Check("bridge", False, False, "no Mitsuba to extend")
+    from mi_ntf.bridge import PLUGIN_NAMES
+
+    folder = plugin_folder()
+    missing = [name for name in PLUGIN_NAMES if not (folder / f"{name}.so").is_file()]
+    reinstall = f"{sys.executable} -m pip install --force-reinstall --no-deps mi-ntf (in a checkout: `make setup`)"
+    if missing:
+        return Check(
+            "bridge",
+            False,
+            False,
+            f"not installed ({', '.join(missing)}); `mi-ntf render` works without it",
+            f"install a C++ compiler (Debian: sudo apt-get install g++), then {reinstall}",
+        )
+    built_for = bridge_version(folder / "nrf.so")
+    if built_for != _version("mitsuba"):
+        return Check(
+            "bridge", False, False, f"built for mitsuba {built_for}, installed is {_version('mitsuba')}", reinstall
+        )
+    return Check("bridge", True, False, f"built for mitsuba {built_for} ({folder})")
+
+
+def check_libpython() -> Check:
+    """With a shared libpython the stock program runs Python inside; without it, it hands over to `mi-ntf render`."""
+    name = f"libpython{sys.version_info.major}.{sys.version_info.minor}.so.1.0"
+    library = Path(sysconfig.get_config_var("LIBDIR") or "") / name
+    shared = library.is_file()
+    if not shared and Path(sys.base_prefix) == Path("/usr"):
+        try:
+            ctypes.CDLL(name)
+            shared = True
+        except OSError:
+            pass
+    remedy = f"sudo apt-get install {name.removesuffix('.so.1.0')}" if sys.base_prefix == "/usr" else ""
+    return Check(
+        "libpython",
+        shared,
+        False,
+        name if shared else f"no {name}; `mitsuba` hands over to `mi-ntf render`",
+        "" if shared else remedy,
+    )
+
+
+def check_extra(extra: str) -> Check:
+    """Modules of one optional extra, by presence alone: nothing is imported."""
+    missing = [module for module in EXTRAS[extra] if importlib.util.find_spec(module) is None]
+    remedy = f"{sys.executable} -m pip install 'mi-ntf[{extra}]'" if missing else ""
+    return Check(
+        f"extra {extra}", not missing, False, "missing: " + ", ".join(missing) if missing else "installed", remedy
+    )
+
+
+def plugin_folder() -> Path:
+    """Folder in which Mitsuba's program looks for plugins, whatever the scene."""
+    spec = importlib.util.find_spec("mitsuba.config")
+    assert spec is not None and spec.origin is not None  # check_mitsuba comes first
+    return Path(spec.origin).parent / "plugins"
+
+
+def bridge_version(library: Path) -> str:
+    """The Mitsuba version that a bridge library was built for, from its mark; '' if it has none."""
+    mark = b"mi_ntf bridge for mitsuba "
+    _, found, rest = library.read_bytes().partition(mark)
+    return rest.partition(b"\0")[0].decode() if found else ""
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return ""
+
+
+def _probe(code: str) -> tuple[int, list[str], str]:
+    """Run Python code in a child: exit status, words of its output, the line that names the fault."""
+    child = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        env={**os.environ, "PYTHONWARNINGS": "ignore"},
+    )
+    errors = child.stderr.strip().splitlines()
+    named = [line for line in errors if "error" in line.lower()]
+    reason = (named or errors or [f"the process ended with status {child.returncode}"])[-1]
+    return child.returncode, child.stdout.split(), reason

@@ -1,0 +1,131 @@
+"""`mi-ntf render`: the stock program `mitsuba` in Python, for machines without a C++ compiler.
+
+It takes the stock program's flags and does what `src/mitsuba/mitsuba.cpp` of Mitsuba 3.9.1 does:
+parse, instantiate, render without developing, let the film write the file.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_ntf import bridge
+from mi_ntf.core.errors import MiNtfError
+
+VARIANT_PRIORITY = ("cuda_ad_rgb", "llvm_ad_rgb")
+"""Without `-m`, the first of these that this machine can run, as in the stock program."""
+
+
+def parser() -> argparse.ArgumentParser:
+    """The stock program's command line."""
+    p = argparse.ArgumentParser(
+        prog="mi-ntf render", description="Render Mitsuba scenes; same flags as the program `mitsuba`."
+    )
+    p.add_argument("scenes", nargs="+", metavar="SCENE.xml")
+    p.add_argument(
+        "-m", "--mode", metavar="VARIANT", help="default: the first available of " + ", ".join(VARIANT_PRIORITY)
+    )
+    p.add_argument("-v", "--verbose", action="count", default=0, help="more messages; may be given twice")
+    p.add_argument("-t", "--threads", type=int, metavar="COUNT", help="number of CPU threads, at least 1")
+    p.add_argument(
+        "-D", "--define", action="append", default=[], metavar="KEY=VALUE", help="value of $KEY in the scene"
+    )
+    p.add_argument("-s", "--sensor", type=int, default=0, metavar="INDEX", help="sensor to render (default 0)")
+    p.add_argument("-a", "--append", default="", metavar="PATH;PATH", help="folders to search for resources")
+    p.add_argument("-o", "--output", metavar="FILE", help="image to write (default: beside the scene)")
+    p.add_argument("-O", type=int, choices=range(6), dest="optimise", metavar="0-5", help="Dr.Jit optimisation level")
+    p.add_argument("-S", action="store_true", dest="print_ir", help="print the intermediate representation")
+    p.add_argument("-W", action="count", default=0, dest="wavefront", help="wavefronts in place of a megakernel")
+    return p
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Run the command line `arguments` (without the program's name).
+
+    Raises MiNtfError, OSError or RuntimeError if the work failed and SystemExit(2) on bad usage.
+    """
+    p = parser()
+    args = p.parse_args(arguments)
+    parameters = {}
+    for item in args.define:
+        key, separator, value = item.partition("=")
+        if not separator:
+            p.error(f"-D {item}: expected KEY=VALUE")
+        parameters[key] = value
+
+    _apply_settings(args)
+    for scene in args.scenes:
+        render_file(Path(scene), parameters, sensor_index=args.sensor, output=args.output and Path(args.output))
+
+
+def render_file(path: Path, parameters: dict[str, str], *, sensor_index: int = 0, output: Path | None = None) -> None:
+    """Render one scene file in the current variant and write the image with the film.
+
+    `parameters` are the values of `$key` in the scene. The image goes to `output` or, by default,
+    beside the scene; the film sets the extension. Raises MiNtfError if the scene cannot be rendered.
+    """
+    if not path.is_file():
+        raise MiNtfError(f"scene {path} does not exist")
+    scene = mi.load_file(str(path), **parameters)
+    if not isinstance(scene, mi.Scene):
+        raise MiNtfError(f"{path}: the root element must be a <scene>")
+    if not 0 <= sensor_index < len(scene.sensors()):
+        raise MiNtfError(f"{path} has {len(scene.sensors())} sensors, so there is no sensor {sensor_index}")
+    if scene.integrator() is None:
+        raise MiNtfError(f"{path}: no integrator specified")
+
+    sensor = scene.sensors()[sensor_index]
+    scene.integrator().render(scene, sensor, seed=0, spp=0, develop=False, evaluate=True)
+    sensor.film().write(str(output or path))
+
+
+def _apply_settings(args: argparse.Namespace) -> None:
+    """Variant, plugins, threads, log level, search path and Dr.Jit flags."""
+    level = min(args.verbose, 2)
+    mi.set_log_level((mi.LogLevel.Info, mi.LogLevel.Debug, mi.LogLevel.Trace)[level])
+    dr.set_log_level((dr.LogLevel.Error, dr.LogLevel.Warn, dr.LogLevel.Info)[level])
+
+    if args.mode and args.mode not in mi.variants():
+        raise MiNtfError(f"unknown variant {args.mode!r}; this Mitsuba has {', '.join(mi.variants())}")
+    try:
+        mi.set_variant(*([args.mode] if args.mode else VARIANT_PRIORITY))
+    except ImportError as error:
+        raise MiNtfError(
+            f"this machine cannot run {args.mode or 'any of ' + ', '.join(VARIANT_PRIORITY)}: "
+            f"`mi-ntf doctor` names the remedy ({error})"
+        ) from error
+    mi.Log(mi.LogLevel.Info, f'Rendering using the "{mi.variant()}" variant.')
+    bridge.register_all(mi.variant())
+
+    if args.threads is not None:
+        if args.threads < 1:
+            raise MiNtfError(f"-t {args.threads}: at least one thread is needed")
+        dr.set_thread_count(args.threads)
+    for folder in filter(None, args.append.split(";")):
+        mi.file_resolver().append(folder)
+
+    flags = (
+        dr.JitFlag.MergeFunctions,
+        dr.JitFlag.ConstantPropagation,
+        dr.JitFlag.ValueNumbering,
+        dr.JitFlag.OptimizeCalls,
+        dr.JitFlag.OptimizeLoops,
+    )
+    if args.optimise is not None:
+        for position, flag in enumerate(flags):
+            dr.set_flag(flag, args.optimise > position)
+    if args.wavefront:
+        dr.set_flag(dr.JitFlag.SymbolicLoops, False)
+    if args.wavefront > 1:
+        dr.set_flag(dr.JitFlag.SymbolicCalls, False)
+    dr.set_flag(dr.JitFlag.PrintIR, args.print_ir)
+
+
+if __name__ == "__main__":
+    from mi_ntf.cli import main as cli_main
+
+    # The C++ bridge lands here when the environment has no shared libpython.
+    sys.exit(cli_main(["render", *sys.argv[1:]]))

@@ -1,0 +1,226 @@
+"""The stock program `mitsuba` of the wheel loads plugins written in Python.
+
+Its own `prb` serves as the plugin in most tests; a stand-in for `mi_ntf.render` shows what
+`nrf` and `ntf` add: one name for several kinds of object, and faults while rendering.
+"""
+
+import re
+import tomllib
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers.programs import run_program
+
+from mi_ntf import bridge, doctor
+
+ROOT = Path(__file__).parents[1]
+
+SCENE = """
+<scene version="3.0.0">
+  <default name="integrator" value="prb"/>
+  <integrator type="$integrator"><integer name="max_depth" value="3"/></integrator>
+  <sensor type="perspective">
+    <transform name="to_world"><lookat origin="0,0,4" target="0,0,0" up="0,1,0"/></transform>
+    <film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="8"/></film>
+    <sampler type="independent"><integer name="sample_count" value="4"/></sampler>
+  </sensor>
+  <emitter type="point"><point name="position" value="1,2,4"/></emitter>
+  <shape type="sphere"/>
+</scene>
+"""
+
+# Python reads a module of this name at its start, wherever it lies on the path.
+STAND_IN = """
+import sys, types
+
+def register():
+    import mitsuba as mi
+
+    class Fog(mi.Medium):
+        def __init__(self, props):
+            mi.Medium.__init__(self, props)
+            self.density = props["density"]
+
+    class Constant(mi.CppADIntegrator):
+        def __init__(self, props):
+            super().__init__(props)
+            self.depth = props.get("max_depth", 1)
+
+        def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+            assert "torch" not in sys.modules
+            if self.depth < 0:
+                raise ValueError("a fault while rendering")
+            film = (scene.sensors()[sensor] if isinstance(sensor, int) else sensor).film()
+            film.prepare([])
+            block = film.create_block()
+            film.put_block(block)
+            return film.develop() if develop else mi.TensorXf()
+
+    kinds = lambda props: Fog(props) if "density" in props else Constant(props)
+    keep.append(kinds)
+    mi.register_integrator("nrf", kinds)
+
+keep = []
+sys.modules["mi_ntf.render"] = types.SimpleNamespace(register=register)
+"""
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    path = tmp_path / "scene.xml"
+    path.write_text(SCENE)
+    return path
+
+
+@pytest.fixture
+def stand_in(tmp_path: Path) -> dict[str, str]:
+    """Environment variables under which a stand-in takes the place of mi_ntf.render."""
+    folder = tmp_path / "stand_in"
+    folder.mkdir()
+    (folder / "sitecustomize.py").write_text(STAND_IN)
+    return {"PYTHONPATH": str(folder)}
+
+
+def test_installed_under_every_name():
+    names = re.search(r"set\(MI_NTF_PLUGIN_NAMES\s+([^)]*)\)", (ROOT / "CMakeLists.txt").read_text())
+    assert sorted(names[1].split()) == sorted(bridge.PLUGIN_NAMES)
+    for name in bridge.PLUGIN_NAMES:
+        assert doctor.bridge_version(doctor.plugin_folder() / f"{name}.so") == mi.__version__
+
+
+def test_names_cover_mitsubas_python_integrators():
+    folder = Path(mi.__path__[0]) / "python" / "ad" / "integrators"
+    registered = set()
+    for file in folder.glob("*.py"):
+        registered |= set(re.findall(r'register_integrator\("(\w+)"', file.read_text()))
+    assert registered == set(bridge.STOCK_INTEGRATORS)
+
+
+def test_version_pins_agree():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    pin = f"mitsuba=={doctor.MITSUBA}"
+    assert pin in project["project"]["dependencies"]
+    assert pin in project["build-system"]["requires"]
+
+
+def test_twenty_runs_end_well(scene: Path):
+    for _ in range(20):
+        done = run_program("mitsuba", "-m", "llvm_ad_rgb", scene, cwd=scene.parent)
+        assert done.returncode == 0, done.stderr
+        assert done.stderr == ""
+
+
+def test_program_equals_python(scene: Path):
+    done = run_program("mitsuba", "-m", "llvm_ad_rgb", "-o", "image.exr", scene, cwd=scene.parent)
+    assert done.returncode == 0, done.stderr
+    mi.set_variant("llvm_ad_rgb")
+    expected = np.array(mi.render(mi.load_file(str(scene)), seed=0))
+    image = np.array(mi.Bitmap(str(scene.parent / "image.exr")))[..., :3]
+    # The film stores 16-bit floats: relative error 2^-11, here of values up to about 0.1.
+    np.testing.assert_allclose(image, expected[..., :3], rtol=5e-4, atol=1e-6)
+    assert expected.max() > 0.01
+
+
+@pytest.mark.parametrize("name", sorted(set(bridge.STOCK_INTEGRATORS) - {"prb"}))
+def test_other_stock_integrators_run(scene: Path, name: str):
+    done = run_program("mitsuba", "-m", "llvm_ad_rgb", f"-Dintegrator={name}", scene, cwd=scene.parent)
+    assert done.returncode == 0, done.stderr
+
+
+def test_from_another_folder_by_relative_path(scene: Path, tmp_path: Path):
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    done = run_program("mitsuba", "-m", "llvm_ad_rgb", "-o", "here.exr", f"../{scene.name}", cwd=elsewhere)
+    assert done.returncode == 0, done.stderr
+    assert (elsewhere / "here.exr").is_file()
+
+
+def test_program_keeps_its_messages(scene: Path):
+    done = run_program("mitsuba", "-m", "llvm_ad_rgb", scene, cwd=scene.parent)
+    # Importing Mitsuba in Python raises the log level; messages after that show it was put back.
+    assert 'Developing "' in done.stdout
+
+
+@pytest.mark.parametrize("name", ["prb", "nrf"])
+def test_scalar_variant_is_refused_in_one_sentence(scene: Path, name: str):
+    done = run_program("mitsuba", "-m", "scalar_rgb", f"-Dintegrator={name}", scene, cwd=scene.parent)
+    assert done.returncode != 0
+    assert f'plugin "{name}" works in ' in done.stderr
+    assert 'not in "scalar_rgb": run `mitsuba -m llvm_ad_rgb' in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_spectral_variant_is_refused_for_fields():
+    with pytest.raises(ValueError, match=r'"nrf" works in llvm_ad_rgb and cuda_ad_rgb, not in "llvm_ad_spectral"'):
+        bridge.check_variant("nrf", "llvm_ad_spectral")
+    bridge.check_variant("prb", "llvm_ad_spectral")
+
+
+def test_misspelt_property_is_named_with_its_line(scene: Path):
+    scene.write_text(SCENE.replace("max_depth", "max_deep"))
+    done = run_program("mitsuba", "-m", "llvm_ad_rgb", scene, cwd=scene.parent)
+    assert done.returncode != 0
+    assert "line 4" in done.stderr
+    assert 'unreferenced property in integrator plugin of type "prb"' in done.stderr
+    assert "max_deep" in done.stderr
+
+
+def test_constructor_fault_reaches_the_terminal(scene: Path):
+    scene.write_text(SCENE.replace('value="3"', 'value="-3"'))
+    done = run_program("mitsuba", "-m", "llvm_ad_rgb", scene, cwd=scene.parent)
+    assert done.returncode != 0
+    assert "Traceback" in done.stderr
+    assert '"max_depth" must be set to -1' in done.stderr
+
+
+def test_rendering_fault_reaches_the_terminal(scene: Path, stand_in: dict[str, str]):
+    scene.write_text(SCENE.replace('value="3"', 'value="-3"'))
+    done = run_program("mitsuba", "-m", "llvm_ad_rgb", "-Dintegrator=nrf", scene, cwd=scene.parent, **stand_in)
+    assert done.returncode != 0
+    assert "Traceback" in done.stderr
+    assert "a fault while rendering" in done.stderr
+
+
+def test_one_name_serves_medium_and_integrator(scene: Path, stand_in: dict[str, str]):
+    medium = (
+        '<shape type="sphere"><medium name="interior" type="nrf"><float name="density" value="1"/></medium></shape>'
+    )
+    scene.write_text(SCENE.replace('<shape type="sphere"/>', medium))
+    for _ in range(5):  # medium and integrator are made by threads that may run at the same time
+        done = run_program("mitsuba", "-m", "llvm_ad_rgb", "-Dintegrator=nrf", scene, cwd=scene.parent, **stand_in)
+        assert done.returncode == 0, done.stderr
+
+
+def test_name_that_registers_nothing_is_an_error(scene: Path, stand_in: dict[str, str]):
+    scene.write_text(SCENE.replace('<emitter type="point">', '<emitter type="ntf">'))
+    done = run_program("mitsuba", "-m", "llvm_ad_rgb", scene, cwd=scene.parent, **stand_in)
+    assert done.returncode != 0
+    assert 'mi_ntf registered no plugin "ntf" for variant "llvm_ad_rgb"' in done.stderr
+
+
+def test_look_alike_writes_the_same_image(scene: Path, stand_in: dict[str, str]):
+    flags = ("-m", "llvm_ad_rgb", "-s", "0")
+    for program, name in ((["mitsuba"], "a.exr"), (["mi-ntf", "render"], "b.exr")):
+        done = run_program(*program, *flags, "-o", name, scene, cwd=scene.parent, **stand_in)
+        assert done.returncode == 0, done.stderr
+    a, b = (np.array(mi.Bitmap(str(scene.parent / name))) for name in ("a.exr", "b.exr"))
+    np.testing.assert_array_equal(a, b)  # same kernels, same seed
+    assert a.max() > 0.01
+
+
+def test_python_registration_survives_the_native_entry(scene: Path, stand_in: dict[str, str]):
+    # load_dict asks for the type of "nrf", which loads the native entry over the one from Python.
+    code = """
+import mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+from mi_ntf.render import register
+register()
+for _ in range(2):
+    assert type(mi.load_dict({"type": "nrf", "density": 2.0})).__name__ == "Fog"
+    assert type(mi.load_dict({"type": "nrf"})).__name__ == "Constant"
+    assert type(mi.load_dict({"type": "prb"})).__name__ == "PRBIntegrator"
+"""
+    done = run_program("python", "-c", code, cwd=scene.parent, **stand_in)
+    assert done.returncode == 0, done.stderr
