@@ -6,8 +6,8 @@ A field has three networks, each an encoding followed by a ReLU multilayer perce
     reflectance    x → 8        raw normal (3), albedo (3), roughness (1), specular weight (1)
     transmittance  ray → 2      raw (a, b) of :func:`mi_ntf.core.logistic.parameters`
 
-The third sees the ray (p1, p2) as the encodings of `points` equidistant points on its chord, from p1 to p2, followed by the
-six coordinates of p1 and p2.
+The third sees the ray (p1, p2) as the encodings of `points` equidistant points on its chord, from p1 to p2, followed by
+the six coordinates of p1 and p2.
 """
 
 import math
@@ -95,7 +95,8 @@ def header_from_json(data: dict, source: str) -> Header:
     """Parse and check a header; `source` (a file name) starts every error text."""
     version = data.get("format") if isinstance(data, dict) else None
     if version != FORMAT:
-        raise MiNtfError(f"{source}: field format {version!r}, this build reads {FORMAT}; train or export the field anew")
+        raise MiNtfError(
+            f"{source}: field format {version!r}, this build reads {FORMAT}; train or export the field anew")
     try:
         nets = {name: _network(data["architecture"][name]) for name in WIDTHS}
         sim = Similarity(tuple(map(float, data["similarity"]["center"])), float(data["similarity"]["radius"]))
@@ -103,7 +104,8 @@ def header_from_json(data: dict, source: str) -> Header:
             raise ValueError(f"similarity {sim}")
         return Header(Architecture(**nets), sim, dict(data.get("provenance", {})))
     except (KeyError, TypeError, ValueError) as error:
-        raise MiNtfError(f"{source}: the header's description is incomplete ({error!r}); was it written by `mi-ntf train`?")
+        raise MiNtfError(f"{source}: the header's description is incomplete ({error!r}); "
+                         "was it written by `mi-ntf train`?") from None
 
 
 def _network(data: dict) -> Network:

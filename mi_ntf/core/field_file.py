@@ -47,9 +47,11 @@ def load_header(path: str | Path) -> Header:
         with safetensors.safe_open(path, "np") as file:
             metadata = file.metadata() or {}
     except safetensors.SafetensorError as error:
-        raise MiNtfError(f"{path} is no field file or is truncated ({error}); make it anew with `mi-ntf train`") from None
+        raise MiNtfError(f"{path} is no field file or is truncated ({error}); "
+                         "make it anew with `mi-ntf train`") from None
     if _KEY not in metadata:
-        raise MiNtfError(f"{path} is a safetensors file of another program (no '{_KEY}' header); pass a file of `mi-ntf train`")
+        raise MiNtfError(f"{path} is a safetensors file of another program (no '{_KEY}' header); "
+                         "pass a file of `mi-ntf train`")
     try:
         data = json.loads(metadata[_KEY])
     except json.JSONDecodeError as error:

@@ -3,13 +3,13 @@
     τ(t) = S(a (t − b)),      S(z) = 1/(1 + e^−z)
 
 τ is the transmittance from the point at t to the light-side end of the chord: 1 near the light, falling away from it.
-`a` > 0 is the slope in inverse field units (a quarter of it is the largest dτ/dt), `b` the place where half of the light
-is gone. All forms have finite values and gradients in float32 for every finite input.
+`a` > 0 is the slope in inverse field units (a quarter of it is the largest dτ/dt), `b` the place where half of the
+light is gone. All forms have finite values and gradients in float32 for every finite input.
 """
 
 MAX_LOG_SLOPE = 6.5
-"""ln of the largest slope, a ≤ 665: a step of width 0.007 of the unit sphere's radius. Learned skins are no sharper, and
-above it float32 products a·(t − b) lose the fourth digit of τ."""
+"""ln of the largest slope, a ≤ 665: a step of width 0.007 of the unit sphere's radius. Learned skins are no sharper,
+and above it float32 products a·(t − b) lose the fourth digit of τ."""
 MAX_CENTRE = 1.2
 """|b| stays below this many half chords. Beyond 1, so that an empty central chord can reach τ = 1 at its far end."""
 _CLIP = 80.0  # e^80 is finite in float32; S differs from 0 or 1 by less than any float32 can tell.
@@ -25,7 +25,8 @@ def sigmoid(ops, z):
 def softplus(ops, z):
     """ln(1 + e^z) without overflow: max(z, 0) + ln(1 + e^−|z|).
 
-    max(z, 0) is written (z + |z|)/2: frameworks disagree on the derivative of a tie, this form has ½ at 0 in all of them.
+    max(z, 0) is written (z + |z|)/2: frameworks disagree on the derivative of a tie, this form has ½ at 0 in all of
+    them.
     """
     return (z + ops.abs(z)) / 2 + _bend(ops, z)
 
@@ -48,8 +49,8 @@ def optical_depth(ops, t, a, b):
 def mean_transmittance(ops, t0, t1, a, b):
     """Mean of τ over [t0, t1], t1 ≥ t0: a box filter that keeps gradients below 1 for slopes of any steepness.
 
-    [softplus(a (t1 − b)) − softplus(a (t0 − b))] / Δ with Δ = a (t1 − t0). For Δ below ½ the difference would cancel (in
-    float32 all digits are gone at Δ = 1e-7), so there the series around the middle c of the step takes over:
+    [softplus(a (t1 − b)) − softplus(a (t0 − b))] / Δ with Δ = a (t1 − t0). For Δ below ½ the difference would cancel
+    (in float32 all digits are gone at Δ = 1e-7), so there the series around the middle c of the step takes over:
 
         S + S″ δ²/6 + S⁗ δ⁴/120,   S = S(a (c − b)),  δ = Δ/2,  S′ = S (1 − S),  S″ = S′ (1 − 2S),  S⁗ = S″ (1 − 12 S′)
 
@@ -61,8 +62,8 @@ def mean_transmittance(ops, t0, t1, a, b):
     d2 = width * width / 4
     series = centre + slope * (1 - 2 * centre) * (d2 / 6) * (1 + (1 - 12 * slope) * (d2 / 20))
     z0, z1 = a * (t0 - b), a * (t1 - b)
-    # max(z1, 0) − max(z0, 0) as a clamp: exactly Δ where both are large. `maximum` below keeps the gradient of the branch
-    # not taken finite at Δ = 0.
+    # max(z1, 0) − max(z0, 0) as a clamp: exactly Δ where both are large. `maximum` below keeps the gradient of the
+    # branch not taken finite at Δ = 0.
     rise = ops.minimum(ops.maximum(z1, 0.0), width)
     difference = (rise + _bend(ops, z1) - _bend(ops, z0)) / ops.maximum(width, _SERIES)
     return ops.where(width < _SERIES, series, difference)

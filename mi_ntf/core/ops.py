@@ -1,8 +1,8 @@
 """Elementary functions by name, so that one formula serves NumPy, Dr.Jit and PyTorch.
 
 A formula of :mod:`mi_ntf.core` takes its arrays as scalars or component tuples and, as its first argument, a namespace
-with ``sqrt exp log sin cos abs maximum minimum where``. This module holds the NumPy one, the float64 oracle; ``infer`` and
-``train`` each hold theirs.
+with ``sqrt exp log sin cos abs maximum minimum where``. This module holds the NumPy one, the float64 oracle; ``infer``
+and ``train`` each hold theirs.
 """
 
 import numpy as np

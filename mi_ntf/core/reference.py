@@ -1,8 +1,9 @@
 """The networks in NumPy float64: the oracle that the PyTorch and Dr.Jit twins are held against. Slow, short, exact.
 
-Conventions that the twins share. Points are (n, 3) in field coordinates, inside [−1, 1]³. A plane of resolution r has its
-texel centres at u = (i + ½)/r with u = (x + 1)/2; the first named coordinate runs along the last spatial axis; beyond the
-outermost centres the border texel is repeated. Layers compute W x + b; every layer but the last is followed by ReLU.
+Conventions that the twins share. Points are (n, 3) in field coordinates, inside [−1, 1]³. A plane of resolution r has
+its texel centres at u = (i + ½)/r with u = (x + 1)/2; the first named coordinate runs along the last spatial axis;
+beyond the outermost centres the border texel is repeated. Layers compute W x + b; every layer but the last is followed
+by ReLU.
 """
 
 import numpy as np
@@ -33,7 +34,8 @@ def encode(encoding: Encoding, tensors: dict, name: str, x: np.ndarray) -> np.nd
     levels = []
     for i in range(len(encoding.resolutions)):
         planes = tensors[f"{name}.planes.{i}"].astype(np.float64)
-        levels.append(np.prod([bilinear(p, u[:, a], u[:, b]) for p, (a, b) in zip(planes, PLANES, strict=True)], axis=0))
+        features = [bilinear(p, u[:, a], u[:, b]) for p, (a, b) in zip(planes, PLANES, strict=True)]
+        levels.append(np.prod(features, axis=0))
     return np.concatenate(levels, axis=1)
 
 

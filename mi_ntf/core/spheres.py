@@ -16,8 +16,8 @@ elementary functions (:mod:`mi_ntf.core.ops`).
 from .ops import dot, normalize
 
 MIN_HALF_CHORD = 0.05
-"""Chords shorter than twice this graze the sphere, where no captured object reaches (the similarity leaves a margin) and
-where float32 loses the end points: their transmittance is 1 by definition. A uniform ray has such a chord with
+"""Chords shorter than twice this graze the sphere, where no captured object reaches (the similarity leaves a margin)
+and where float32 loses the end points: their transmittance is 1 by definition. A uniform ray has such a chord with
 probability h² = 0.25 %."""
 
 
@@ -50,7 +50,8 @@ def end_points(m, d, h):
 
 
 def from_end_points(ops, p1, p2):
-    """Inverse of :func:`end_points`: ``(m, d, h)`` of the chord from `p1` to `p2`, two distinct points of the unit sphere."""
+    """Inverse of :func:`end_points`: ``(m, d, h)`` of the chord from `p1` to `p2`, two distinct points of the unit
+    sphere."""
     m = tuple((a + b) / 2 for a, b in zip(p1, p2, strict=True))
     span = tuple(b - a for a, b in zip(p1, p2, strict=True))
     h = ops.sqrt(ops.maximum(dot(span, span), 1e-20)) / 2

@@ -7,7 +7,7 @@ import pytest
 import safetensors.numpy
 
 from mi_ntf.core import field_file
-from mi_ntf.core.architecture import (FAST, Architecture, Encoding, Header, Network, Similarity, header_from_json)
+from mi_ntf.core.architecture import FAST, Architecture, Encoding, Header, Network, Similarity, header_from_json
 from mi_ntf.core.errors import MiNtfError
 
 SMALL = Architecture(
@@ -81,7 +81,8 @@ def test_fast_preset_survives_json():
     (lambda t: t.update(extra=np.zeros(2, np.float32)), "unknown tensor extra"),
     (lambda t: t.update({"density.layers.0.bias": np.zeros(4, np.float32)}),
      r"density.layers.0.bias: expected shape \(5,\), found \(4,\)"),
-    (lambda t: t["density.layers.0.bias"].__setitem__(slice(0, 2), np.nan), "density.layers.0.bias: 2 values are NaN or infinite"),
+    (lambda t: t["density.layers.0.bias"].__setitem__(slice(0, 2), np.nan),
+     "density.layers.0.bias: 2 values are NaN or infinite"),
     (lambda t: t.update({"density.layers.0.bias": np.zeros(5, np.int32)}),
      "density.layers.0.bias: expected floating point, found int32"),
 ])
@@ -101,14 +102,14 @@ def test_wrong_tensors_are_named_on_saving_and_on_loading(tmp_path, change, text
 def test_all_faults_come_in_one_error(tmp_path):
     tensors = make_tensors(SMALL)
     del tensors["density.planes.0"], tensors["transmittance.layers.1.bias"]
-    with pytest.raises(MiNtfError, match="missing tensor density.planes.0; missing tensor transmittance.layers.1.bias"):
+    with pytest.raises(MiNtfError, match=r"tensor density.planes.0; missing tensor transmittance.layers.1.bias"):
         field_file.save(tmp_path / "f", Header(SMALL), tensors)
 
 
 def test_features_beyond_half_precision_are_refused_when_saving(tmp_path):
     tensors = make_tensors(SMALL)
     tensors["density.planes.0"][0, 0, 0, 0] = 1e5
-    with pytest.raises(MiNtfError, match="as float16 .*density.planes.0: 1 values are NaN or infinite"):
+    with pytest.raises(MiNtfError, match=r"as float16 .*density.planes.0: 1 values are NaN or infinite"):
         field_file.save(tmp_path / "f", Header(SMALL), tensors)
 
 
@@ -117,21 +118,21 @@ def test_truncated_file(saved):
     data = path.read_bytes()
     for size in (0, 6, len(data) // 2, len(data) - 1):
         path.write_bytes(data[:size])
-        with pytest.raises(MiNtfError, match="is no field file or is truncated .*make it anew with `mi-ntf train`"):
+        with pytest.raises(MiNtfError, match=r"is no field file or is truncated .*make it anew with `mi-ntf train`"):
             field_file.load(path)
 
 
 def test_foreign_and_absent_files(tmp_path):
     path = tmp_path / "foreign.safetensors"
     safetensors.numpy.save_file({"w": np.zeros(2, np.float32)}, path)
-    with pytest.raises(MiNtfError, match="safetensors file of another program .*pass a file of `mi-ntf train`"):
+    with pytest.raises(MiNtfError, match=r"safetensors file of another program .*pass a file of `mi-ntf train`"):
         field_file.load(path)
     path.write_bytes(b"\x80\x04K\x01.")  # a pickle
     with pytest.raises(MiNtfError, match="is no field file or is truncated"):
         field_file.load(path)
-    with pytest.raises(MiNtfError, match="does not exist; make one with `mi-ntf train DATASET -o nowhere.safetensors`"):
+    with pytest.raises(MiNtfError, match=r"not exist; make one with `mi-ntf train DATASET -o nowhere.safetensors`"):
         field_file.load(tmp_path / "nowhere.safetensors")
-    with pytest.raises(MiNtfError, match="folder .*no does not exist; create it first"):
+    with pytest.raises(MiNtfError, match=r"folder .*no does not exist; create it first"):
         field_file.save(tmp_path / "no" / "f", Header(SMALL), make_tensors(SMALL))
 
 
@@ -139,7 +140,8 @@ def test_foreign_and_absent_files(tmp_path):
     (lambda d: d.update(format=2), "field format 2, this build reads 1; train or export the field anew"),
     (lambda d: d.pop("architecture"), "incomplete .*architecture"),
     (lambda d: d["architecture"].pop("transmittance"), "incomplete .*transmittance"),
-    (lambda d: d["architecture"]["density"]["encoding"].update(kind="hash"), "'hash', expected 'planes' or 'frequency'"),
+    (lambda d: d["architecture"]["density"]["encoding"].update(kind="hash"),
+     "'hash', expected 'planes' or 'frequency'"),
     (lambda d: d["architecture"]["density"]["encoding"].update(resolutions=[1]), "resolutions of at least 2"),
     (lambda d: d["architecture"]["density"].update(hidden=[0]), "expected positive integers"),
     (lambda d: d["similarity"].update(radius=0), "incomplete .*similarity"),
@@ -158,5 +160,5 @@ def test_wrong_headers(change, text):
 @pytest.mark.parametrize("text", ["no json", "[]", "3"])
 def test_headers_that_are_no_description(tmp_path, text):
     safetensors.numpy.save_file({"w": np.zeros(2, np.float32)}, tmp_path / "f", metadata={"mi_ntf": text})
-    with pytest.raises(MiNtfError, match="header is not JSON|field format None"):
+    with pytest.raises(MiNtfError, match=r"header is not JSON|field format None"):
         field_file.load(tmp_path / "f")

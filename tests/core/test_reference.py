@@ -95,8 +95,9 @@ def test_transmittance_parameters(tensors):
         m = o[i] - (o[i] @ d[i]) * d[i]
         h = math.sqrt(1 - m @ m)
         p1, p2 = m - h * d[i], m + h * d[i]
-        features = sum((_planes(tensors, "transmittance", p1 + (k + 0.5) / 4 * (p2 - p1)) for k in range(4)), [])
-        raw_a, raw_b = _layers(tensors, "transmittance", features + [*p1, *p2])
-        assert a[i] == pytest.approx(math.exp(logistic.MAX_LOG_SLOPE * math.tanh(raw_a / logistic.MAX_LOG_SLOPE)), rel=1e-10)
+        features = [f for k in range(4) for f in _planes(tensors, "transmittance", p1 + (k + 0.5) / 4 * (p2 - p1))]
+        raw_a, raw_b = _layers(tensors, "transmittance", [*features, *p1, *p2])
+        log_a = logistic.MAX_LOG_SLOPE * math.tanh(raw_a / logistic.MAX_LOG_SLOPE)
+        assert a[i] == pytest.approx(math.exp(log_a), rel=1e-10)
         assert b[i] == pytest.approx(logistic.MAX_CENTRE * h * math.tanh(raw_b), rel=1e-10, abs=1e-14)
     assert np.isfinite([a[0], b[0]]).all() and abs(b[0]) <= logistic.MAX_CENTRE * spheres.MIN_HALF_CHORD

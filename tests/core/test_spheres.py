@@ -47,7 +47,7 @@ def test_round_trip_from_points_on_the_sphere(p1, p2):
     hit, m2, h2 = _chord(m + 0.3 * h * d, d)
     assert hit
     # End points to 1e-13: 1e-16 of the inputs over the shortest half chord, 0.05, twice.
-    np.testing.assert_allclose(np.concatenate(spheres.end_points(tuple(m2), tuple(d), h2)), np.concatenate([p1, p2]), atol=1e-13)
+    np.testing.assert_allclose(spheres.end_points(tuple(m2), tuple(d), h2), [p1, p2], atol=1e-13)
     assert h2 == pytest.approx(float(h), abs=1e-13)
 
 

@@ -1,0 +1,210 @@
+"""Every formula of core in NumPy float64, PyTorch float32 and Dr.Jit float32: values and gradients, from one list.
+
+Inputs are rounded to float32 first, so all three see the same numbers. The gradient oracle is the central difference of
+the NumPy float64 formula.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from mi_ntf.core import logistic, microfacet, ops, spheres
+
+COUNT = 4000
+STEP = 1e-6
+"""Of the central difference, relative to each input's size: truncation 1e-12·f‴, rounding 1e-16/1e-6."""
+
+
+def _uniform(low, high):
+    return lambda rng: [rng.uniform(low, high, COUNT)]
+
+
+def _log_uniform(low, high):
+    return lambda rng: [np.exp(rng.uniform(np.log(low), np.log(high), COUNT))]
+
+
+def _point(rng):
+    return list(rng.uniform(-0.55, 0.55, (3, COUNT)))
+
+
+def _direction(rng):
+    v = rng.normal(size=(3, COUNT))
+    return list(v / np.linalg.norm(v, axis=0))
+
+
+@dataclass(frozen=True)
+class Formula:
+    """`function(ops, *scalars)` → scalars; `inputs`: samplers; tolerances relative to max(|oracle|, `unit`)."""
+
+    name: str
+    function: Callable
+    inputs: tuple
+    value: float
+    gradient: float
+    unit: float = 1.0
+    """Size below which errors count absolutely."""
+
+
+def _chord(o, x, y, z, dx, dy, dz):
+    _, m, h = spheres.chord(o, (x, y, z), (dx, dy, dz))
+    return *m, h
+
+
+def _end_points(o, x, y, z, dx, dy, dz, h):
+    p1, p2 = spheres.end_points((x, y, z), (dx, dy, dz), h)
+    return *p1, *p2
+
+
+def _from_end_points(o, *c):
+    m, d, h = spheres.from_end_points(o, c[:3], c[3:])
+    return *m, *d, h
+
+
+T, B = _uniform(-1, 1), _uniform(-1.1, 1.1)
+GENTLE, STEEP = _log_uniform(0.01, 20), _log_uniform(20, 665)
+# z = a (t − b) carries 3 roundings of 6e-8·|z|; where S(z) is not yet flat |z| < 15 for gentle slopes: 1e-6. Steep ones
+# subtract t − b exactly in part, then multiply: 665·1e-7/4 = 2e-5 of τ, and a·that of its derivatives (unit = a).
+FORMULAS = [
+    Formula("chord", _chord, (_point, _direction), 1e-6, 5e-6),
+    Formula("end_points", _end_points, (_point, _direction, _uniform(0.05, 1)), 5e-7, 5e-7),
+    Formula("from_end_points", _from_end_points, (_point, _direction), 1e-6, 3e-6),
+    Formula("coordinate", lambda o, *c: [spheres.coordinate(c[:3], c[3:])], (_point, _direction), 5e-7, 5e-7),
+    Formula("sigmoid", lambda o, z: [logistic.sigmoid(o, z)], (_uniform(-90, 90),), 5e-7, 5e-7),
+    Formula("softplus", lambda o, z: [logistic.softplus(o, z)], (_uniform(-90, 90),), 5e-7, 5e-7),
+    Formula("tanh", lambda o, z: [logistic.tanh(o, z)], (_uniform(-20, 20),), 5e-7, 5e-7),
+    Formula("transmittance", lambda o, *c: [logistic.transmittance(o, *c)], (T, GENTLE, B), 3e-6, 6e-6),
+    Formula("transmittance, steep", lambda o, *c: [logistic.transmittance(o, *c)], (T, STEEP, B), 5e-5, 1e-4, 665.0),
+    Formula("optical_depth", lambda o, *c: [logistic.optical_depth(o, *c)], (T, GENTLE, B), 3e-6, 6e-6),
+    Formula("optical_depth, steep", lambda o, *c: [logistic.optical_depth(o, *c)], (T, STEEP, B), 1e-6, 1e-4, 100.0),
+    Formula("mean_transmittance, short steps", lambda o, t, w, a, b: [logistic.mean_transmittance(o, t, t + w, a, b)],
+            (T, _log_uniform(1e-4, 0.02), GENTLE, B), 3e-6, 1e-5),
+    # The difference of two softplus over Δ ≥ ½, derivatives over Δ and the width (0.05): rounding divided by both.
+    Formula("mean_transmittance, long steps", lambda o, t, w, a, b: [logistic.mean_transmittance(o, t, t + w, a, b)],
+            (T, _uniform(0.05, 1), GENTLE, B), 3e-6, 3e-5),
+    # ln a is 6.5 tanh: 6.5·2e-7 of a; derivative likewise.
+    Formula("parameters", lambda o, *c: logistic.parameters(o, *c), (_uniform(-12, 12), _uniform(-5, 5),
+            _uniform(0.05, 1)), 3e-6, 1e-5),
+    Formula("through_quantiles", lambda o, b, u, v: logistic.through_quantiles(o, b + u, b, b - v),
+            (T, _log_uniform(0.02, 1), _log_uniform(0.02, 1)), 3e-6, 3e-5),  # t75 − t25 ≥ 0.04, rounded by 1e-7
+    # dD/dα is a difference of two terms 1000 times its value where it crosses zero.
+    Formula("ggx", lambda o, s, a: [microfacet.ggx(s, a)], (_uniform(0, 1), _log_uniform(0.0225, 1)), 1e-6, 3e-5),
+    Formula("smith_g1", lambda o, c, a: [microfacet.smith_g1(o, c, a)], (_uniform(0, 1), _log_uniform(0.0225, 1)),
+            1e-6, 3e-6),
+    # Directions rounded by 6e-8 under a lobe of width α ≥ 0.0225: 6e-8/α per order of derivative, unit peak-relative.
+    Formula("lobes", lambda o, *c: microfacet.lobes(o, c[:3], c[3:6], c[6:9], c[9]),
+            (_direction, _direction, _direction, _uniform(0.15, 1)), 2e-5, 2e-4),
+    Formula("lobes, collocated", lambda o, c, r: microfacet.lobes_collocated(o, c, r),
+            (_uniform(-1, 0.999), _uniform(0.15, 1)), 2e-5, 2e-4),
+    Formula("normalize", lambda o, *c: ops.normalize(o, c), (_point,), 5e-7, 1e-5, 1.0),
+]
+
+
+def _inputs(formula):
+    rng = np.random.default_rng(17)
+    return [np.float32(v) for sample in formula.inputs for v in sample(rng)]
+
+
+def _oracle(formula, inputs):
+    """Values (k, n), and per input the central difference of Σ_k w_k f_k, w = 1, ½, ⅓ …"""
+    inputs = [v.astype(np.float64) for v in inputs]
+    values = np.array(formula.function(ops, *inputs))
+    weights = 1 / np.arange(1, len(values) + 1)
+    gradients = []
+    for i, x in enumerate(inputs):
+        step = STEP * np.maximum(np.abs(x), 1e-2)
+        moved = [[*inputs[:i], x + s, *inputs[i + 1:]] for s in (step, -step)]
+        up, down = (weights @ np.array(formula.function(ops, *m)) for m in moved)
+        gradients.append((up - down) / (2 * step))
+    return values, np.array(gradients)
+
+
+def _torch(formula, inputs):
+    torch = pytest.importorskip("torch")
+    namespace = pytest.importorskip("mi_ntf.train.ops")
+    inputs = [torch.tensor(v, requires_grad=True) for v in inputs]
+    values = formula.function(namespace, *inputs)
+    sum((v / (k + 1)).sum() for k, v in enumerate(values)).backward()
+    return [v.detach().numpy() for v in values], [v.grad.numpy() for v in inputs]
+
+
+def _drjit(formula, inputs):
+    mi = pytest.importorskip("mitsuba")
+    import drjit as dr
+
+    mi.set_variant("llvm_ad_rgb")
+    from mi_ntf.infer import ops as namespace
+
+    inputs = [mi.Float(v) for v in inputs]
+    dr.enable_grad(inputs)
+    values = formula.function(namespace, *inputs)
+    dr.backward(sum((dr.sum(v / (k + 1)) for k, v in enumerate(values)), mi.Float(0)))
+    return [v.numpy() for v in values], [v.grad.numpy() for v in inputs]
+
+
+BACKENDS = {"numpy32": lambda f, x: (f.function(ops, *x), None), "torch": _torch, "drjit": _drjit}
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("formula", FORMULAS, ids=lambda f: f.name)
+def test_values_and_gradients(formula, backend):
+    inputs = _inputs(formula)
+    expected, expected_gradients = _oracle(formula, inputs)
+    values, gradients = BACKENDS[backend](formula, inputs)
+    for value, oracle in zip(values, expected, strict=True):
+        assert value.dtype == np.float32
+        error = np.abs(value - oracle) / np.maximum(np.abs(oracle), 1.0)
+        assert error.max() <= formula.value, f"worst input {[float(v[error.argmax()]) for v in inputs]}"
+    if gradients is None:
+        return
+    for gradient, oracle in zip(gradients, expected_gradients, strict=True):
+        assert np.isfinite(gradient).all()
+        error = np.abs(gradient - oracle) / np.maximum(np.abs(oracle), formula.unit)
+        assert error.max() <= formula.gradient, f"worst input {[float(v[error.argmax()]) for v in inputs]}"
+
+
+def _opposite(o, x):
+    wi, wo = (0.6 * x, 0 * x, 0.8 * x), (-0.6 * x, 0 * x, -0.8 * x)
+    return microfacet.lobes(o, wi, wo, (0 * x, 0 * x, x), 0.2 * x)
+
+
+SINGULAR = {
+    "tangent line": (lambda o, x: _chord(o, x, 0 * x, 0 * x, 0 * x, 0 * x, x), 1.0),
+    "line far outside": (lambda o, x: _chord(o, 50 * x, 0 * x, 0 * x, 0 * x, 0 * x, x), 1.0),
+    "line through the centre": (lambda o, x: _chord(o, 0 * x, 0 * x, x, 0 * x, 0 * x, x), 1.0),
+    "coinciding end points": (lambda o, x: _from_end_points(o, x, 0 * x, 0 * x, x, 0 * x, 0 * x), 1.0),
+    "step of no width": (lambda o, x: [logistic.mean_transmittance(o, x, x, 600 * x, 0 * x)], 1.0),
+    "huge logit": (lambda o, x: [logistic.sigmoid(o, x), logistic.sigmoid(o, -x), logistic.softplus(o, x)], 1e30),
+    "huge raw parameters": (lambda o, x: logistic.parameters(o, x, -x, 0.5 + 0 * x), 1e30),
+    "coinciding quantiles": (lambda o, x: logistic.through_quantiles(o, x, x, x), 0.3),
+    "grazing both": (lambda o, x: microfacet.lobes(o, (1 + 0 * x, x, x), (x, 1 + 0 * x, x), (x, x, 1 + 0 * x), 1 + x),
+                     0.0),
+    "opposite directions": (_opposite, 1.0),
+    "zero vector": (lambda o, x: ops.normalize(o, (x, x, x)), 0.0),
+}
+
+
+@pytest.mark.parametrize("backend", ["torch", "drjit"])
+@pytest.mark.parametrize("name", SINGULAR)
+def test_values_and_gradients_are_finite_at_singular_points(name, backend):
+    function, x = SINGULAR[name]
+    formula = Formula(name, function, (), 0, 0)
+    values, gradients = BACKENDS[backend](formula, [np.full(3, x, np.float32)])
+    assert np.isfinite(values).all() and np.isfinite(gradients).all()
+
+
+@pytest.mark.parametrize("backend", ["torch", "drjit"])
+def test_softplus_has_slope_one_half_at_zero(backend):
+    formula = Formula("softplus", lambda o, z: [logistic.softplus(o, z)], (), 0, 0)
+    values, gradients = BACKENDS[backend](formula, [np.zeros(2, np.float32)])
+    np.testing.assert_allclose(values[0], np.log(2), rtol=1e-7)
+    np.testing.assert_array_equal(gradients[0], 0.5)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("name", ["maximum", "minimum"])
+def test_not_a_number_passes_through(backend, name):
+    formula = Formula(name, lambda o, x: [getattr(o, name)(x, 0.0), getattr(o, name)(x * 0 + 1, x)], (), 0, 0)
+    values, _ = BACKENDS[backend](formula, [np.array([np.nan, 2], np.float32)])
+    assert np.isnan([v[0] for v in values]).all() and np.isfinite([v[1] for v in values]).all()
