@@ -1,0 +1,22 @@
+# Everything happens in .venv inside this checkout; the logic lives in Python.
+PYTHON ?= python3
+RUN := .venv/bin/python
+
+.PHONY: setup demo test clean
+
+setup:
+	@$(PYTHON) tools/setup_env.py
+
+demo:
+	@$(PYTHON) tools/setup_env.py eval
+	@$(RUN) -m mi_ntf.evaluate.demo
+
+# Two workers: tracing in Python is serial, and Dr.Jit's own threads fill what is left.
+test:
+	@$(PYTHON) tools/setup_env.py dev
+	@$(RUN) -m ruff check .
+	@$(RUN) -m pytest -n 2 --dist loadfile -q -m "not slow and not gpu"
+
+clean:
+	rm -rf .venv build dist out .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
