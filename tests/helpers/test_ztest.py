@@ -7,7 +7,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from tests.helpers import ztest
+from helpers import ztest
 
 H, W = 48, 40
 

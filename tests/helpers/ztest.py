@@ -53,8 +53,8 @@ def p_values(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def check(images, references, label: str, block: int = 1) -> None:
     """Fail unless the estimators agree in ≥ 99.75 % of pixels (of `block` × `block` means when `block` > 1).
 
-    `images`, `references`: at least four independent renders each, (h, w, c) linear. On failure their means, and the map
-    of p-values, are written as EXR and the path stands in the error.
+    `images`, `references`: at least four independent renders each, (h, w, c) linear. On failure their means and the
+    map of p-values are written as EXR and the path stands in the error.
     """
     if min(len(images), len(references)) < 4:
         raise ValueError(f"{label}: {len(images)} and {len(references)} renders; a variance needs at least 4 of each")

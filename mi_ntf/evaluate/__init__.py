@@ -1,0 +1,1 @@
+"""Measuring what was rendered. Never imports PyTorch."""

@@ -1,0 +1,110 @@
+"""`mi-ntf compare IMAGE REFERENCE`: read two images, measure, print."""
+
+from pathlib import Path
+
+import numpy as np
+
+from mi_ntf.core.errors import MiNtfError
+
+from . import metrics
+
+EXPLAINED = {
+    "relative_rmse": ("relative RMSE", "√(mean (a−b)² / mean b²), linear"),
+    "psnr": ("PSNR, dB", "sRGB, clipped to [0, 1]"),
+    "ssim": ("SSIM", "sRGB, clipped, Gaussian 11×11"),
+    "flip": ("HDR-FLIP", "mean, 67 pixels a degree"),
+    "max_abs": ("largest error", "linear, any channel"),
+}
+
+
+def compare(image: Path, reference: Path) -> dict[str, float]:
+    """The metrics of :mod:`.metrics` by name, both images composited on black.
+
+    EXR is read as linear and premultiplied, its AOV layers are dropped; PNG as sRGB with straight alpha. Raises
+    :class:`MiNtfError` where a file is missing or unreadable, sizes differ, or a pixel is not finite.
+    """
+    a, b = read_image(image), read_image(reference)
+    if a.shape != b.shape:
+        raise MiNtfError(f"{image} has {_size(a)} pixels, {reference} has {_size(b)}; render both at one size")
+    return compare_arrays(a[..., :3], b[..., :3])
+
+
+def compare_arrays(image: np.ndarray, reference: np.ndarray) -> dict[str, float]:
+    """:func:`compare` for linear RGB arrays (h, w, 3), composited on black."""
+    return {name: getattr(metrics, name)(image, reference) for name in EXPLAINED}
+
+
+def read_image(path: Path) -> np.ndarray:
+    """Linear premultiplied RGBA (h, w, 4), float32; alpha is 1 where the file has none.
+
+    For errors see :func:`compare`.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise MiNtfError(f"image {path} does not exist; render it first")
+    readers = {".exr": _read_exr, ".png": _read_png}
+    if path.suffix.lower() not in readers:
+        raise MiNtfError(f"image {path}: unknown ending {path.suffix!r}; give .exr or .png")
+    pixels = readers[path.suffix.lower()](path)
+    bad = int(np.count_nonzero(~np.isfinite(pixels).all(axis=-1)))
+    if bad:
+        raise MiNtfError(f"image {path}: {bad} of {pixels.shape[0] * pixels.shape[1]} pixels are NaN or infinite; "
+                         "they would make every metric meaningless, so mend the render")
+    return pixels
+
+
+def write_exr(path: Path, pixels: np.ndarray) -> None:
+    """Write linear RGB or RGBA (h, w, 3 or 4) as a float32 EXR, atomically."""
+    import OpenEXR
+
+    channels = {name: np.ascontiguousarray(pixels[..., i], np.float32) for i, name in
+                enumerate("RGBA"[:pixels.shape[-1]])}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    temporary = Path(path).with_suffix(".part.exr")
+    with OpenEXR.File(header, channels) as file:
+        file.write(str(temporary))
+    temporary.replace(path)
+
+
+def print_table(result: dict[str, float]) -> None:
+    """Print what :func:`compare` returned, with each metric's definition."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("metric", "value", "on")
+    for name, value in result.items():
+        title, definition = EXPLAINED[name]
+        table.add_row(title, f"{value:.4g}", definition)
+    Console().print(table)
+
+
+def _size(pixels: np.ndarray) -> str:
+    return f"{pixels.shape[1]}×{pixels.shape[0]}"
+
+
+def _read_exr(path: Path) -> np.ndarray:
+    import OpenEXR
+
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            parts = [{name: np.array(c.pixels, np.float32) for name, c in part.channels.items()} for part in file.parts]
+    except Exception as error:  # OpenEXR raises bare RuntimeError and ValueError
+        raise MiNtfError(f"image {path} is no readable EXR ({error}); render it anew") from None
+    for channels in parts:
+        colour = [channels.get(c) for c in "RGB"] if "R" in channels else [channels.get("Y")] * 3
+        if all(c is not None for c in colour):
+            return np.stack([*colour, channels.get("A", np.ones_like(colour[0]))], axis=-1)
+    names = sorted({name for channels in parts for name in channels})
+    raise MiNtfError(f"image {path}: no part has the channels R, G, B or Y; found {', '.join(names)}")
+
+
+def _read_png(path: Path) -> np.ndarray:
+    from PIL import Image
+
+    try:
+        with Image.open(path, formats=["PNG"]) as file:
+            encoded = np.asarray(file.convert("RGBA"), np.float32) / 255
+    except (OSError, SyntaxError) as error:  # Pillow's own type derives from OSError
+        raise MiNtfError(f"image {path} is no readable PNG ({error}); make it anew") from None
+    alpha = encoded[..., 3:]
+    return np.concatenate([metrics.linear(encoded[..., :3]) * alpha, alpha], axis=-1).astype(np.float32)

@@ -1,0 +1,93 @@
+"""Reading images as `mi-ntf compare` does, and its error texts."""
+
+import numpy as np
+import OpenEXR
+import pytest
+from skimage import io
+
+from mi_ntf.core.errors import MiNtfError
+from mi_ntf.evaluate import metrics
+from mi_ntf.evaluate.compare import EXPLAINED, compare, print_table, read_image, write_exr
+
+
+@pytest.fixture
+def rgba():
+    rng = np.random.default_rng(3)
+    alpha = rng.uniform(0, 1, (16, 20, 1))
+    return np.float32(np.concatenate([rng.uniform(0, 2, (16, 20, 3)) * alpha, alpha], axis=-1))
+
+
+def _write(path, channels):
+    with OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, channels) as file:
+        file.write(str(path))
+
+
+def test_exr_round_trip_and_comparison(tmp_path, rgba):
+    write_exr(tmp_path / "a.exr", rgba)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.exr"), rgba)
+    write_exr(tmp_path / "b.exr", rgba[..., :3] * 1.1)
+    result = compare(tmp_path / "b.exr", tmp_path / "a.exr")
+    assert list(result) == list(EXPLAINED)
+    assert result["relative_rmse"] == pytest.approx(0.1, rel=1e-5)
+    assert result["max_abs"] == pytest.approx(0.1 * rgba[..., :3].max(), rel=1e-5)
+    assert result["psnr"] == pytest.approx(metrics.psnr(rgba[..., :3] * 1.1, rgba[..., :3]), rel=1e-5)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.exr", "b.exr"]
+
+
+def test_aov_layers_are_dropped(tmp_path, rgba):
+    channels = {c: np.ascontiguousarray(rgba[..., i]) for i, c in enumerate("RGBA")}
+    _write(tmp_path / "aov.exr", channels | {"albedo.R": channels["R"] * 0 + 5, "depth.T": channels["R"] * np.nan})
+    np.testing.assert_array_equal(read_image(tmp_path / "aov.exr"), rgba)
+
+
+def test_images_of_mitsuba_are_read(tmp_path, rgba):
+    mi = pytest.importorskip("mitsuba")
+    mi.set_variant("llvm_ad_rgb")
+    mi.Bitmap(rgba).write(str(tmp_path / "m.exr"))
+    np.testing.assert_array_equal(read_image(tmp_path / "m.exr"), rgba)
+    mi.Bitmap(rgba[..., :1]).write(str(tmp_path / "grey.exr"))
+    np.testing.assert_array_equal(read_image(tmp_path / "grey.exr")[..., 2], rgba[..., 0])
+
+
+def test_png_is_srgb_with_straight_alpha(tmp_path):
+    encoded = np.zeros((12, 12, 4), np.uint8)
+    encoded[..., :3] = 188  # sRGB 0.737 is linear 0.503
+    encoded[..., 3] = 102  # 0.4
+    io.imsave(tmp_path / "a.png", encoded, check_contrast=False)
+    # float32 of the curve
+    np.testing.assert_allclose(read_image(tmp_path / "a.png")[3, 4], [0.502886 * 0.4] * 3 + [0.4], rtol=1e-5)
+    io.imsave(tmp_path / "grey.png", encoded[..., 0], check_contrast=False)
+    np.testing.assert_allclose(read_image(tmp_path / "grey.png")[3, 4], [0.502886] * 3 + [1], rtol=1e-5)
+
+
+def test_errors_name_the_fault(tmp_path, rgba):
+    write_exr(tmp_path / "a.exr", rgba)
+    with pytest.raises(MiNtfError, match=r"nowhere.exr does not exist; render it first"):
+        compare(tmp_path / "nowhere.exr", tmp_path / "a.exr")
+    write_exr(tmp_path / "small.exr", rgba[:12])
+    with pytest.raises(MiNtfError, match=r"small.exr has 20×12 pixels, .*a.exr has 20×16; render both at one size"):
+        compare(tmp_path / "small.exr", tmp_path / "a.exr")
+    broken = rgba.copy()
+    broken[3, 4:7, 1] = np.nan
+    broken[0, 0] = np.inf
+    write_exr(tmp_path / "nan.exr", broken)
+    with pytest.raises(MiNtfError, match=r"nan.exr: 4 of 320 pixels are NaN or infinite"):
+        compare(tmp_path / "nan.exr", tmp_path / "a.exr")
+    (tmp_path / "fake.exr").write_bytes(b"not an image")
+    with pytest.raises(MiNtfError, match=r"fake.exr is no readable EXR"):
+        read_image(tmp_path / "fake.exr")
+    (tmp_path / "fake.png").write_bytes(b"not an image")
+    with pytest.raises(MiNtfError, match=r"fake.png is no readable PNG"):
+        read_image(tmp_path / "fake.png")
+    (tmp_path / "a.jpg").write_bytes(b"")
+    with pytest.raises(MiNtfError, match=r"unknown ending '.jpg'; give .exr or .png"):
+        read_image(tmp_path / "a.jpg")
+    _write(tmp_path / "depth.exr", {"Z": np.zeros((4, 4), np.float32)})
+    with pytest.raises(MiNtfError, match=r"no part has the channels R, G, B or Y; found Z"):
+        read_image(tmp_path / "depth.exr")
+
+
+def test_table_shows_every_metric(capsys):
+    print_table(dict.fromkeys(EXPLAINED, 0.125))
+    text = capsys.readouterr().out
+    assert text.count("0.125") == len(EXPLAINED) and "HDR-FLIP" in text
