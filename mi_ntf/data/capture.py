@@ -73,7 +73,8 @@ def _load(path: Path):
         raise MiNtfError(f"{path}: holds a {type(scene).__name__}, not a scene; the root element must be <scene>")
     shapes = [shape for shape in scene.shapes() if not shape.is_emitter()]
     if not shapes:
-        raise MiNtfError(f"{path}: {len(scene.shapes())} shapes, none that reflects light; add the object to photograph")
+        raise MiNtfError(f"{path}: no shapes that reflect light ({len(scene.shapes())} emitters); "
+                         "add the object to photograph")
     media = [shape.id() for shape in shapes if shape.interior_medium() or shape.exterior_medium()]
     if media:
         raise MiNtfError(f"{path}: shape '{media[0]}' holds a medium; only surfaces are photographed, remove it")
@@ -87,8 +88,9 @@ def _outline(shapes: list) -> np.ndarray:
 
     points = []
     for shape in shapes:
-        if shape.is_mesh():
-            points.append(np.array(mi.traverse(shape)["vertex_positions"]).reshape(-1, 3))
+        params = mi.traverse(shape)
+        if "vertex_positions" in params:  # a rectangle calls itself a mesh and has none
+            points.append(np.array(params["vertex_positions"]).reshape(-1, 3))
         else:
             points.append(np.array([np.array(shape.bbox().corner(i)).ravel() for i in range(8)]))
     return np.concatenate(points).astype(np.float64)
@@ -129,8 +131,8 @@ def _open_manifest(out: Path, settings: dict) -> None:
         before = json.loads(path.read_text())
         for key, value in settings.items():
             if before.get(key) != value:
-                raise MiNtfError(f"{path}: this folder was captured with {key} = {before.get(key)}, now {key} = {value}; "
-                                 "use another folder, delete this one, or give the former value to resume")
+                raise MiNtfError(f"{path}: this folder was captured with {key} = {before.get(key)}, now {key} = "
+                                 f"{value}; use another folder, delete this one, or give the former value to resume")
         return
     temporary = path.with_suffix(".json.tmp")
     temporary.write_text(json.dumps(settings, indent=1) + "\n")
@@ -171,7 +173,8 @@ def capture(scene: Path, out: Path, *, views: int = 100, size: int = 128, test_v
     studio = _studio(shapes, integrator, angle, size)
     counts = {"train": views, "val": max(4, views // 20), "test": test_views}
     out.mkdir(parents=True, exist_ok=True)
-    _open_manifest(out, {"scene": Path(scene).name, "object": _fingerprint(studio), "views": views, "size": size,
+    _open_manifest(out, {"scene": Path(scene).name, "object": _fingerprint(studio),
+                         "integrator": " ".join(str(studio.integrator()).split()), "views": views, "size": size,
                          "test_views": test_views, "spp": spp, "seed": seed})
     plan = _plan(counts, center, radius, seed)
     frames = [frame for split in plan.values() for frame in split]

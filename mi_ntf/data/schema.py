@@ -5,7 +5,7 @@ The NeRF-synthetic/Blender convention, and per frame the light that took part:
     {"camera_angle_x": 0.63, "w": 128, "h": 128,                  horizontal field of view (radians), size (pixels)
      "unit_sphere": {"center": [x, y, z], "radius": r},           field = (world - center) / radius, object inside 1
      "frames": [{"file_path": "train/0000.exr",                   relative to the folder
-                 "transform_matrix": [[...], ...],                4x4 camera-to-world, OpenGL: +X right, +Y up, looks at -Z
+                 "transform_matrix": [[...], ...],                4x4 camera-to-world, OpenGL: looks along -Z, +Y up
                  "pl_pos": [x, y, z],                             point light, world units
                  "pl_intensity": [r, g, b]}, ...]}                radiant intensity, W/sr, linear RGB
 
@@ -96,8 +96,8 @@ def _frame(entry: dict, where: str) -> Frame:
         raise MiNtfError(f"{where}: 'transform_matrix' is no rigid motion (rotation off by {error:.2g}, determinant "
                          f"{np.linalg.det(c2w[:3, :3]):.3g}); remove scale and mirroring, keep the last row 0 0 0 1")
     if "pl_pos" not in entry or "pl_intensity" not in entry:
-        raise MiNtfError(f"{where}: 'pl_pos' or 'pl_intensity' is missing; training needs photographs taken with a known "
-                         "point light (for a flash on the camera: pl_pos = the camera's position)")
+        raise MiNtfError(f"{where}: 'pl_pos' or 'pl_intensity' is missing; training needs photographs taken with a "
+                         "known point light (for a flash on the camera: pl_pos = the camera's position)")
     light = [_numbers(entry, key, (3,), where) for key in ("pl_pos", "pl_intensity")]
     return Frame(str(entry["file_path"]), c2w, *light)
 

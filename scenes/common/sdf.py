@@ -119,7 +119,8 @@ def drop_covered(mesh: trimesh.Trimesh, others: Shape, margin: float) -> trimesh
     """`mesh` without the triangles that lie deeper than `margin` inside the `others` and are never seen."""
     hidden = (others(np.asarray(mesh.vertices)) < -margin)[mesh.faces].all(1)
     used, faces = np.unique(mesh.faces[~hidden], return_inverse=True)
-    return trimesh.Trimesh(mesh.vertices[used], faces.reshape(-1, 3), vertex_normals=mesh.vertex_normals[used], process=False)
+    return trimesh.Trimesh(mesh.vertices[used], faces.reshape(-1, 3), vertex_normals=mesh.vertex_normals[used],
+                           process=False)
 
 
 def write_ply(mesh: trimesh.Trimesh, path: Path, offset=(0.0, 0.0, 0.0)) -> None:

@@ -67,7 +67,7 @@ def land():
 
 
 def mount():
-    """Axis rod with end balls, and the ring outside the globe that carries it, from the north pole down to the column."""
+    """Axis rod with end balls, and the ring that carries it, from the north pole down to the column."""
     ring = torus((0, 0, 0), (0, 0, 1), 0.74, 0.034)
     half = intersection(ring, lambda p: np.minimum(p @ EAST, np.maximum(p[..., 1], p[..., 0] - 0.06)) - 0.03)
     ends = [ellipsoid(s * 0.74 * AXIS, 0.062) for s in (-1, 1)]

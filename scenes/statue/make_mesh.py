@@ -35,11 +35,13 @@ def figure():
 
 def head():
     """Neck and head with a simple face: brow, nose, lips, closed eyes, long ears."""
-    skull = blend(0.05, ellipsoid((0, 1.215, 0.0), (0.118, 0.135, 0.128)), ellipsoid((0, 1.15, 0.03), (0.088, 0.09, 0.088)))
+    skull = blend(0.05, ellipsoid((0, 1.215, 0.0), (0.118, 0.135, 0.128)),
+                  ellipsoid((0, 1.15, 0.03), (0.088, 0.09, 0.088)))
     neck = cone((0, 0.93, -0.01), (0, 1.12, 0.0), 0.075, 0.062)
     nose = blend(0.02, cone((0, 1.235, 0.115), (0, 1.175, 0.143), 0.010, 0.017),
                  ellipsoid((0, 1.170, 0.133), (0.025, 0.012, 0.014)))
-    lips = union(ellipsoid((0, 1.133, 0.112), (0.032, 0.009, 0.018)), ellipsoid((0, 1.119, 0.110), (0.025, 0.009, 0.018)))
+    lips = union(ellipsoid((0, 1.133, 0.112), (0.032, 0.009, 0.018)),
+                 ellipsoid((0, 1.119, 0.110), (0.025, 0.009, 0.018)))
     ears = union(*[ellipsoid((s * 0.120, 1.17, -0.005), (0.018, 0.066, 0.032)) for s in (-1, 1)])
     sockets = union(*[ellipsoid((s * 0.047, 1.205, 0.137), (0.032, 0.016, 0.022)) for s in (-1, 1)])
     lids = union(*[ellipsoid((s * 0.046, 1.202, 0.102), (0.028, 0.015, 0.021)) for s in (-1, 1)])
@@ -82,7 +84,8 @@ def hair():
         return 1.5 * (1.245 - p[..., 1]) + 0.9 * p[..., 2] - 0.02
 
     cap = carve(ellipsoid((0, 1.235, -0.016), (0.128, 0.133, 0.130)), lambda p: -hairline(p), 0.01)
-    knot = blend(0.03, ellipsoid((0, 1.372, -0.02), (0.062, 0.055, 0.062)), ellipsoid((0, 1.425, -0.02), (0.03, 0.035, 0.03)))
+    knot = blend(0.03, ellipsoid((0, 1.372, -0.02), (0.062, 0.055, 0.062)),
+                 ellipsoid((0, 1.425, -0.02), (0.03, 0.035, 0.03)))
     shape = blend(0.03, cap, knot)
 
     def curls(p):
@@ -99,7 +102,7 @@ def necklace(surface):
         p = np.array([0.155 * u, 0.80 + 0.165 * abs(u) ** 1.7, 0.5])
         for _ in range(64):
             p[2] -= 0.8 * float(surface(p))
-        beads.append(ellipsoid(p + (0, 0, 0.008), 0.026 if abs(u) < 0.01 else 0.0185))
+        beads.append(ellipsoid((p[0], p[1], p[2] + 0.008), 0.026 if abs(u) < 0.01 else 0.0185))
     return union(*beads)
 
 
@@ -113,8 +116,8 @@ def gold():
     parts.append(cone((0, 0.98, -0.17), (0, 0.93, -0.10), 0.035, 0.05))
     parts.append(cone((STAFF_X, 0.40, STAFF_Z), (STAFF_X, 1.36, STAFF_Z), 0.023))
     top = np.array([STAFF_X, 1.47, STAFF_Z])
-    parts += [torus(top, (0, 0.2, 1), 0.085, 0.021), ellipsoid(top + (0, -0.11, 0), (0.04, 0.03, 0.04)),
-              ellipsoid(top + (0, 0.115, 0), 0.038)]
+    parts += [torus(top, (0, 0.2, 1), 0.085, 0.021), ellipsoid((STAFF_X, 1.36, STAFF_Z), (0.04, 0.03, 0.04)),
+              ellipsoid((STAFF_X, 1.585, STAFF_Z), 0.038)]
     return blend(0.015, *parts)
 
 
@@ -131,7 +134,8 @@ def petals(count: int, ring: float, y: float, size, lean: float, phase: float):
 
 def pedestal():
     """Stepped round base with a beaded moulding."""
-    beads = [ellipsoid((0.485 * np.cos(a), 0.128, 0.485 * np.sin(a)), 0.040) for a in np.linspace(0, 2 * np.pi, 29)[:-1]]
+    beads = [ellipsoid((0.485 * np.cos(a), 0.128, 0.485 * np.sin(a)), 0.040)
+             for a in np.linspace(0, 2 * np.pi, 29)[:-1]]
     return union(disc((0, 0.05, 0.05), 0.56, 0.05, 0.02), disc((0, 0.10, 0.05), 0.515, 0.03, 0.012),
                  disc((0, 0.19, 0.05), 0.39, 0.09, 0.02), disc((0, 0.30, 0.05), 0.43, 0.03, 0.02),
                  *[lambda p, b=b: b(p - (0, 0, 0.05)) for b in beads])
@@ -142,7 +146,8 @@ def main() -> None:
     body, face = figure(), head()
     cloth = robe(body)
     skin = intersection(blend(0.02, body, face), lambda p: 0.30 - p[..., 1])
-    lotus = union(petals(14, 0.41, 0.215, (0.030, 0.085, 0.088), 0.55, 0.0), petals(14, 0.385, 0.285, (0.028, 0.075, 0.08), 0.25, 0.5))
+    lotus = union(petals(14, 0.41, 0.215, (0.030, 0.085, 0.088), 0.55, 0.0),
+                  petals(14, 0.385, 0.285, (0.028, 0.075, 0.08), 0.25, 0.5))
     parts = {
         "skin": (skin, (-0.56, 0.28, -0.28), (0.50, 1.40, 0.46), 0.0145),
         "robe": (cloth, (-0.56, 0.28, -0.32), (0.56, 1.12, 0.50), 0.0160),

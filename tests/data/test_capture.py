@@ -1,0 +1,166 @@
+"""The virtual camera: geometry against Mitsuba's own sensor, radiance against closed forms, resuming, errors."""
+
+import json
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_ntf.core.errors import MiNtfError
+from mi_ntf.data import capture as cap
+from mi_ntf.data import schema
+
+SPHERE = """<scene version="3.9.0">
+    <integrator type="path"/>
+    <emitter type="constant"/>
+    <shape type="sphere">
+        <point name="center" x="2" y="-1" z="0.5"/> <float name="radius" value="0.7"/>
+        <bsdf type="diffuse"><rgb name="reflectance" value="0.8, 0.4, 0.2"/></bsdf>
+    </shape>
+    <shape type="sphere">
+        <point name="center" x="9" y="9" z="9"/> <float name="radius" value="0.1"/>
+        <emitter type="area"><rgb name="radiance" value="5"/></emitter>
+    </shape>
+</scene>"""
+
+MESHES = """<scene version="3.9.0">
+    <shape type="cube"> <transform name="to_world"> <scale value="0.2"/> <translate x="3"/> </transform> </shape>
+    <shape type="rectangle"> <transform name="to_world"> <rotate x="1" angle="40"/> <translate x="2.6" y="1"/>
+    </transform> </shape>
+</scene>"""
+
+
+@pytest.fixture(autouse=True, scope="module")
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+def write(folder, text=SPHERE):
+    path = folder / "scene.xml"
+    path.write_text(text)
+    return path
+
+
+def small(scene, out, **changes):
+    return cap.capture(scene, out, **{"views": 3, "size": 33, "test_views": 1, "spp": 16, **changes})
+
+
+@pytest.fixture(scope="module")
+def sphere_set(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("sphere")
+    return small(write(folder), folder / "out"), folder / "out"
+
+
+def test_similarity_leaves_out_the_emitter_and_keeps_the_margin(sphere_set):
+    summary, out = sphere_set
+    split = schema.load_split(out, "train")
+    # a sphere is known by its bounding box alone, whose corners lie sqrt(3) r out; 1e-6: float32 bounds
+    np.testing.assert_allclose(split.center, [2, -1, 0.5], atol=1e-6)
+    assert split.radius == pytest.approx(0.7 * np.sqrt(3) * cap.MARGIN, rel=1e-6)
+    assert summary["rendered"] == 3 + 4 + 1 and summary["kept"] == 0
+    assert [len(schema.read_transforms(out, s).frames) for s in schema.SPLITS] == [3, 4, 1]
+
+
+def test_collocated_radiance_of_a_diffuse_sphere_is_the_closed_form(sphere_set):
+    split = schema.load_split(sphere_set[1], "train")
+    for i in range(3):
+        distance = np.linalg.norm(split.light_pos[i] - split.center) - 0.7
+        expected = np.array([0.8, 0.4, 0.2]) / np.pi * split.light_intensity[i] / distance**2
+        # the middle pixel of 33 sees the nearest point; over it cos and distance change by 0.3 %, half floats by 0.05 %
+        np.testing.assert_allclose(split.images[i, 16, 16, :3], expected, rtol=5e-3)
+        assert split.images[i, 16, 16, 3] == 1 and (split.images[i, 0, 0] == 0).all()
+
+
+def test_white_surface_at_the_centre_has_radiance_one(sphere_set):
+    split = schema.load_split(sphere_set[1], "test")
+    distance = np.linalg.norm(split.light_pos[0] - split.center)
+    np.testing.assert_allclose(split.light_intensity[0] / (np.pi * distance**2), 1.0, rtol=1e-6)  # float32
+    np.testing.assert_allclose(split.light_pos[0], split.c2w[0, :3, 3], rtol=1e-6)
+
+
+def test_pixel_rays_are_those_of_mitsubas_sensor():
+    width, height, angle = 7, 5, 0.8
+    c2w = cap.camera_to_world(np.array([1.0, 2.0, 3.0]), np.array([0.2, -0.1, 0.4]))
+    sensor = mi.load_dict({
+        "type": "perspective", "fov": float(np.degrees(angle)), "fov_axis": "x",
+        "to_world": mi.ScalarTransform4f(mi.ScalarMatrix4f(schema.mitsuba_to_opengl(c2w).tolist())),
+        "film": {"type": "hdrfilm", "width": width, "height": height}})
+    y, x = np.meshgrid((np.arange(height) + 0.5) / height, (np.arange(width) + 0.5) / width, indexing="ij")
+    position = mi.Point2f(mi.Float(x.ravel().astype(np.float32)), mi.Float(y.ravel().astype(np.float32)))
+    ray, _ = sensor.sample_ray(0.0, 0.5, position, mi.Point2f(0.5))
+    origins, directions = schema.pixel_rays(c2w, schema.focal_length(angle, width), width, height)
+    np.testing.assert_allclose(np.array(ray.d).T.reshape(height, width, 3), directions, atol=2e-6)  # float32 matrices
+    offset = np.array(ray.o).T.reshape(height, width, 3) - origins  # Mitsuba starts rays on the near plane
+    np.testing.assert_allclose(np.cross(offset, directions), 0.0, atol=2e-6)
+
+
+def test_cameras_look_at_the_object_from_all_around():
+    directions = cap.view_directions(200, np.random.default_rng(3))
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1.0, atol=1e-12)
+    assert np.linalg.norm(directions.mean(0)) < 0.02  # a lattice is balanced; random points would give 0.07
+    nearest = np.sort(np.arccos(np.clip(directions @ directions.T, -1, 1)), axis=1)[:, 1]
+    assert nearest.min() > 0.5 * np.sqrt(4 * np.pi / 200)  # no two views fall together
+    for direction in [*directions, np.array([0, 1.0, 0]), np.array([0, -1.0, 0])]:
+        c2w = cap.camera_to_world(3 * direction, np.zeros(3))
+        np.testing.assert_allclose(c2w[:3, 2], direction, atol=1e-12)
+        np.testing.assert_allclose(c2w[:3, :3].T @ c2w[:3, :3], np.eye(3), atol=1e-12)
+        assert np.linalg.det(c2w[:3, :3]) > 0
+
+
+def test_meshes_lie_inside_the_unit_ball_and_inside_the_picture(tmp_path):
+    scene = write(tmp_path, MESHES)
+    points = cap._outline(cap._load(scene)[0])
+    summary = small(scene, tmp_path / "out", views=8)
+    reach = np.linalg.norm((points - summary["center"]) / summary["radius"], axis=1).max()
+    assert reach == pytest.approx(1 / cap.MARGIN, rel=1e-6)
+    assert summary["radius"] / cap.MARGIN < np.linalg.norm(np.ptp(points, axis=0)) / 2  # tighter than the box's ball
+    alpha = schema.load_split(tmp_path / "out", "train").images[..., 3]
+    assert alpha[:, 16, 16].any() and alpha.max() == 1
+    assert not alpha[:, [0, -1]].any() and not alpha[:, :, [0, -1]].any()
+
+
+def test_a_second_run_keeps_what_exists_and_renders_what_is_missing_the_same(tmp_path):
+    scene, out = write(tmp_path), tmp_path / "out"
+    small(scene, out)
+    before = {p: (p.stat().st_mtime_ns, p.read_bytes()) for p in sorted(out.rglob("*.exr"))}
+    lost = out / "train" / "0001.exr"
+    lost.unlink()
+    summary = small(scene, out)
+    assert (summary["rendered"], summary["kept"]) == (1, 7)
+    for path, (modified, content) in before.items():
+        assert path.stat().st_mtime_ns == modified or path == lost
+        # the same seed makes the same image; only the order of float additions in the film may differ
+        image = schema.read_image(path)
+        path.write_bytes(content)
+        np.testing.assert_allclose(image, schema.read_image(path), rtol=2e-3, atol=1e-4)
+
+
+def test_other_settings_or_another_object_are_refused_by_name(tmp_path):
+    scene, out = write(tmp_path), tmp_path / "out"
+    small(scene, out)
+    with pytest.raises(MiNtfError, match=r"captured with spp = 16, now spp = 8; use another folder, delete this one"):
+        small(scene, out, spp=8)
+    write(tmp_path, SPHERE.replace("0.8, 0.4, 0.2", "0.8, 0.4, 0.3"))
+    with pytest.raises(MiNtfError, match=r"captured with object = "):
+        small(scene, out)
+    assert json.loads((out / "capture.json").read_text())["spp"] == 16
+
+
+@pytest.mark.parametrize(("text", "message"), [
+    ("<scene version='3.9.0'><emitter type='constant'/></scene>", "no shapes that reflect light"),
+    ("<bsdf version='3.9.0' type='diffuse'/>", "not a scene; the root element must be <scene>"),
+    ("<scene version='3.9.0'><shape type='sphere' id='ball'><medium type='homogeneous' name='interior'/></shape>"
+     "</scene>",
+     "shape 'ball' holds a medium; only surfaces are photographed"),
+])
+def test_scenes_that_cannot_be_photographed_say_why(tmp_path, text, message):
+    with pytest.raises(MiNtfError, match=message):
+        small(write(tmp_path, text), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_missing_scene_and_bad_counts(tmp_path):
+    with pytest.raises(MiNtfError, match=r"gone.xml does not exist; name a Mitsuba scene file"):
+        small(tmp_path / "gone.xml", tmp_path / "out")
+    with pytest.raises(MiNtfError, match="views is 0, must be 1 or more"):
+        small(write(tmp_path), tmp_path / "out", views=0)
