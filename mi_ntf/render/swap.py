@@ -1,0 +1,169 @@
+"""`mi-ntf swap`: a mesh scene as XML, written anew with a field in place of its meshes. Works on XML alone."""
+
+import os
+import re
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+from mi_ntf.core.errors import MiNtfError
+from mi_ntf.core.field_file import load_header
+
+_PARAMETER = re.compile(r"(?<!\\)\$(\w+)")
+
+
+def swap(scene: Path, field: Path, out: Path) -> None:
+    """Write `out`: the scene `scene` with all shapes but emitters and sensors replaced by the field `field`.
+
+    The field sits in one bounding ``sphere`` with a ``null`` BSDF; centre and radius, in scene units, are those of the
+    capture. The integrator becomes ``nrf`` with ``<default name="visibility" value="auto"/>`` and keeps
+    `hide_emitters`. Sensors, films, emitters, parameters and includes stay; an include that holds shapes or the
+    integrator is inlined, with ``$parameters`` in its name at their defaults. BSDFs and textures that nothing uses any
+    more are dropped. Paths are rewritten for `out`'s folder. Comments are lost.
+
+    Raises :class:`MiNtfError` where `scene` is no Mitsuba XML, has no shape to replace, or an include is missing.
+    """
+    scene, field, out = Path(scene), Path(field), Path(out)
+    similarity = load_header(field).similarity
+    if out.resolve() == scene.resolve():
+        raise MiNtfError(f"{out} is the mesh scene itself; choose another name for the scene with the field")
+    root = _parse(scene)
+    defaults = {d.get("name"): d.get("value", "") for d in root.iter("default")}
+    _inline(root, scene, scene.parent, defaults)
+    place = _remove_shapes(root, scene)
+    root.insert(place, _bounding_sphere(similarity, os.path.relpath(field, out.parent)))
+    _replace_integrator(root)
+    _drop_unused(root, scene.parent, defaults)
+    _move_paths(root, scene.parent, out.parent, defaults)
+    root.insert(0, ET.Comment(f" The meshes of {scene.name} as the field {field.name}; written by `mi-ntf swap`. "))
+    ET.indent(root, "    ")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    temporary = out.with_name(out.name + ".part")
+    temporary.write_text(ET.tostring(root, encoding="unicode") + "\n", encoding="utf-8")
+    temporary.replace(out)
+
+
+def _parse(path: Path) -> ET.Element:
+    if not path.is_file():
+        raise MiNtfError(f"scene {path} does not exist; give the XML file of a mesh scene")
+    try:
+        root = ET.parse(path).getroot()
+    except ET.ParseError as error:
+        raise MiNtfError(f"{path} is not XML ({error}); give the XML file of a Mitsuba scene") from None
+    if root.tag != "scene":
+        raise MiNtfError(f"{path}: root element is <{root.tag}>, expected <scene>; give the XML of a Mitsuba scene")
+    return root
+
+
+def _resolve(include: ET.Element, source: Path, folder: Path, defaults: dict[str, str]) -> Path:
+    """The file that `include` of the scene file `source` names, parameters at their defaults.
+
+    Mitsuba looks beside the including file first, then in the folder of the main scene.
+    """
+    name = _substitute(include.get("filename", ""), defaults)
+    for base in (source.parent, folder):
+        if (base / name).is_file():
+            return base / name
+    hint = "; give its $parameters a <default>" if "$" in name else ""
+    raise MiNtfError(f"{source}: included file {name!r} does not exist beside it{hint}")
+
+
+def _substitute(text: str, defaults: dict[str, str]) -> str:
+    return _PARAMETER.sub(lambda m: defaults.get(m[1], m[0]), text)
+
+
+def _inline(root: ET.Element, source: Path, folder: Path, defaults: dict[str, str]) -> None:
+    """Replace those includes of `root` that (themselves or deeper) hold shapes to swap or an integrator."""
+    for include in root.findall("include"):
+        path = _resolve(include, source, folder, defaults)
+        content = _parse(path)
+        for d in content.iter("default"):
+            defaults.setdefault(d.get("name"), d.get("value", ""))
+        _inline(content, path, folder, defaults)
+        position = list(root).index(include)
+        if _replaceable(content) or content.find("integrator") is not None:
+            root.remove(include)
+            for offset, child in enumerate(content):
+                root.insert(position + offset, child)
+        else:
+            # From here on relative to the main scene's folder, wherever the including file was.
+            name = include.get("filename", "")
+            include.set("filename", os.path.relpath(source.parent / name, folder) if not os.path.isabs(name) else name)
+
+
+def _replaceable(root: ET.Element) -> list[ET.Element]:
+    """Top-level shapes that neither emit nor measure."""
+    lights = {e.get("id") for e in root.findall("emitter")} - {None}
+    return [s for s in root.findall("shape") if s.find("emitter") is None and s.find("sensor") is None
+            and not any(r.get("id") in lights for r in s.findall("ref"))]
+
+
+def _remove_shapes(root: ET.Element, scene: Path) -> int:
+    """Remove what the field replaces; returns the place of the first."""
+    shapes = _replaceable(root)
+    if not shapes:
+        raise MiNtfError(f"{scene} has no shape that a field could replace (emitters stay); give the scene that "
+                         "`mi-ntf capture` photographed")
+    place = list(root).index(shapes[0])
+    for shape in shapes:
+        root.remove(shape)
+    return place
+
+
+def _bounding_sphere(similarity, filename: str) -> ET.Element:
+    shape = ET.Element("shape", type="sphere")
+    x, y, z = (repr(c) for c in similarity.center)
+    ET.SubElement(shape, "point", name="center", x=x, y=y, z=z)
+    ET.SubElement(shape, "float", name="radius", value=repr(similarity.radius))
+    ET.SubElement(shape, "bsdf", type="null")
+    medium = ET.SubElement(shape, "medium", type="nrf", name="interior")
+    ET.SubElement(medium, "string", name="filename", value=Path(filename).as_posix())
+    return shape
+
+
+def _replace_integrator(root: ET.Element) -> None:
+    """Put the ``nrf`` integrator where the old one stood, and the default of its parameter at the top."""
+    new = ET.Element("integrator", type="nrf")
+    ET.SubElement(new, "string", name="visibility", value="$visibility")
+    old = root.findall("integrator")
+    place = list(root).index(old[0]) if old else 0
+    hide = next((b for i in old for b in i.iter("boolean") if b.get("name") == "hide_emitters"), None)
+    if hide is not None:
+        new.append(hide)
+    for integrator in old:
+        root.remove(integrator)
+    root.insert(place, new)
+    for default in root.findall("default"):
+        if default.get("name") == "visibility":
+            root.remove(default)
+    root.insert(0, ET.Element("default", name="visibility", value="auto"))
+
+
+def _drop_unused(root: ET.Element, folder: Path, defaults: dict[str, str]) -> None:
+    """Drop definitions that nothing refers to, until none is left. Includes may refer to them as well."""
+    included = [_parse(_resolve(i, folder / "scene.xml", folder, defaults)) for i in root.findall("include")]
+    while True:
+        used = {r.get("id") for tree in (root, *included) for r in tree.iter("ref")}
+        used |= {a.get("id") for a in root.iter("alias")}
+        unused = [e for e in root if e.tag in ("bsdf", "texture") and e.get("id") not in used]
+        if not unused:
+            return
+        for element in unused:
+            root.remove(element)
+
+
+def _move_paths(root: ET.Element, old: Path, new: Path, defaults: dict[str, str]) -> None:
+    """Make relative paths, written for the folder `old`, right for the folder `new`."""
+    if old.resolve() == new.resolve():
+        return
+    nodes = [(e, "value") for e in root.iter("string") if e.get("name") == "filename"]
+    nodes += [(e, "filename") for e in root.iter() if e.tag in ("include", "spectrum")]
+    nodes += [(e, "value") for e in root.iter("path")]
+    field = root.find("shape/medium[@type='nrf']/string")
+    for element, attribute in nodes:
+        value = element.get(attribute, "")
+        # What is not there is found by a <path>, which is moved itself.
+        if element is not field and not os.path.isabs(value) and (old / _substitute(value, defaults)).exists():
+            element.set(attribute, Path(os.path.relpath(old / value, new)).as_posix())
+    if root.find("include") is not None:
+        # Mitsuba looks for the files that an include names in the main scene's folder, so that folder stays known.
+        root.insert(0, ET.Element("path", value=Path(os.path.relpath(old, new)).as_posix()))

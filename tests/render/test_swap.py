@@ -1,0 +1,166 @@
+"""`mi-ntf swap` on XML alone: what is replaced, what stays, how paths move, and the error texts."""
+
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pytest
+
+from mi_ntf.core import field_file
+from mi_ntf.core.architecture import Architecture, Encoding, Header, Network, Similarity
+from mi_ntf.core.errors import MiNtfError
+from mi_ntf.render.swap import swap
+
+MESH = """<scene version="3.9.0">
+    <default name="spp" value="64"/>
+    <default name="light" value="point"/>
+    <integrator type="path">
+        <integer name="max_depth" value="6"/>
+        <boolean name="hide_emitters" value="true"/>
+    </integrator>
+    <include filename="sensor.xml"/>
+    <include filename="light_$light.xml"/>
+    <texture type="bitmap" id="wood"><string name="filename" value="wood.png"/></texture>
+    <bsdf type="diffuse" id="skin"><ref id="wood" name="reflectance"/></bsdf>
+    <bsdf type="diffuse" id="lamp"/>
+    <shape type="ply"><string name="filename" value="meshes/a.ply"/><ref id="skin"/></shape>
+    <shape type="cube"><ref id="skin"/></shape>
+    <shape type="rectangle"><ref id="lamp"/><emitter type="area"/></shape>
+    <emitter type="envmap"><string name="filename" value="env.exr"/></emitter>
+</scene>
+"""
+SENSOR = '<scene version="3.9.0"><sensor type="perspective"><sampler type="independent">' \
+         '<integer name="sample_count" value="$spp"/></sampler></sensor></scene>'
+LIGHT = '<scene version="3.9.0"><emitter type="envmap"><string name="filename" value="env.exr"/></emitter></scene>'
+
+
+@pytest.fixture
+def folder(tmp_path):
+    scene = tmp_path / "scene"
+    (scene / "meshes").mkdir(parents=True)
+    for name in ("wood.png", "env.exr", "meshes/a.ply"):
+        (scene / name).touch()
+    (scene / "mesh.xml").write_text(MESH)
+    (scene / "sensor.xml").write_text(SENSOR)
+    (scene / "light_point.xml").write_text(LIGHT)
+    net = Network(Encoding("frequency", octaves=1), (2,))
+    header = Header(Architecture(net, net, net), Similarity((0.25, -1.0, 3.0), 1.75))
+    tensors = {k: np.zeros(s, np.float32) for k, s in header.architecture.skeleton().items()}
+    field_file.save(scene / "f.safetensors", header, tensors)
+    return scene
+
+
+def _swap(folder, out):
+    swap(folder / "mesh.xml", folder / "f.safetensors", out)
+    return ET.parse(out).getroot()
+
+
+def test_meshes_become_one_sphere_with_the_field(folder):
+    root = _swap(folder, folder / "scene.xml")
+    spheres = [s for s in root.findall("shape") if s.get("type") == "sphere"]
+    assert len(spheres) == 1 and len(root.findall("shape")) == 2
+    sphere = spheres[0]
+    assert {k: float(sphere.find("point").get(k)) for k in "xyz"} == {"x": 0.25, "y": -1.0, "z": 3.0}
+    assert sphere.find("point").get("name") == "center"
+    assert (sphere.find("float").get("name"), float(sphere.find("float").get("value"))) == ("radius", 1.75)
+    assert sphere.find("bsdf").get("type") == "null"
+    medium = sphere.find("medium")
+    assert (medium.get("type"), medium.get("name")) == ("nrf", "interior")
+    assert medium.find("string").attrib == {"name": "filename", "value": "f.safetensors"}
+
+
+def test_integrator_is_replaced_and_keeps_hide_emitters(folder):
+    root = _swap(folder, folder / "scene.xml")
+    (integrator,) = root.findall("integrator")
+    assert integrator.get("type") == "nrf"
+    assert [(e.tag, e.get("name"), e.get("value")) for e in integrator] == [
+        ("string", "visibility", "$visibility"), ("boolean", "hide_emitters", "true")]
+    assert {d.get("name"): d.get("value") for d in root.findall("default")} == {
+        "visibility": "auto", "spp": "64", "light": "point"}
+
+
+def test_emitters_includes_and_what_they_use_stay(folder):
+    root = _swap(folder, folder / "scene.xml")
+    assert [e.get("filename") for e in root.findall("include")] == ["sensor.xml", "light_$light.xml"]
+    assert [b.get("id") for b in root.findall("bsdf")] == ["lamp"]  # used by the emitting rectangle
+    assert root.findall("texture") == []  # used by a dropped BSDF alone
+    assert root.find("emitter/string").get("value") == "env.exr"
+    assert (folder / "scene.xml").read_text().count("\n    <") > 6  # formatted
+    assert not list(folder.glob("*.part"))
+
+
+def test_paths_move_with_the_output(folder):
+    root = _swap(folder, folder.parent / "out" / "deep" / "scene.xml")
+    assert [e.get("filename") for e in root.findall("include")] == [
+        "../../scene/sensor.xml", "../../scene/light_$light.xml"]
+    assert root.find("emitter/string").get("value") == "../../scene/env.exr"
+    assert root.find("shape/medium/string").get("value") == "../../scene/f.safetensors"
+    # The included light names env.exr, which Mitsuba seeks in the main scene's folder and in <path>s.
+    assert [p.get("value") for p in root.findall("path")] == ["../../scene"]
+
+
+def test_includes_with_shapes_are_inlined_recursively(folder):
+    (folder / "parts").mkdir()
+    (folder / "parts" / "all.xml").write_text(
+        '<scene version="3.9.0"><include filename="inner.xml"/><include filename="lights.xml"/></scene>')
+    (folder / "parts" / "inner.xml").write_text(
+        '<scene version="3.9.0"><bsdf type="diffuse" id="b"/><shape type="cube"><ref id="b"/></shape></scene>')
+    (folder / "parts" / "lights.xml").write_text(
+        '<scene version="3.9.0"><shape type="rectangle"><emitter type="area"/></shape></scene>')
+    (folder / "mesh.xml").write_text(
+        '<scene version="3.9.0"><default name="p" value="all"/><include filename="parts/$p.xml"/></scene>')
+    root = _swap(folder, folder / "scene.xml")
+    assert [s.get("type") for s in root.findall("shape")] == ["sphere"]
+    assert root.findall("bsdf") == []
+    assert [e.get("filename") for e in root.findall("include")] == ["parts/lights.xml"]
+    assert len(root.findall("integrator")) == 1
+
+
+def test_the_shipped_scene(folder):
+    source = Path(__file__).parents[2] / "scenes" / "statue" / "mesh.xml"
+    out = folder / "statue.xml"
+    swap(source, folder / "f.safetensors", out)
+    root = ET.parse(out).getroot()
+    assert [s.get("type") for s in root.findall("shape")] == ["sphere"]
+    assert all((folder / e.get("filename").replace("$light", "point")).is_file() for e in root.findall("include"))
+
+
+@pytest.mark.parametrize(("text", "message"), [
+    ("no xml", r"mesh.xml is not XML .*give the XML file of a Mitsuba scene"),
+    ("<shape/>", r"root element is <shape>, expected <scene>"),
+    ('<scene><shape type="cube"><emitter type="area"/></shape></scene>', r"no shape that a field could replace"),
+    ('<scene><include filename="gone.xml"/></scene>', r"included file 'gone.xml' does not exist beside it$"),
+    ('<scene><include filename="a_$b.xml"/></scene>', r"included file 'a_\$b.xml' .*give its \$parameters a <default>"),
+])
+def test_errors(folder, text, message):
+    (folder / "mesh.xml").write_text(text)
+    with pytest.raises(MiNtfError, match=message):
+        _swap(folder, folder / "scene.xml")
+    assert not (folder / "scene.xml").exists()
+
+
+def test_errors_of_files(folder):
+    with pytest.raises(MiNtfError, match=r"is the mesh scene itself; choose another name"):
+        _swap(folder, folder / "mesh.xml")
+    with pytest.raises(MiNtfError, match=r"scene .*none.xml does not exist"):
+        swap(folder / "none.xml", folder / "f.safetensors", folder / "o.xml")
+    with pytest.raises(MiNtfError, match=r"field file .*none.safetensors does not exist"):
+        swap(folder / "mesh.xml", folder / "none.safetensors", folder / "o.xml")
+
+
+def test_mitsuba_loads_a_swapped_scene_from_another_folder(folder):
+    """Includes and files named in them are found; the medium itself is tried elsewhere, so a stock one stands in."""
+    mi = pytest.importorskip("mitsuba")
+    mi.set_variant("llvm_ad_rgb")
+    mi.Bitmap(np.ones((2, 4, 3), np.float32)).write(str(folder / "env.exr"))
+    text = MESH.replace('<emitter type="envmap"><string name="filename" value="env.exr"/></emitter>', "")
+    (folder / "mesh.xml").write_text(text)
+    out = folder.parent / "elsewhere" / "scene.xml"
+    _swap(folder, out)
+    text = out.read_text().replace('type="nrf" name="interior"', 'type="homogeneous" name="interior"')
+    text = text.replace('<string name="filename" value="../scene/f.safetensors" />', "")
+    text = text.replace('<string name="visibility" value="$visibility" />', "")
+    out.write_text(text.replace('type="nrf"', 'type="volpath"'))
+    scene = mi.load_file(str(out))
+    assert scene.environment() is not None and len(scene.emitters()) == 2
+    assert scene.sensors()[0].sampler().sample_count() == 64
