@@ -144,14 +144,14 @@ def check_bridge() -> Check:
 
     folder = plugin_folder()
     missing = [name for name in PLUGIN_NAMES if not (folder / f"{name}.so").is_file()]
-    reinstall = f"{sys.executable} -m pip install --force-reinstall --no-deps mi-ntf (in a checkout: `make setup`)"
+    reinstall = pip_install("", "--force-reinstall", "--no-deps")
     if missing:
         return Check(
             "bridge",
             False,
             False,
             f"not installed ({', '.join(missing)}); `mi-ntf render` works without it",
-            f"install a C++ compiler (Debian: sudo apt-get install g++), then {reinstall}",
+            f"install a C++ compiler (Debian: sudo apt-get install g++), then run `{reinstall}`",
         )
     built_for = bridge_version(folder / "nrf.so")
     if built_for != _version("mitsuba"):
@@ -185,10 +185,17 @@ def check_libpython() -> Check:
 def check_extra(extra: str) -> Check:
     """Modules of one optional extra, by presence alone: nothing is imported."""
     missing = [module for module in EXTRAS[extra] if importlib.util.find_spec(module) is None]
-    remedy = f"{sys.executable} -m pip install 'mi-ntf[{extra}]'" if missing else ""
+    remedy = pip_install(f"[{extra}]") if missing else ""
     return Check(
         f"extra {extra}", not missing, False, "missing: " + ", ".join(missing) if missing else "installed", remedy
     )
+
+
+def pip_install(extras: str, *options: str) -> str:
+    """The command that installs this package again, from the checkout if it lies in one."""
+    checkout = Path(__file__).resolve().parents[1]
+    source = f"-e '{checkout}{extras}'" if (checkout / "pyproject.toml").is_file() else f"'mi-ntf{extras}'"
+    return " ".join([sys.executable, "-m pip install", *options, source])
 
 
 def plugin_folder() -> Path:

@@ -1,0 +1,169 @@
+"""Exit codes, messages and JSON of `mi-ntf`."""
+
+import json
+import sys
+import types
+from pathlib import Path
+
+import pytest
+from helpers.programs import run_program
+
+from mi_ntf import cli, doctor
+from mi_ntf.core.errors import MiNtfError
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> list:
+    """Stand-ins for the functions behind the commands; holds what they were called with."""
+    seen: list = []
+
+    def note(result=None):
+        def function(*args, **kwargs):
+            seen.append((args, kwargs))
+            return result
+
+        return function
+
+    def stand_in(module: str, **functions):
+        monkeypatch.setitem(sys.modules, module, types.SimpleNamespace(**functions))
+
+    table = {"psnr": 30.5, "inner": {"a": 1}}
+    stand_in("mi_ntf.data.capture", capture=note())
+    stand_in("mi_ntf.train", train=note())
+    stand_in("mi_ntf.render.swap", swap=note())
+    stand_in("mi_ntf.evaluate.compare", compare=note(table), print_table=lambda values: print("table", values["psnr"]))
+    stand_in("mi_ntf.render.explain", explain=note(table), print_table=lambda values: print("table", values["psnr"]))
+    stand_in("mi_ntf.core.field_file", describe=note(table))
+    return seen
+
+
+@pytest.mark.parametrize(
+    ("line", "args", "kwargs"),
+    [
+        (
+            "capture s.xml data --views 7 --size 32",
+            (Path("s.xml"), Path("data")),
+            {"views": 7, "size": 32, "test_views": 20, "spp": 64, "seed": 0},
+        ),
+        (
+            "train data -o f.safetensors --minutes 2.5",
+            (Path("data"), Path("f.safetensors")),
+            {"preset": "fast", "minutes": 2.5, "steps": None, "seed": 0},
+        ),
+        ("swap s.xml f.safetensors -o out.xml", (Path("s.xml"), Path("f.safetensors"), Path("out.xml")), {}),
+        ("compare a.exr b.exr", (Path("a.exr"), Path("b.exr")), {}),
+        ("explain s.xml -D spp=4 -D visibility=none", (Path("s.xml"), {"spp": "4", "visibility": "none"}), {}),
+        ("info f.safetensors", (Path("f.safetensors"),), {}),
+    ],
+)
+def test_commands_pass_their_arguments_on(calls: list, line: str, args: tuple, kwargs: dict):
+    assert cli.main(line.split()) == 0
+    assert calls == [(args, kwargs)]
+
+
+@pytest.mark.parametrize("line", ["compare a b --json", "explain s.xml --json", "info f --json"])
+def test_json(calls: list, line: str, capsys: pytest.CaptureFixture[str]):
+    assert cli.main(line.split()) == 0
+    assert json.loads(capsys.readouterr().out) == {"psnr": 30.5, "inner": {"a": 1}}
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "",
+        "nonsense",
+        "train",
+        "capture s.xml data --views many",
+        "train data -o f --minutes 1 --steps 5",
+        "explain s.xml -D spp",
+        "render",
+        "render -D spp scene.xml",
+        "render --nonsense scene.xml",
+    ],
+)
+def test_bad_usage_is_2(calls: list, line: str):
+    assert cli.main(line.split()) == 2
+    assert calls == []
+
+
+@pytest.mark.parametrize("line", ["-h", "train -h", "render -h"])
+def test_help_is_0(line: str):
+    assert cli.main(line.split()) == 0
+
+
+@pytest.mark.parametrize("error", [MiNtfError("the field is bad"), OSError("the field is bad")])
+def test_failed_work_is_1_and_one_line(calls: list, monkeypatch, capsys, error: Exception):
+    def fail(path):
+        raise error
+
+    monkeypatch.setattr(sys.modules["mi_ntf.core.field_file"], "describe", fail)
+    monkeypatch.delenv("MI_NTF_DEBUG", raising=False)
+    assert cli.main(["info", "f"]) == 1
+    assert capsys.readouterr().err == "mi-ntf: error: the field is bad\n"
+    monkeypatch.setenv("MI_NTF_DEBUG", "1")
+    assert cli.main(["info", "f"]) == 1
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_missing_extra_points_to_doctor(calls: list, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "mi_ntf.train", None)
+    assert cli.main(["train", "data", "-o", "f"]) == 1
+    assert "`mi-ntf doctor` names the package" in capsys.readouterr().err
+
+
+def test_defect_shows_its_traceback(calls: list, monkeypatch, capsys):
+    monkeypatch.setattr(sys.modules["mi_ntf.core.field_file"], "describe", lambda path: {}["key"])
+    assert cli.main(["info", "f"]) == 1
+    assert "KeyError" in capsys.readouterr().err
+
+
+def test_module_is_the_command(tmp_path: Path):
+    done = run_program("python", "-m", "mi_ntf", "info", "nothing.safetensors", cwd=tmp_path)
+    assert done.returncode == 1
+    assert done.stderr.startswith("mi-ntf: error: ")
+    assert "nothing.safetensors" in done.stderr
+
+
+def test_render_names_a_missing_scene(tmp_path: Path):
+    done = run_program("mi-ntf", "render", "-m", "scalar_rgb", "nothing.xml", cwd=tmp_path)
+    assert done.returncode == 1
+    assert "mi-ntf: error: scene nothing.xml does not exist" in done.stderr
+
+
+def test_render_names_an_unknown_variant(tmp_path: Path):
+    done = run_program("mi-ntf", "render", "-m", "llvm_rgb", "nothing.xml", cwd=tmp_path)
+    assert done.returncode == 1
+    assert "unknown variant 'llvm_rgb'; this Mitsuba has scalar_rgb" in done.stderr
+
+
+def test_doctor_as_json(tmp_path: Path):
+    done = run_program("mi-ntf", "doctor", "--json", cwd=tmp_path)
+    report = json.loads(done.stdout)
+    checks = {check["name"]: check for check in report["checks"]}
+    assert done.returncode == 0 and report["ok"]
+    assert checks["mitsuba"]["found"] == doctor.MITSUBA
+    assert checks["bridge"]["found"].startswith(f"built for mitsuba {doctor.MITSUBA}")
+    assert all(check["remedy"] == "" for check in checks.values() if check["needed"])
+
+
+def test_doctor_survives_a_missing_llvm(tmp_path: Path):
+    done = run_program("mi-ntf", "doctor", "--json", cwd=tmp_path, DRJIT_LIBLLVM_PATH=str(tmp_path / "nothing.so"))
+    llvm = next(check for check in json.loads(done.stdout)["checks"] if check["name"] == "LLVM")
+    assert done.returncode == 1
+    assert not llvm["ok"]
+    assert "libllvm19" in llvm["remedy"]
+
+
+def test_doctor_reads_the_mark_of_a_library(tmp_path: Path):
+    library = tmp_path / "nrf.so"
+    library.write_bytes(b"\x7fELF\0mi_ntf bridge for mitsuba 3.8.0\0more")
+    assert doctor.bridge_version(library) == "3.8.0"
+    library.write_bytes(b"\x7fELF of somebody else")
+    assert doctor.bridge_version(library) == ""
+
+
+def test_doctor_prints_a_remedy_on_one_line(capsys):
+    remedy = "a command " + "that is long " * 20 + "and whole"
+    check = doctor.Check("thing", False, True, "broken", remedy)
+    doctor.print_table({"version": "1", "ok": False, "checks": [vars(check)]})
+    assert f"thing: {remedy}" in capsys.readouterr().out

@@ -1,0 +1,93 @@
+"""The direction of dependencies: core ← infer ← render ← evaluate, core ← data ← train.
+
+Training never imports Mitsuba or Dr.Jit, rendering never imports PyTorch.
+"""
+
+import ast
+from pathlib import Path
+
+import pytest
+from helpers.programs import run_program
+
+PACKAGE = Path(__file__).parents[1] / "mi_ntf"
+
+MAY_IMPORT = {
+    "core": {"core"},
+    "infer": {"core", "infer"},
+    "render": {"core", "infer", "render"},
+    "data": {"core", "data"},
+    "train": {"core", "data", "train"},
+    "evaluate": {"core", "infer", "render", "data", "evaluate"},
+}
+"""Which folders of the package a folder may import."""
+
+RENDERER, TORCH = {"mitsuba", "drjit"}, {"torch", "torchmetrics", "tensorboard", "lpips"}
+
+FORBIDDEN = {
+    "core": RENDERER | TORCH,
+    "infer": TORCH,
+    "render": TORCH,
+    "data": TORCH,
+    "train": RENDERER,
+    # Metrics that live in PyTorch are offered where it is installed; the demo does without.
+    "evaluate": set(),
+}
+"""Third parties that a folder must not import, not even inside a function."""
+
+TOP_LEVEL_FORBIDDEN = TORCH
+"""The same for the modules at the top of the package (command line, bridge, doctor)."""
+
+
+def imports_of(file: Path) -> set[str]:
+    """Dotted names that a file imports anywhere; relative imports made absolute."""
+    names = set()
+    package = ("mi_ntf", *file.relative_to(PACKAGE).parent.parts)
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            base = ".".join(package[: len(package) - node.level + 1]) if node.level else ""
+            module = ".".join(filter(None, [base, node.module]))
+            names |= {f"{module}.{alias.name}" for alias in node.names}
+    return names
+
+
+FILES = sorted(PACKAGE.rglob("*.py"))
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: str(file.relative_to(PACKAGE)))
+def test_imports_follow_the_picture(file: Path):
+    parts = file.relative_to(PACKAGE).parts
+    folder = parts[0] if len(parts) > 1 else None
+    forbidden = FORBIDDEN[folder] if folder else TOP_LEVEL_FORBIDDEN
+    if parts == ("data", "capture.py"):
+        pass  # the one file of `data` that renders
+    elif folder == "data":
+        forbidden = forbidden | RENDERER
+    elif parts == ("evaluate", "demo.py"):
+        forbidden = TORCH
+    for name in imports_of(file):
+        top, *rest = name.split(".")
+        assert top not in forbidden, f"{file} imports {name}"
+        inner = rest[0] if top == "mi_ntf" and rest else None
+        if folder and inner in MAY_IMPORT:
+            assert inner in MAY_IMPORT[folder], f"{file} imports {name}"
+
+
+def test_relative_imports_are_resolved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    file = PACKAGE / "infer" / "imaginary.py"
+    monkeypatch.setattr(Path, "read_text", lambda self: "from ..train import loss\nfrom . import grid\nimport torch.nn")
+    assert imports_of(file) == {"mi_ntf.train.loss", "mi_ntf.infer.grid", "torch.nn"}
+
+
+@pytest.mark.parametrize(
+    ("modules", "absent"),
+    [
+        ("mi_ntf, mi_ntf.cli, mi_ntf.core.field_file", RENDERER | TORCH),
+        ("mi_ntf.bridge, mi_ntf.launcher, mi_ntf.doctor", TORCH),
+    ],
+)
+def test_nothing_heavy_comes_along(tmp_path: Path, modules: str, absent: set[str]):
+    code = f"import sys, {modules}\nprint(sorted({absent!r} & set(sys.modules)))"
+    done = run_program("python", "-c", code, cwd=tmp_path)
+    assert done.stdout == "[]\n", done.stderr + done.stdout
