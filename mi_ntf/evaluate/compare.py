@@ -53,19 +53,6 @@ def read_image(path: Path) -> np.ndarray:
     return pixels
 
 
-def write_exr(path: Path, pixels: np.ndarray) -> None:
-    """Write linear RGB or RGBA (h, w, 3 or 4) as a float32 EXR, atomically."""
-    import OpenEXR
-
-    channels = {name: np.ascontiguousarray(pixels[..., i], np.float32) for i, name in
-                enumerate("RGBA"[:pixels.shape[-1]])}
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    temporary = Path(path).with_suffix(".part.exr")
-    with OpenEXR.File(header, channels) as file:
-        file.write(str(temporary))
-    temporary.replace(path)
-
-
 def print_table(result: dict[str, float]) -> None:
     """Print what :func:`compare` returned, with each metric's definition."""
     from rich.console import Console
