@@ -110,8 +110,7 @@ def picture(path: Path, shots: list[Shot], references: dict[str, np.ndarray], me
             errors = bottom[column].imshow(error, cmap="inferno", vmin=0, vmax=ERROR_SCALE)
             bottom[column].set_title(f"relative RMSE {m['relative_rmse']:.1%}, "
                                      f"to raymarch {m['relative_rmse_to_raymarch']:.1%}", fontsize=9)
-        figure.colorbar(errors, ax=bottom[0], location="right", fraction=0.5, shrink=0.8,
-                        label="error / RMS of the reference")
+        figure.colorbar(errors, cax=bottom[0].inset_axes([0.7, 0.1, 0.06, 0.8]), label="error / RMS of the reference")
     temporary = path.with_name(path.stem + ".part.png")
     figure.savefig(temporary, dpi=110)
     temporary.replace(path)

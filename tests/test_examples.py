@@ -1,0 +1,83 @@
+"""Every example runs, with small settings and a small field, and its result is checked."""
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from skimage import io
+
+from mi_ntf.core import field_file
+from mi_ntf.core.architecture import Architecture, Encoding, Header, Network, Similarity
+from mi_ntf.evaluate.compare import read_image
+
+ROOT = Path(__file__).parents[1]
+
+
+def _run(script, *words):
+    words = [sys.executable, ROOT / "examples" / script, *map(str, words)]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def _blob() -> tuple[Header, dict[str, np.ndarray]]:
+    """A soft ball: every plane holds a Gaussian, whose product over the three planes is a Gaussian of |x|."""
+    planes, small = Encoding("planes", (32,), 1), Encoding("frequency", octaves=0)
+    arch = Architecture(Network(planes, (2,)), Network(small, (2,)), Network(small, (2,), points=2))
+    tensors = {k: np.zeros(s, np.float32) for k, s in arch.skeleton().items()}
+    c = 2 * (np.arange(32) + 0.5) / 32 - 1
+    tensors["density.planes.0"][:] = np.exp(-2 * (c[:, None] ** 2 + c[None, :] ** 2))[None, ..., None]  # e^(−4 r²)
+    tensors["density.layers.0.weight"][0] = 1
+    tensors["density.layers.1.weight"][0, 0] = 12  # ln σ = 12 e^(−4 r²) − 8: 55 at the centre, 1 at r = 0.32
+    tensors["density.layers.1.bias"][:] = -8
+    tensors["reflectance.layers.1.bias"][:] = [0, 1, 0, 1, 0.5, 0, 0, -3]  # normal up, warm, mostly diffuse
+    return Header(arch, Similarity((0.1, 0.8, 0.0), 1.0)), tensors
+
+
+@pytest.fixture(scope="module")
+def blob_scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scenes") / "statue"
+    folder.mkdir()
+    for file in ("scene.xml", "sensor.xml", "light_point.xml"):
+        shutil.copy(ROOT / "scenes" / "statue" / file, folder)
+    text = (folder / "scene.xml").read_text()
+    text = re.sub(r'<point name="center".*/>', '<point name="center" x="0.1" y="0.8" z="0"/>', text)
+    text = re.sub(r'<float name="radius".*/>', '<float name="radius" value="1"/>', text)
+    (folder / "scene.xml").write_text(text)
+    field_file.save(folder / "field.safetensors", *_blob())
+    return folder / "scene.xml"
+
+
+@pytest.mark.parametrize("script", sorted(p.name for p in (ROOT / "examples").glob("*.py")))
+def test_examples_are_short_and_covered(script):
+    assert len((ROOT / "examples" / script).read_text().splitlines()) < 60
+    assert f'"{script}"' in Path(__file__).read_text()
+
+
+def test_relight_moves_the_light(blob_scene, tmp_path):
+    out = _run("relight.py", "--scene", blob_scene, "--out", tmp_path, "--frames", 2, "--size", 32, "--spp", 4,
+               "--visibility", "raymarch")
+    assert out.count(".png") == 2
+    front, back = (io.imread(tmp_path / f"relight_{i:03d}.png")[..., :3].astype(float) for i in range(2))
+    assert front.mean() > 2  # something is lit
+    # Half a turn later the light is on the other side: the bright half of the ball changes.
+    assert np.abs(front - back).mean() > 1
+
+
+def test_volpath_reference_agrees(blob_scene):
+    out = _run("volpath_reference.py", "--scene", blob_scene, "--size", 32, "--spp", 256)
+    error = float(re.search(r"block means: ([\d.]+)", out)[1])
+    assert error < 0.03  # volpath's noise: 8·8·256 paths a block, about 1 %; twice that and the marcher's own
+
+
+@pytest.mark.slow
+def test_own_mesh_from_photographs_to_a_lit_image(tmp_path):
+    pytest.importorskip("torch")
+    _run("own_mesh.py", "--out", tmp_path, "--views", 8, "--size", 32, "--spp", 4, "--minutes", 0.3)
+    image = read_image(tmp_path / "relit.exr")
+    assert image.shape == (96, 96, 4)
+    assert 0.03 < image[..., 3].mean() < 0.9 and image[..., :3].mean() > 1e-3  # an object, lit, before a background
