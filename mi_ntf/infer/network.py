@@ -1,0 +1,115 @@
+"""The field as its networks, in Dr.Jit: the twin of :mod:`mi_ntf.core.reference` (conventions there)."""
+
+from types import ModuleType
+
+import drjit as dr
+import numpy as np
+from drjit import nn
+
+from ..core import logistic, spheres
+from ..core.architecture import MAX_LOG_DENSITY, MIN_LOG_DENSITY, Encoding, Header
+from ..core.microfacet import MIN_ROUGHNESS
+from ..core.ops import normalize
+from ..core.reference import PLANES
+from . import ops
+
+MIN_DENSITY = 0.1
+"""σ below this counts as empty, 1/(unit-sphere radius): an optical depth of 0.2 at most across the whole sphere.
+Training drives empty space below it; every renderer of the field (also stock `volpath`) sees the same zero."""
+
+
+class NetworkField:
+    """Density, reflectance and ray transmittance of one field, evaluated by its networks.
+
+    `dj` is the Dr.Jit module of the back end (:func:`mi_ntf.infer.backend.module`). Points and directions are
+    3-component tuples or arrays of ``dj.Float``.
+    """
+
+    def __init__(self, header: Header, tensors: dict[str, np.ndarray], dj: ModuleType):
+        arch = header.architecture
+        self.points = arch.transmittance.points
+        self._density = _Network(arch.density.encoding, "density", tensors, dj)
+        self._reflectance = _Network(arch.reflectance.encoding, "reflectance", tensors, dj)
+        self._transmittance = _Network(arch.transmittance.encoding, "transmittance", tensors, dj)
+
+    def density(self, p):
+        """σ at `p`, 1/(unit-sphere radius); 0 outside the unit sphere and below ``MIN_DENSITY``."""
+        (raw,) = self._density.layers(self._density.encode(p))
+        sigma = dr.exp(dr.clip(raw, MIN_LOG_DENSITY, MAX_LOG_DENSITY))
+        inside = p[0] * p[0] + p[1] * p[1] + p[2] * p[2] < 1
+        return dr.select(inside & (sigma > MIN_DENSITY), sigma, 0)
+
+    def reflectance(self, p):
+        """``(normal, albedo, roughness, specular)``: two 3-tuples and two scalars, ranges as in core.reference."""
+        raw = self._reflectance.layers(self._reflectance.encode(p))
+        normal = normalize(ops, tuple(raw[:3]))
+        r, g, b, rough, spec = (logistic.sigmoid(ops, v) for v in raw[3:])
+        return normal, (r, g, b), MIN_ROUGHNESS + (1 - MIN_ROUGHNESS) * rough, spec
+
+    def transmittance_parameters(self, o, d):
+        """``(hit, m, h, a, b)`` of the rays through `o` along unit directions `d` towards the light: one query a
+        ray."""
+        hit, m, h = spheres.chord(ops, o, d)
+        p1, p2 = spheres.end_points(m, d, h)
+        features = []
+        for i in range(self.points):
+            s = (i + 0.5) / self.points
+            features += self._transmittance.encode(tuple(q1 + s * (q2 - q1) for q1, q2 in zip(p1, p2, strict=True)))
+        raw_a, raw_b = self._transmittance.layers([*features, *p1, *p2])
+        a, b = logistic.parameters(ops, raw_a, raw_b, h)
+        return hit, m, h, a, b
+
+
+class _Network:
+    """An encoding and its perceptron."""
+
+    def __init__(self, encoding: Encoding, name: str, tensors: dict, dj: ModuleType):
+        self.encoding = encoding
+        self.dj = dj
+        levels = [tensors[f"{name}.planes.{i}"] for i in range(len(encoding.resolutions))]
+        # No hardware filtering: its weights have 9 bits.
+        self.planes = [
+            [
+                dj.Texture2f(dj.TensorXf(np.ascontiguousarray(plane)), use_accel=False, wrap_mode=dr.WrapMode.Clamp)
+                for plane in planes
+            ]
+            for planes in levels
+        ]
+        count = sum(k.startswith(f"{name}.layers.") and k.endswith("weight") for k in tensors)
+        self._pack(name, tensors, count)
+
+    def _pack(self, name: str, tensors: dict, count: int) -> None:
+        # Cooperative vectors are float16 on CUDA; on LLVM float32 is the faster (and exact) one.
+        half = self.dj.__name__.startswith("drjit.cuda")
+        self.scalar = self.dj.Float16 if half else self.dj.Float
+        tensor = self.dj.TensorXf16 if half else self.dj.TensorXf
+        shapes = [tensors[f"{name}.layers.{i}.weight"].shape for i in range(count)]
+        layers = []
+        for i, (n_out, n_in) in enumerate(shapes):
+            layers += [nn.Linear(n_in, n_out)] + ([nn.ReLU()] if i + 1 < count else [])
+        net = nn.Sequential(*layers).alloc(tensor, size=shapes[0][1])
+        for i in range(count):
+            for ours, theirs in (("weight", "weights"), ("bias", "bias")):
+                value = np.ascontiguousarray(tensors[f"{name}.layers.{i}.{ours}"], np.float16 if half else np.float32)
+                net[f"layers.{2 * i}.{theirs}"] = tensor(value)
+        self.packed = nn.pack(net, layout="inference")
+
+    def encode(self, p) -> list:
+        """Features of the points `p`, a list of scalars arrays."""
+        if self.encoding.kind == "frequency":
+            features = list(p)
+            for k in range(self.encoding.octaves):
+                angles = [dr.pi * 2.0**k * c for c in p]
+                features += [dr.sin(a) for a in angles] + [dr.cos(a) for a in angles]
+            return features
+        u = [0.5 * c + 0.5 for c in p]
+        features = []
+        for planes in self.planes:
+            values = [plane.eval(self.dj.Array2f(u[a], u[b])) for plane, (a, b) in zip(planes, PLANES, strict=True)]
+            features += [x * y * z for x, y, z in zip(*values, strict=True)]
+        return features
+
+    def layers(self, features: list) -> list:
+        """The perceptron's outputs, a list of float32 arrays."""
+        out = self.packed(nn.CoopVec(*(self.scalar(f) for f in features)))
+        return [self.dj.Float(v) for v in out]

@@ -1,0 +1,21 @@
+"""How much of a light reaches a point: one file a method, all behind one call.
+
+    tau(x, wi, distance, index, active) → τ in [0, 1]
+
+`x` shading point and `wi` unit vector towards the light (3-tuples, field coordinates); `distance` to the light, field
+units, infinite for directional lights; `index` the light's row in the table. `active` masks lanes whose result is
+unused. Construction does the work that depends on the lights alone.
+"""
+
+METHODS = (
+    "raymarch",
+    "transmittance_volume",
+    "neural_transmittance",
+    "transmittance_map",
+    "visibility_mlp",
+    "none",
+    "auto",
+)
+"""Every name that users may type."""
+AVAILABLE = ("raymarch", "neural_transmittance", "transmittance_map", "none", "auto")
+"""Those that this version implements."""

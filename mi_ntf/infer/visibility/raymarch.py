@@ -1,0 +1,22 @@
+"""``raymarch``: one march per point and light, the reference (method.md, section 7)."""
+
+import drjit as dr
+
+from ..march import optical_depth
+
+
+class RayMarch:
+    """`steps`: see :func:`mi_ntf.infer.march.optical_depth`. `offset`: array like the shading points, in [0, 1)."""
+
+    def __init__(self, density, grid, steps, offset):
+        self.density, self.grid, self.steps, self.offset = density, grid, steps, offset
+
+    def tau(self, x, wi, distance, index, active):
+        """exp(−∫σ) from `x` to the light."""
+        return dr.exp(-optical_depth(self.density, self.grid, x, wi, distance, self.steps, self.offset, active))
+
+
+def default_steps(step: float) -> tuple[float, float, float]:
+    """Steps from the camera march's cell length: as fine beside the point, a tenth of the distance further off, and
+    never longer than an occupancy cell, which would jump over thin parts."""
+    return step, max(step, 2 / 64), 0.1

@@ -1,0 +1,80 @@
+"""Mitsuba plugins: medium, phase function and integrator ``nrf``, emitter ``ntf``. Importing this package registers
+nothing.
+
+    import mitsuba as mi
+    mi.set_variant("llvm_ad_rgb")
+    import mi_ntf.render
+    mi_ntf.render.register()
+
+The stock ``mitsuba`` program does this by itself through the bridge.
+"""
+
+import difflib
+
+import mitsuba as mi
+
+from ..infer.backend import module
+
+MEDIUM_PROPERTIES = ("filename", "to_world", "scale", "representation", "resolution")
+INTEGRATOR_PROPERTIES = (
+    "visibility",
+    "samples",
+    "light_samples",
+    "environment_lights",
+    "map_resolution",
+    "map_source",
+    "hide_emitters",
+    "timeout",
+    "max_depth",
+    "block_size",
+)
+
+_classes: dict[str, dict] = {}
+_watching = False
+
+
+def register() -> None:
+    """Make the plugins known to the current variant, and to every variant that is set later. May be called again.
+
+    Raises MiNtfError in a variant that they cannot run in (none set, scalar, spectral, …).
+    """
+    global _watching
+    variant = mi.variant() or "(none set)"
+    module(variant)
+    if variant not in _classes:
+        from .emitter import emitter_class
+        from .integrator import integrator_class
+        from .medium import medium_class
+        from .phase import phase_class
+
+        # Kept alive for good: Mitsuba may still call a constructor after another one took its name.
+        medium, integrator = medium_class(phase_class()), integrator_class()
+        _classes[variant] = {
+            "nrf": lambda props: (medium if _is_medium(props) else integrator)(props),
+            "emitter": emitter_class(),
+        }
+    classes = _classes[variant]
+    mi.register_integrator("nrf", classes["nrf"])
+    mi.register_emitter("ntf", classes["emitter"])
+    if not _watching:
+        _watching = True
+        mi.detail.add_variant_callback(_on_variant)
+
+
+def _on_variant(_old: str, new: str) -> None:
+    """Registrations hold for one variant: repeat them for the new one, where the plugins can run in it."""
+    if new in ("llvm_ad_rgb", "cuda_ad_rgb"):
+        register()
+
+
+def _is_medium(props) -> bool:
+    """Mitsuba has one constructor per plugin name and tells it no kind: whether `props` are those of the medium
+    ``nrf``, not the integrator's. A misspelt property counts for the kind that it resembles most, whose error then
+    names it."""
+    if props.id() in ("interior", "exterior"):
+        return True
+    for name in props.keys():
+        near = difflib.get_close_matches(name, (*MEDIUM_PROPERTIES, *INTEGRATOR_PROPERTIES), n=1, cutoff=0.0)
+        if near[0] in MEDIUM_PROPERTIES:
+            return True
+    return False

@@ -1,0 +1,36 @@
+"""Fields in memory: read and baked once, whoever asks."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import mitsuba as mi
+
+from ..core import field_file
+from ..core.architecture import Header
+from ..infer.backend import module
+from ..infer.grid import GridField
+from ..infer.network import NetworkField
+
+
+@dataclass(frozen=True)
+class LoadedField:
+    """A field file in both representations."""
+
+    header: Header
+    network: NetworkField
+    grid: GridField
+
+
+def load(path: str, resolution: int) -> LoadedField:
+    """Read `path` and bake it at `resolution`³; cached by path, modification time, resolution and variant."""
+    stat = Path(path).stat() if Path(path).is_file() else None
+    return _load(path, stat and (stat.st_mtime_ns, stat.st_size), resolution, mi.variant())
+
+
+@lru_cache(maxsize=4)
+def _load(path: str, _stamp: tuple | None, resolution: int, variant: str) -> LoadedField:
+    dj = module(variant)
+    header, tensors = field_file.load(path)
+    network = NetworkField(header, tensors, dj)
+    return LoadedField(header, network, GridField(network, resolution, dj))

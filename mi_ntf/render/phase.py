@@ -1,0 +1,61 @@
+"""The ``nrf`` phase function."""
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.errors import MiNtfError
+from ..infer import scatter
+
+
+def phase_class() -> type:
+    """The plugin class for the current variant."""
+
+    class NRFPhase(mi.PhaseFunction):
+        """Reflectance of a field as a scattering lobe (``nrf``).
+
+        =========== ====== ===================================================================
+        parameter   type   meaning
+        =========== ====== ===================================================================
+        (none)             the ``nrf`` medium creates its phase function by itself
+        =========== ====== ===================================================================
+
+        Value: ρ(R(x), ω_o, ω_i, n(x)) ⟨n(x), ω_i⟩⁺ in linear RGB, 1/sr, with the microfacet model of
+        :mod:`mi_ntf.core.microfacet`; it integrates over the sphere to the directional albedo, not to 1. Stock
+        ``volpath`` and ``prbvolpath`` with it solve the same equation as the ``nrf`` integrator (Bi et al. 2020, eq.
+        2).
+
+        Does not support: use outside an ``nrf`` medium; polarised and spectral variants; adjoint (importance)
+        transport.
+        """
+
+        def __init__(self, props):
+            mi.PhaseFunction.__init__(self, props)
+            self.frame, self.source = None, None
+            self.m_flags = int(mi.PhaseFunctionFlags.Anisotropic)
+
+        def attach(self, frame, source):
+            """Called by the medium: its placement and field."""
+            self.frame, self.source = frame, source
+
+        def _look(self, mei):
+            if self.source is None:
+                raise MiNtfError("phase function nrf stands alone; remove it: the nrf medium creates its own")
+            return (self.frame.direction_to_field(mei.wi), self.source.reflectance(self.frame.point_to_field(mei.p)))
+
+        def eval_pdf(self, ctx, mei, wo, active=True):
+            viewer, reflectance = self._look(mei)
+            value, pdf = scatter.evaluate(self.frame.direction_to_field(wo), viewer, reflectance)
+            return mi.Spectrum(value), pdf
+
+        def sample(self, ctx, mei, sample1, sample2, active=True):
+            viewer, reflectance = self._look(mei)
+            light = scatter.sample(viewer, reflectance, sample1, (sample2.x, sample2.y))
+            value, pdf = scatter.evaluate(light, viewer, reflectance)
+            pdf = dr.select(active & (pdf > 1e-8), pdf, 0)
+            weight = mi.Spectrum(value) * dr.select(pdf > 0, dr.rcp(pdf), 0)
+            return self.frame.direction_to_world(light), weight, pdf
+
+        def to_string(self):
+            return "NRFPhase[]"
+
+    return NRFPhase

@@ -1,0 +1,93 @@
+"""Fields with known values, written by hand into the networks: no training, exact up to bilinear interpolation."""
+
+import numpy as np
+
+from mi_ntf.core.architecture import MIN_LOG_DENSITY, Architecture, Encoding, Header, Network, Similarity
+from mi_ntf.core.microfacet import MIN_ROUGHNESS
+
+RESOLUTION = 128
+
+
+def architecture() -> Architecture:
+    return Architecture(
+        Network(Encoding("planes", (RESOLUTION,), 8), (16,)),
+        Network(Encoding("planes", (RESOLUTION,), 4), (16,)),
+        Network(Encoding("planes", (16,), 4), (16,), points=4),
+    )
+
+
+def constant(tensors: dict, name: str, values) -> None:
+    """Make network `name` return `values` everywhere."""
+    last = max(int(k.split(".")[2]) for k in tensors if k.startswith(f"{name}.layers."))
+    tensors[f"{name}.layers.{last}.weight"][:] = 0
+    tensors[f"{name}.layers.{last}.bias"][:] = values
+
+
+def _axes():
+    c = (np.arange(RESOLUTION) + 0.5) / RESOLUTION * 2 - 1
+    return np.meshgrid(c, c)  # u (columns), v (rows)
+
+
+def _logit(p):
+    return float(np.log(p / (1 - p)))
+
+
+def blobs(
+    centers, radii, *, log_density=5.0, edge=8.0, albedo=(0.6, 0.5, 0.4), roughness=0.5, specular=0.2, similarity=None
+) -> tuple[Header, dict]:
+    """Opaque balls: ln σ rises from −12 to `log_density` over about radius/`edge`.. around each radius. Normals point
+    away from the origin. At most 8 balls; a ball is the level set of a Gaussian, which the three planes' product holds
+    exactly."""
+    arch = architecture()
+    t = {k: np.zeros(s) for k, s in arch.skeleton().items()}
+    u, v = _axes()
+    for i, (c, r) in enumerate(zip(centers, radii, strict=True)):
+        k = 1 / r**2
+        for plane, (a, b) in enumerate(((0, 1), (0, 2), (1, 2))):
+            t["density.planes.0"][plane, :, :, i] = np.exp(-k / 2 * ((u - c[a]) ** 2 + (v - c[b]) ** 2))
+        # Gaussian at the radius is e^−1; the hidden unit is relu(edge·(g/e^−1 − 1) + something positive inside).
+        t["density.layers.0.weight"][i, i] = edge * np.e * 4
+        t["density.layers.0.bias"][i] = -edge * 4 + (log_density - MIN_LOG_DENSITY) / 2
+    # ln σ = MIN + min over… ReLU units add; overlapping balls only saturate at the clip.
+    t["density.layers.1.weight"][0, : len(radii)] = 1
+    t["density.layers.1.bias"][0] = MIN_LOG_DENSITY
+    # Clip at log_density by a second unit per ball: relu(x) − relu(x − span).
+    span = log_density - MIN_LOG_DENSITY
+    for i in range(len(radii)):
+        t["density.layers.0.weight"][8 + i] = t["density.layers.0.weight"][i]
+        t["density.layers.0.bias"][8 + i] = t["density.layers.0.bias"][i] - span
+        t["density.layers.1.weight"][0, 8 + i] = -1
+    _outward_reflectance(t, albedo, roughness, specular)
+    rng = np.random.default_rng(0)
+    for k in t:
+        if k.startswith("transmittance"):
+            t[k] = rng.normal(size=t[k].shape) * 0.5
+    return Header(arch, similarity or Similarity()), t
+
+
+def _outward_reflectance(t, albedo, roughness, specular) -> None:
+    u, v = _axes()
+    planes = t["reflectance.planes.0"]
+    planes[...] = 1
+    planes[0, :, :, 0], planes[0, :, :, 1], planes[1, :, :, 2] = u, v, v  # products: x, y, z
+    w0, w1, b1 = (t[f"reflectance.layers.{n}"] for n in ("0.weight", "1.weight", "1.bias"))
+    for i in range(3):
+        w0[2 * i, i], w0[2 * i + 1, i] = 1, -1
+        w1[i, 2 * i], w1[i, 2 * i + 1] = 1, -1
+    b1[3:6] = [_logit(a) for a in albedo]
+    b1[6] = _logit((roughness - MIN_ROUGHNESS) / (1 - MIN_ROUGHNESS))
+    b1[7] = _logit(specular)
+
+
+def empty() -> tuple[Header, dict]:
+    """No density anywhere."""
+    header, t = blobs([(0, 0, 0)], [0.3])
+    constant(t, "density", [MIN_LOG_DENSITY])
+    return header, t
+
+
+def uniform(sigma: float, **kwargs) -> tuple[Header, dict]:
+    """σ everywhere in the unit sphere."""
+    header, t = blobs([(0, 0, 0)], [0.3], **kwargs)
+    constant(t, "density", [np.log(sigma)])
+    return header, t
