@@ -42,12 +42,13 @@ def test_field_sphere_is_the_captures_similarity(name):
 @pytest.mark.parametrize("light", ["point", "env"])
 def test_mesh_scene_renders_its_reference(name, light):
     scene = mi.load_file(str(SCENES / name / "mesh.xml"), light=light, res="256")
-    image = np.array(mi.render(scene, spp=4))
+    image = np.array(mi.render(scene, spp=32))
     reference = read_image(SCENES / name / f"reference_{light}.exr")
     blocks = [x.reshape(16, 16, 16, 16, 4).mean((1, 3)) for x in (image, reference)]
-    # 4 paths a pixel, 256 pixels a block: pixel noise of some 100 % at worst leaves 3 % of the image's mean
+    # One path has a standard deviation of about 220 % of the image's mean under the environment's small sun (less
+    # under the point light): 32 paths x 256 pixels a block leave 2.4 %. A shift of 8 pixels costs 60 % and more.
     error = np.sqrt(((blocks[0] - blocks[1]) ** 2).mean((0, 1))) / blocks[1].mean((0, 1))
-    assert (error < 0.03).all(), error
+    assert (error < 0.05).all(), error
 
 
 @pytest.mark.parametrize("name", NAMES)
