@@ -29,7 +29,7 @@ def parser() -> argparse.ArgumentParser:
         "-m", "--mode", metavar="VARIANT", help="default: the first available of " + ", ".join(VARIANT_PRIORITY)
     )
     p.add_argument("-v", "--verbose", action="count", default=0, help="more messages; may be given twice")
-    p.add_argument("-t", "--threads", type=int, metavar="COUNT", help="number of CPU threads, at least 1")
+    p.add_argument("-t", "--threads", type=int, metavar="COUNT", help="number of CPU threads (1 counts as 2)")
     p.add_argument(
         "-D", "--define", action="append", default=[], metavar="KEY=VALUE", help="value of $KEY in the scene"
     )
@@ -103,7 +103,8 @@ def _apply_settings(args: argparse.Namespace) -> None:
     if args.threads is not None:
         if args.threads < 1:
             raise MiNtfError(f"-t {args.threads}: at least one thread is needed")
-        dr.set_thread_count(args.threads)
+        # The film writes EXR from a worker thread and waits for it for ever if there is none.
+        dr.set_thread_count(max(args.threads, 2))
     for folder in filter(None, args.append.split(";")):
         mi.file_resolver().append(folder)
 

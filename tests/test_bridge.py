@@ -5,6 +5,8 @@ Its own `prb` serves as the plugin in most tests; a stand-in for `mi_ntf.render`
 """
 
 import re
+import shutil
+import subprocess
 import tomllib
 from pathlib import Path
 
@@ -224,3 +226,29 @@ for _ in range(2):
 """
     done = run_program("python", "-c", code, cwd=scene.parent, **stand_in)
     assert done.returncode == 0, done.stderr
+
+
+NO_LIBPYTHON = """
+#include <dlfcn.h>
+#include <string.h>
+extern "C" void *dlopen(const char *name, int flags) {
+    static auto real = (void *(*)(const char *, int)) dlsym(RTLD_NEXT, "dlopen");
+    return name && strstr(name, "libpython") ? nullptr : real(name, flags);
+}
+"""
+
+
+@pytest.mark.skipif(shutil.which("c++") is None, reason="needs a C++ compiler to hide libpython from the program")
+def test_without_shared_libpython_the_look_alike_takes_over(scene: Path, stand_in: dict[str, str]):
+    source, library = scene.with_name("hide.cpp"), scene.with_name("hide.so")
+    source.write_text(NO_LIBPYTHON)
+    subprocess.run(["c++", "-shared", "-fPIC", source, "-o", library, "-ldl"], check=True)
+    program = Path(mi.__path__[0]) / "mitsuba"
+    flags = ("-m", "llvm_ad_rgb", "-o", "image.exr")
+    done = run_program(program, *flags, scene, cwd=scene.parent, LD_PRELOAD=str(library), **stand_in)
+    assert done.returncode == 0, done.stderr
+    assert "launcher.py" in done.stdout
+    assert (scene.parent / "image.exr").is_file()
+    done = run_program(program, "-m", "scalar_rgb", scene, cwd=scene.parent, LD_PRELOAD=str(library), **stand_in)
+    assert done.returncode == 1
+    assert 'not in "scalar_rgb"' in done.stderr
