@@ -99,8 +99,11 @@ def header_from_json(data: dict, source: str) -> Header:
             f"{source}: field format {version!r}, this build reads {FORMAT}; train or export the field anew")
     try:
         nets = {name: _network(data["architecture"][name]) for name in WIDTHS}
-        sim = Similarity(tuple(map(float, data["similarity"]["center"])), float(data["similarity"]["radius"]))
-        if len(sim.center) != 3 or not sim.radius > 0 or not all(map(math.isfinite, (*sim.center, sim.radius))):
+        center = [float(c) for c in data["similarity"]["center"]]
+        if len(center) != 3:
+            raise ValueError(f"similarity center {center}, expected 3 numbers")
+        sim = Similarity((center[0], center[1], center[2]), float(data["similarity"]["radius"]))
+        if not sim.radius > 0 or not all(map(math.isfinite, (*sim.center, sim.radius))):
             raise ValueError(f"similarity {sim}")
         return Header(Architecture(**nets), sim, dict(data.get("provenance", {})))
     except (KeyError, TypeError, ValueError) as error:

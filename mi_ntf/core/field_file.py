@@ -22,7 +22,8 @@ def save(path: str | Path, header: Header, tensors: dict[str, np.ndarray], dtype
     """
     _check(str(path), header, tensors)
     with np.errstate(over="ignore"):  # a float16 overflow is reported by the check below, by name
-        data = {k: np.ascontiguousarray(v, dtype if ".planes." in k else np.float32) for k, v in tensors.items()}
+        data: dict[str, np.ndarray] = {
+            k: np.ascontiguousarray(v, dtype if ".planes." in k else np.float32) for k, v in tensors.items()}
     _check(f"{path} as {np.dtype(dtype).name}", header, data)
     if not Path(path).absolute().parent.is_dir():
         raise MiNtfError(f"cannot write {path}: folder {Path(path).parent} does not exist; create it first")

@@ -78,11 +78,12 @@ def _read_exr(path: Path) -> np.ndarray:
     except Exception as error:  # OpenEXR raises bare RuntimeError and ValueError
         raise MiNtfError(f"image {path} is no readable EXR ({error}); render it anew") from None
     for channels in parts:
-        colour = [channels.get(c) for c in "RGB"] if "R" in channels else [channels.get("Y")] * 3
-        if all(c is not None for c in colour):
-            return np.stack([*colour, channels.get("A", np.ones_like(colour[0]))], axis=-1)
-    names = sorted({name for channels in parts for name in channels})
-    raise MiNtfError(f"image {path}: no part has the channels R, G, B or Y; found {', '.join(names)}")
+        for names in ("RGB", "YYY"):
+            if set(names) <= set(channels):
+                colour = [channels[c] for c in names]
+                return np.stack([*colour, channels.get("A", np.ones_like(colour[0]))], axis=-1)
+    found = sorted({name for channels in parts for name in channels})
+    raise MiNtfError(f"image {path}: no part has the channels R, G, B or Y; found {', '.join(found)}")
 
 
 def _read_png(path: Path) -> np.ndarray:

@@ -89,6 +89,8 @@ def table(measured: list[dict], note: str) -> str:
 
 def picture(path: Path, shots: list[Shot], references: dict[str, np.ndarray], measured: list[dict]) -> None:
     """Draw, per light, the reference and the shots side by side and beneath them the error maps |a − b|/RMS(b)."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
 
     columns = 1 + max(sum(s.light == light for s in shots) for light in references)
@@ -96,7 +98,6 @@ def picture(path: Path, shots: list[Shot], references: dict[str, np.ndarray], me
     axes = figure.subplots(2 * len(references), columns, squeeze=False)
     for a in axes.flat:
         a.set_axis_off()
-    errors = None
     for row, (light, reference) in enumerate(references.items()):
         top, bottom = axes[2 * row], axes[2 * row + 1]
         top[0].imshow(srgb(reference[..., :3]))
@@ -107,10 +108,11 @@ def picture(path: Path, shots: list[Shot], references: dict[str, np.ndarray], me
             top[column].imshow(srgb(shot.image[..., :3]))
             top[column].set_title(f"{shot.visibility}\n{shot.seconds:.1f} s · SSIM {m['ssim']:.3f}", fontsize=9)
             error = np.abs(shot.image - reference)[..., :3].mean(-1) / rms
-            errors = bottom[column].imshow(error, cmap="inferno", vmin=0, vmax=ERROR_SCALE)
+            bottom[column].imshow(error, cmap="inferno", vmin=0, vmax=ERROR_SCALE)
             bottom[column].set_title(f"relative RMSE {m['relative_rmse']:.1%}, "
                                      f"to raymarch {m['relative_rmse_to_raymarch']:.1%}", fontsize=9)
-        figure.colorbar(errors, cax=bottom[0].inset_axes([0.7, 0.1, 0.06, 0.8]), label="error / RMS of the reference")
+        scale = ScalarMappable(Normalize(0, ERROR_SCALE), "inferno")
+        figure.colorbar(scale, cax=bottom[0].inset_axes([0.7, 0.1, 0.06, 0.8]), label="error / RMS of the reference")
     temporary = path.with_name(path.stem + ".part.png")
     figure.savefig(temporary, dpi=110)
     temporary.replace(path)
@@ -161,7 +163,7 @@ def demo(out: Path = Path("out/demo"), scene: str = "statue", spp: int = 16) -> 
         for light in LIGHTS:
             for visibility in VISIBILITIES:
                 progress.update(task, description=f"{light} · {visibility}")
-                file = out / f"{scene}_{light}_{visibility}.exr"
+                file = out / f"{folder.name}_{light}_{visibility}.exr"
                 file.unlink(missing_ok=True)
                 shots.append(render(command, folder / "scene.xml", light, visibility, spp, file))
                 progress.advance(task)

@@ -27,7 +27,7 @@ def swap(scene: Path, field: Path, out: Path) -> None:
     if out.resolve() == scene.resolve():
         raise MiNtfError(f"{out} is the mesh scene itself; choose another name for the scene with the field")
     root = _parse(scene)
-    defaults = {d.get("name"): d.get("value", "") for d in root.iter("default")}
+    defaults = {d.get("name", ""): d.get("value", "") for d in root.iter("default")}
     _inline(root, scene, scene.parent, defaults)
     place = _remove_shapes(root, scene)
     root.insert(place, _bounding_sphere(similarity, os.path.relpath(field, out.parent)))
@@ -77,7 +77,7 @@ def _inline(root: ET.Element, source: Path, folder: Path, defaults: dict[str, st
         path = _resolve(include, source, folder, defaults)
         content = _parse(path)
         for d in content.iter("default"):
-            defaults.setdefault(d.get("name"), d.get("value", ""))
+            defaults.setdefault(d.get("name", ""), d.get("value", ""))
         _inline(content, path, folder, defaults)
         position = list(root).index(include)
         if _replaceable(content) or content.find("integrator") is not None:
