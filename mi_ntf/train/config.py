@@ -1,0 +1,42 @@
+"""What decides a training run. Times in the schedule are shares of the whole run, so it scales with --minutes and --steps."""
+
+from dataclasses import dataclass
+
+from ..core.architecture import FAST, Architecture
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """One recipe. Lengths in field units (unit-sphere radii), weights relative to the colour loss."""
+
+    architecture: Architecture = FAST
+    samples: int = 40000
+    """Field samples a step; the number of camera rays follows from how many samples a ray takes."""
+    step: float = 1 / 80
+    """Length of the cells of the quadrature: 160 across the unit sphere."""
+    cells: int = 96
+    """Occupancy grid, cells along an edge."""
+    bake: int = 128
+    """Density grid for normals and transmittance targets, cells along an edge."""
+    lr_planes: float = 2e-2
+    lr_layers: float = 3e-3
+    lr_end: float = 0.03
+    """Share of the learning rates that is left at the end (exponential decay)."""
+    log_density: float = 3.0
+    """ln σ at the start: a mist that colours can carve."""
+    alpha: float = 1.0
+    normal: float = 0.03
+    facing: float = 0.1
+    empty: float = 0.05
+    """Weight of σ → 0 outside the visual hull, where no photograph's ray is sampled."""
+    smooth: float = 2e-3
+    """Weight of total variation of the planes."""
+    ntf_from: float = 0.4
+    """Transmittance training starts here, the field has formed."""
+    ntf_alone: float = 0.85
+    """From here the field is finished and only its transmittance is trained."""
+    ntf_rays: int = 1024
+    """Fresh transmittance rays a step."""
+
+
+PRESETS = {"fast": TrainConfig()}

@@ -1,0 +1,54 @@
+"""How well a field reproduces photographs: PSNR of images rendered as the renderer does, from the networks alone."""
+
+import math
+
+import torch
+
+from .networks import Networks
+from .occupancy import Occupancy, from_networks
+from .rays import Rays
+from .render import render
+
+CUT = 0.1
+"""The renderer treats σ below this as empty."""
+
+
+def srgb(x: torch.Tensor) -> torch.Tensor:
+    """sRGB-encoded, clipped to [0, 1], of linear values."""
+    x = x.clamp(0, 1)
+    return torch.where(x <= 0.0031308, 12.92 * x, 1.055 * x.clamp(min=1e-8) ** (1 / 2.4) - 0.055)
+
+
+@torch.no_grad()
+def render_all(networks: Networks, rays: Rays, occupancy: Occupancy, step: float, generator: torch.Generator,
+               passes: int = 1, chunk: int = 8192):
+    """``(color (n, 3), alpha (n,), normal (n, 3))`` of all rays; `passes` jittered evaluations are averaged."""
+    index, kept = occupancy.tighten(rays)
+    color, alpha, normal = torch.zeros(len(rays), 3), torch.zeros(len(rays)), torch.zeros(len(rays), 3)
+    for first in range(0, len(kept), chunk):
+        part = kept[slice(first, first + chunk)]
+        where = index[first:first + chunk]
+        for _ in range(passes):
+            image = render(networks, part, occupancy.samples(part, step, generator), step)
+            color[where] += image.color / passes
+            alpha[where] += image.alpha / passes
+            normal[where] += torch.zeros(len(part), 3).index_add(0, image.shaded, image.weight[:, None] * image.normal) / passes
+    return color, alpha, normal
+
+
+def psnr(predicted: torch.Tensor, target: torch.Tensor, images: int) -> dict[str, float]:
+    """Mean over `images` of their PSNR (dB): of sRGB-encoded images clipped to [0, 1] (`srgb`, the field's habit) and of
+    linear ones with peak 1 (`linear`)."""
+    def mean(a, b):
+        mse = (a - b).square().view(images, -1).mean(1).clamp(min=1e-12)
+        return float((-10 * mse.log10()).mean())
+    return {"srgb": mean(srgb(predicted), srgb(target)), "linear": mean(predicted, target)}
+
+
+def score(networks: Networks, rays: Rays, images: int, step: float, cells: int = 128) -> dict[str, float]:
+    """PSNR of a whole split, from the networks alone: what they put outside the visual hull is seen too."""
+    generator = torch.Generator().manual_seed(1)
+    occupancy = from_networks(networks, cells, CUT, generator)
+    color, alpha, _ = render_all(networks, rays, occupancy, step, generator, passes=2)
+    error = (alpha - rays.target[:, 3]).square().mean()
+    return psnr(color, rays.target[:, :3], images) | {"alpha_rmse": math.sqrt(float(error))}

@@ -1,0 +1,145 @@
+"""Compositing against double loops and closed forms."""
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="training needs PyTorch: pip install 'mi-ntf[train]'")
+
+from mi_ntf.train import evaluate, losses, networks, render  # noqa: E402
+from mi_ntf.train.baked import Baked  # noqa: E402
+from mi_ntf.train.config import PRESETS  # noqa: E402
+from mi_ntf.train.occupancy import Occupancy  # noqa: E402
+from mi_ntf.train.rays import Rays, sphere_span  # noqa: E402
+
+SIGMA = 3.0
+ALBEDO, LIGHT = 0.5, 7.0
+
+
+def rays(n=4):
+    """Rays along +z from 3 units away through the ball, hitting it near its axis."""
+    o = torch.zeros(n, 3)
+    o[:, 0] = torch.linspace(0.0, 0.4, n)
+    o[:, 2] = -3.0
+    d = torch.tensor([0.0, 0.0, 1.0]).expand(n, 3)
+    t0, t1 = sphere_span(o, d)
+    return Rays(o, d, t0, t1, torch.zeros(n, 4), torch.full((n, 3), LIGHT))
+
+
+class Slab:
+    """Uniform density, Lambert reflectance, normals towards the camera."""
+
+    def log_density(self, x):
+        return torch.full((len(x),), float(np.log(SIGMA)))
+
+    def density(self, x):
+        return torch.exp(self.log_density(x))
+
+    def reflectance(self, x):
+        one = torch.ones(len(x))
+        return torch.tensor([0.0, 0.0, -1.0]).expand(len(x), 3), ALBEDO * torch.ones(len(x), 3), one, 0 * one
+
+
+def test_packed_weights_equal_a_double_loop():
+    rng = np.random.default_rng(0)
+    counts, step = [3, 0, 5, 1], 0.05
+    ray = np.repeat(np.arange(4), counts)
+    sigma = rng.uniform(0, 40, len(ray)).astype(np.float32)
+    w, v = render.weights(torch.tensor(sigma), torch.tensor(ray), 4, step)
+    for r in range(4):
+        front = 1.0
+        for j in np.nonzero(ray == r)[0]:
+            through = np.exp(-np.float64(sigma[j]) * step)
+            # float32 exponentials of depths up to 10: relative error some 1e-6
+            np.testing.assert_allclose(w[j], front * (1 - through), rtol=1e-5, atol=1e-7)
+            np.testing.assert_allclose(v[j], front**2 * (1 - through**2) / 2, rtol=1e-5, atol=1e-7)
+            front *= through
+
+
+def test_uniform_ball_has_the_closed_form():
+    """alpha = 1 − e^{−2σh}; colour = SURFACE ∫ T²σ (k/π) I/t² dt, the ball crossed along its chord of half length h."""
+    batch = rays()
+    grid = Occupancy(torch.ones((16,) * 3, dtype=torch.bool))
+    grid.sigma[:] = 0.0  # occupied everywhere, nothing hidden
+    step = 1 / 400
+    image = render.render(Slab(), batch, grid.samples(batch, step, torch.Generator().manual_seed(0)), step)
+    h = ((batch.t1 - batch.t0) / 2).numpy().astype(float)
+    # A jittered first and last cell each miss or add up to one cell: 2σ·step = 1.5 % of the depth at that end.
+    np.testing.assert_allclose(image.alpha, 1 - np.exp(-2 * SIGMA * h), rtol=0.004)
+    for i, t0 in enumerate(batch.t0.numpy().astype(float)):
+        t = t0 + (np.arange(4000) + 0.5) * (2 * h[i] / 4000)
+        integral = np.sum(np.exp(-2 * SIGMA * (t - t0)) * SIGMA / t**2) * (2 * h[i] / 4000)
+        expected = render.SURFACE * integral * ALBEDO / np.pi * LIGHT
+        np.testing.assert_allclose(image.color[i], expected, rtol=0.02)
+
+
+def test_an_opaque_plane_looks_like_its_surface():
+    """The reason of SURFACE: v sums to 1/2 behind an opaque front, however coarse the cells are."""
+    for step in (0.2, 0.01):
+        w, v = render.weights(torch.full((400,), 600.0), torch.zeros(400, dtype=torch.long), 1, step)
+        assert abs(float(w.sum()) - 1) < 1e-6
+        assert abs(render.SURFACE * float(v.sum()) - 1) < 1e-6
+
+
+def test_a_ray_outside_the_occupied_cells_is_dropped_and_others_are_tightened():
+    hull = torch.zeros((32,) * 3, dtype=torch.bool)
+    hull[14:18, 14:18, 14:18] = True  # |x| ≤ 1/8
+    grid = Occupancy(hull)
+    index, kept = grid.tighten(rays(5))
+    assert index.tolist() == [0, 1]  # x = 0 and 0.1; the next is at 0.2
+    # A cell (1/16) more at most at either end than the cube itself, 3 ± 1/8
+    assert (kept.t0 <= 3 - 1 / 8).all() and (kept.t0 >= 3 - 1 / 8 - 1 / 8).all()
+    assert (kept.t1 >= 3 + 1 / 8).all() and (kept.t1 <= 3 + 1 / 8 + 1 / 8).all()
+
+
+def ball(cells=48, radius=0.5, sigma=40.0):
+    baked = Baked(cells)
+
+    class Field:
+        def density(self, x):
+            return torch.where(x.norm(dim=1) < radius, sigma, 0.0)
+
+    grid = Occupancy(torch.ones((16,) * 3, dtype=torch.bool))
+    baked.update(Field(), grid)
+    return baked
+
+
+def test_normals_of_a_ball_point_outwards():
+    baked = ball()
+    x = torch.nn.functional.normalize(torch.randn(500, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    normal, certain = baked.normals(0.5 * x)
+    assert certain.all()
+    # Steps of 1/24 blurred over 1.25 cells: a few degrees remain
+    assert float((normal * x).sum(1).clamp(-1, 1).acos().rad2deg().mean()) < 4
+
+
+def test_marched_depth_of_a_ball_is_its_chord():
+    baked = ball(sigma=4.0)
+    m, d, h = torch.tensor([[0.0, 0.3, 0.0]]), torch.tensor([[1.0, 0.0, 0.0]]), torch.tensor([0.9539])
+    depth = baked.march(m, d, h, 200, torch.Generator().manual_seed(0))
+    assert float(depth[0, -1]) == 0.0
+    assert (depth[0, :-1] >= depth[0, 1:]).all()
+    # chord 2·0.4 of σ 4; a grid of 1/24 misplaces either end by half a cell at most
+    assert abs(float(depth[0, 0]) - 3.2) < 4 / 24
+
+
+def test_transmittance_loss_leaves_the_field_alone():
+    nets = networks.initial(PRESETS["fast"].architecture, 1.0, torch.Generator().manual_seed(0))
+    surface = torch.rand(100, 3) - 0.5
+    generator = torch.Generator().manual_seed(0)
+    loss = losses.transmittance(nets, ball(), surface, 64, generator)
+    batch = rays()
+    samples = torch.arange(4).repeat_interleave(5), torch.linspace(2.8, 3.2, 5).repeat(4)
+    image = render.render(nets, batch, samples, 0.1)
+    (loss + losses.transmittance_color(nets, image, batch, 1.0, 4)).backward()
+    for name, value in nets.tensors.items():
+        if name.startswith("transmittance"):
+            assert value.grad is not None and value.grad.abs().sum() > 0, name
+        else:
+            assert value.grad is None, name
+
+
+def test_psnr_of_a_known_error():
+    a, b = torch.full((8, 3), 0.5), torch.full((8, 3), 0.6)
+    assert evaluate.psnr(a, b, 2)["linear"] == pytest.approx(20.0, abs=1e-3)
+    # sRGB of 0.5 and 0.6: 0.73536 and 0.79774 → −20 lg 0.06238
+    assert evaluate.psnr(a, b, 2)["srgb"] == pytest.approx(24.10, abs=0.01)

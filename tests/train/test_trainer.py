@@ -1,0 +1,105 @@
+"""Whole runs on two analytic spheres, and the texts of the errors."""
+
+import json
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="training needs PyTorch: pip install 'mi-ntf[train]'")
+
+from mi_ntf.core import field_file  # noqa: E402
+from mi_ntf.core.errors import MiNtfError  # noqa: E402
+from mi_ntf.data import schema  # noqa: E402
+from mi_ntf.train import train, trainer  # noqa: E402
+
+from train import two_spheres  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory):
+    return two_spheres.write(tmp_path_factory.mktemp("spheres"))
+
+
+def test_short_run_learns_the_spheres(photographs, tmp_path):
+    """An all-black picture of them has 13 dB; 120 steps must explain most of what is seen, also after rounding to float16."""
+    out = tmp_path / "field.safetensors"
+    report = train(photographs, out, steps=120)
+    assert report["test"]["srgb"] > 20, report
+    header, _ = field_file.load(out)
+    assert header.provenance["test"] == report["test"] and header.provenance["steps_done"] == 120
+    assert str(tmp_path) not in json.dumps(header.to_json())
+    assert out.stat().st_size < 4e6
+    assert list(tmp_path.iterdir()) == [out], "checkpoint and temporary files are gone"
+
+
+def run(photographs, out, steps):
+    return trainer._Run(photographs, out, trainer.PRESETS["fast"], "fast", minutes=None, steps=steps, seed=3)
+
+
+def test_same_seed_gives_the_same_losses_and_a_checkpoint_continues_them(photographs, tmp_path):
+    torch.set_num_threads(1)
+    first, second = run(photographs, tmp_path / "a", 20), run(photographs, tmp_path / "a", 20)
+    first.resume()
+    second.resume()
+    expected = [_step(first) for _ in range(12)]
+    assert [_step(second) for _ in range(6)] == expected[:6]
+    second.save()
+    third = run(photographs, tmp_path / "a", 20)
+    third.resume()
+    assert third.step == 6
+    # The baked grid is renewed at a resumption, so normals differ a little from then on.
+    np.testing.assert_allclose([_step(third) for _ in range(6)], expected[6:], rtol=0.05)
+    with pytest.raises(MiNtfError, match="belongs to a run with other settings.*delete the file"):
+        run(photographs, tmp_path / "a", 21).resume()
+
+
+def _step(state):
+    value = state.advance()
+    state.step += 1
+    return value
+
+
+@pytest.mark.parametrize(("options", "text"), [
+    ({"preset": "quick"}, "preset 'quick' is unknown; it is one of fast"),
+    ({"minutes": 1, "steps": 10}, "both --minutes 1 and --steps 10 are given"),
+    ({"steps": 0}, "--steps is 0; it must be positive"),
+    ({"minutes": float("nan")}, "--minutes is nan; it must be positive"),
+])
+def test_bad_options(photographs, tmp_path, options, text):
+    with pytest.raises(MiNtfError, match=text):
+        train(photographs, tmp_path / "f", **options)
+
+
+def test_bad_photographs(tmp_path):
+    folder = two_spheres.write(tmp_path / "set", {"train": 2, "val": 1, "test": 1}, size=8)
+    bad = schema.read_image(folder / "train/0001.exr")
+    bad[3, 4] = np.nan
+    schema.write_exr(folder / "train/0001.exr", bad)
+    with pytest.raises(MiNtfError, match="0001.exr: 1 pixels are NaN"):
+        train(folder, tmp_path / "f", steps=1)
+    path = folder / "transforms_val.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"frames": []}))
+    schema.write_exr(folder / "train/0001.exr", np.nan_to_num(bad))
+    with pytest.raises(MiNtfError, match="'frames' is empty"):
+        train(folder, tmp_path / "f", steps=1)
+    assert not (tmp_path / "f").exists()
+
+
+def test_a_light_away_from_the_camera_is_refused(tmp_path):
+    folder = two_spheres.write(tmp_path / "set", {"train": 2, "val": 1, "test": 1}, size=8)
+    path = folder / "transforms_train.json"
+    data = json.loads(path.read_text())
+    data["frames"][1]["pl_pos"][0] += 1.0
+    path.write_text(json.dumps(data))
+    with pytest.raises(MiNtfError, match="split 'train', frame 1: the light is 1 object radii from the camera"):
+        train(folder, tmp_path / "f", steps=1)
+
+
+def test_divergence_stops_without_a_file(photographs, tmp_path):
+    state = run(photographs, tmp_path / "f", 5)
+    state.resume()
+    with torch.no_grad():
+        state.nets.tensors["reflectance.planes.0"].fill_(float("nan"))
+    with pytest.raises(MiNtfError, match="training diverged: the field loss is nan at step 0; nothing was written"):
+        state.advance()
+    assert not (tmp_path / "f").exists()
