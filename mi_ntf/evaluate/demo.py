@@ -66,7 +66,8 @@ def render(command: list[str], scene: Path, light: str, visibility: str, spp: in
     try:
         done = subprocess.run(words, capture_output=True, text=True, timeout=TIMEOUT, check=False)
     except subprocess.TimeoutExpired:
-        raise MiNtfError(f"{' '.join(words)}\ndid not end within {TIMEOUT} s; try fewer samples (--spp, --environment-spp)") from None
+        raise MiNtfError(f"{' '.join(words)}\ndid not end within {TIMEOUT} s; "
+                         "try fewer samples (--spp, --environment-spp)") from None
     seconds = time.perf_counter() - start
     if done.returncode or not out.is_file():
         raise MiNtfError(f"{' '.join(words)}\nfailed with exit code {done.returncode}; its output ends with\n"
