@@ -8,7 +8,8 @@ one. It is Mitsuba's ``blendbsdf`` of ``diffuse`` and a GGX ``roughconductor`` w
 
 ω_i points to the light, ω_o to the viewer, n is the normal: unit 3-component tuples. The diffuse lobe needs only
 ⟨n,ω_i⟩ > 0; the specular lobe also needs ⟨n,ω_o⟩ > 0. So ρ is reciprocal where both are positive, and the directional
-albedo ∫ ρ ⟨n,ω_i⟩ dω_i is at most (1 − s) k + s ≤ 1 everywhere.
+albedo ∫ ρ ⟨n,ω_i⟩ dω_i is at most (1 − s) k + s ≤ 1 everywhere. As a volume, the field scatters with
+:func:`scattering`, which makes an opaque skin reflect like a surface of this ρ.
 """
 
 import math
@@ -40,20 +41,38 @@ def lobes(ops, wi, wo, n, roughness):
 
     ρ·⟨n,ω_i⟩⁺ = (1 − s)·k·diffuse + s·specular. Split so that colour enters outside, once for any number of channels.
     """
-    cos_i, cos_o = dot(n, wi), dot(n, wo)
-    lit = ops.maximum(cos_i, 0.0)
+    cos_i, _, gloss = _cosines(ops, wi, wo, n, roughness)
+    return cos_i * INV_PI, gloss * cos_i
+
+
+def scattering(ops, wi, wo, n, roughness):
+    """The two lobes of the field's phase function f = ρ (⟨n,ω_i⟩⁺ + ⟨n,ω_o⟩⁺), light from above only; as :func:`lobes`.
+
+    Why the sum: a half space of any density profile that scatters once with f returns f ⟨n,ω_i⟩/(⟨n,ω_i⟩ + ⟨n,ω_o⟩)
+    (Lommel and Seeliger; Chandrasekhar 1960, section 6), because the light too is dimmed on its way through the skin to
+    the scattering point. With this f that is ρ ⟨n,ω_i⟩: an opaque field looks like the surface, from all sides and
+    under all lights. With the paper's ρ ⟨n,ω_i⟩ alone it would lose half of the light and fade towards grazing light. f
+    is reciprocal, as a phase function has to be.
+    """
+    cos_i, cos_o, gloss = _cosines(ops, wi, wo, n, roughness)
+    both = ops.where(cos_i > 0, cos_i + cos_o, 0.0 * cos_i)
+    return both * INV_PI, gloss * both
+
+
+def _cosines(ops, wi, wo, n, roughness):
+    """⟨n,ω_i⟩⁺, ⟨n,ω_o⟩⁺ and the specular ρ (0 seen from below)."""
+    cos_i, cos_o = ops.maximum(dot(n, wi), 0.0), dot(n, wo)
     # G1(ω)/(2⟨n,ω⟩) in one piece: finite at grazing directions, where both factors vanish.
     alpha = roughness * roughness
     a2 = alpha * alpha
-    gi = 1 / (lit + ops.sqrt(a2 + (1 - a2) * lit * lit))
-    co = ops.maximum(cos_o, 0.0)
-    go = 1 / (co + ops.sqrt(a2 + (1 - a2) * co * co))
+    gi = 1 / (cos_i + ops.sqrt(a2 + (1 - a2) * cos_i * cos_i))
+    above = ops.maximum(cos_o, 0.0)
+    go = 1 / (above + ops.sqrt(a2 + (1 - a2) * above * above))
     half = normalize(ops, tuple(a + b for a, b in zip(wi, wo, strict=True)))
     # ⟨n,h⟩ > 0 wherever the lobe is not zero, so D needs no sign of it.
     across = cross(n, half)
-    d = ggx(dot(across, across), alpha)
-    specular = ops.where(cos_o > 0, d * gi * go * lit, 0.0 * lit)
-    return lit * INV_PI, specular
+    gloss = ggx(dot(across, across), alpha) * gi * go
+    return cos_i, above, ops.where(cos_o > 0, gloss, 0.0 * gloss)
 
 
 def lobes_collocated(ops, cos, roughness):

@@ -10,8 +10,9 @@ from ..core import spheres
 from . import ops
 from .grid import CELLS
 
-MIN_WEIGHT = 1e-4
-"""Samples with less weight are not shaded: at 20 samples in matter along a ray, less than 0.2 % of the pixel."""
+MIN_WEIGHT_RATE = 0.02
+"""Samples that weigh less than this times their cell's length are not shaded: matter that would add less than 2 % of a
+pixel per unit-sphere radius of depth. It is the tail of nearly spent rays, and the faint rim of a skin."""
 MIN_TRANSMITTANCE = 1e-3
 """Camera rays end here; what lies behind could add 0.1 %."""
 MAX_OPTICAL_DEPTH = 12.0
@@ -62,8 +63,8 @@ def camera_samples(density, grid, o, d, maxt, step, offset, depth):
     all the light's own transmittance, are averaged with the right weights: the expectation over `depth` is exact for
     constant σ_j.
 
-    Returns ``(ray, t, w, T)``: ray index, distance and weight of every sample with w > MIN_WEIGHT (in no particular
-    order); T, per ray, the transmittance of the whole ray.
+    Returns ``(ray, t, w, T)``: ray index, distance and weight of every sample with w > MIN_WEIGHT_RATE · step (in no
+    particular order); T, per ray, the transmittance of the whole ray.
     """
     active, t0, t1 = camera_interval(o, d, maxt)
     t0 = t0 - offset * step
@@ -84,7 +85,7 @@ def camera_samples(density, grid, o, d, maxt, step, offset, depth):
             alpha = 1 - dr.exp(-sigma * step)
             w = transmittance * alpha
             inside = -dr.log(1 - depth * alpha) / dr.maximum(sigma, 1e-6)
-            state = emit(active & (w > MIN_WEIGHT), t_cell + inside, w, state)
+            state = emit(active & (w > MIN_WEIGHT_RATE * step), t_cell + inside, w, state)
             transmittance = dr.select(active, transmittance - w, transmittance)
             # Not in place: a state variable is the caller's own array, and the second walk starts from it again.
             k = k + dr.select(empty, uint(skip / step) + 1, 1)

@@ -1,4 +1,8 @@
-"""Importance sampling of the field's reflectance: directions to the light, given the viewer (field coordinates)."""
+"""Importance sampling of the field's phase function: directions to the light, given the viewer (field coordinates).
+
+Three densities over the side that the normal faces, with c = ⟨n,ω_o⟩⁺: cosine and uniform, which together follow the
+diffuse lobe ∝ ⟨n,ω_i⟩ + c exactly, and the GGX half vector (Walter et al. 2007, eqs. 35, 36).
+"""
 
 import drjit as dr
 
@@ -8,31 +12,32 @@ from . import ops
 
 
 def evaluate(wi, wo, reflectance):
-    """``(value, pdf)`` of light from `wi` scattered to `wo`: ρ ⟨n,ω_i⟩⁺ (3-tuple, 1/sr) and the density of
-    :func:`sample`."""
+    """``(value, pdf)`` of light from `wi` scattered to `wo`: the phase function ρ (⟨n,ω_i⟩⁺ + ⟨n,ω_o⟩⁺) (3-tuple, 1/sr)
+    and the density of :func:`sample`."""
     normal, albedo, roughness, specular = reflectance
-    diffuse, gloss = microfacet.lobes(ops, wi, wo, normal, roughness)
+    diffuse, gloss = microfacet.scattering(ops, wi, wo, normal, roughness)
     value = tuple((1 - specular) * k * diffuse + specular * gloss for k in albedo)
     half = normalize(ops, tuple(a + b for a, b in zip(wi, wo, strict=True)))
     cos_h = dr.maximum(dot(normal, half), 0)
     across = cross(normal, half)
     jacobian = dr.rcp(4 * dr.maximum(dot(wo, half), 1e-6))
     pdf_gloss = microfacet.ggx(dot(across, across), roughness * roughness) * cos_h * jacobian
-    share = _gloss_share(wo, reflectance)
-    # A half vector below the surface, or light from below, is never of use: no density is spent on it.
-    pdf = (1 - share) * diffuse + share * dr.select(cos_h > 0, pdf_gloss, 0)
+    share, above = _gloss_share(wo, reflectance)
+    pdf = (1 - share) * diffuse / (1 + 2 * above) + share * pdf_gloss
     return value, pdf
 
 
 def sample(wo, reflectance, u1, u2):
-    """A direction to the light: cosine lobe or GGX half vector (Walter et al. 2007, eqs. 35, 36). `u1`: scalar, `u2`:
-    pair, uniform in [0, 1). Returns the unit 3-tuple `wi`; its density is :func:`evaluate`'s."""
+    """A direction to the light. `u1`: scalar, `u2`: pair, uniform in [0, 1). Returns the unit 3-tuple `wi`; its density
+    is :func:`evaluate`'s."""
     normal, _, roughness, _ = reflectance
-    gloss = u1 < _gloss_share(wo, reflectance)
+    share, above = _gloss_share(wo, reflectance)
+    gloss = u1 < share
+    uniform = (u1 - share) * (1 + 2 * above) > 1 - share
     phi = 2 * dr.pi * u2[1]
     alpha = roughness * roughness
     cos_gloss = dr.sqrt((1 - u2[0]) / (1 + (alpha * alpha - 1) * u2[0]))
-    cos = dr.select(gloss, cos_gloss, dr.sqrt(1 - u2[0]))
+    cos = dr.select(gloss, cos_gloss, dr.select(uniform, u2[0], dr.sqrt(1 - u2[0])))
     sin = dr.safe_sqrt(1 - cos * cos)
     s, t = _tangents(normal)
     m = tuple(sin * dr.cos(phi) * a + sin * dr.sin(phi) * b + cos * c for a, b, c in zip(s, t, normal, strict=True))
@@ -42,11 +47,13 @@ def sample(wo, reflectance, u1, u2):
 
 
 def _gloss_share(wo, reflectance):
-    """Probability of the specular lobe: its share of the albedo, within [0.1, 0.9]; 0 seen from behind."""
+    """Probability of the specular lobe, its share of the albedo within [0.1, 0.9] (0 seen from behind), and
+    ⟨n,ω_o⟩⁺."""
     normal, albedo, _, specular = reflectance
+    above = dr.maximum(dot(normal, wo), 0)
     diffuse = (1 - specular) * (albedo[0] + albedo[1] + albedo[2]) / 3
     share = dr.clip(specular / dr.maximum(specular + diffuse, 1e-6), 0.1, 0.9)
-    return dr.select(dot(normal, wo) > 0, share, 0)
+    return dr.select(above > 0, share, 0), above
 
 
 def _tangents(n):

@@ -7,11 +7,13 @@ from . import ops
 
 
 def reflect(points, lights, visibility):
-    """Σ over lights of irradiance · τ · ρ ⟨n,ω_i⟩⁺ (method.md, section 1: h(x, ω_o)).
+    """Σ over lights of irradiance · τ · f, f the phase function of :func:`mi_ntf.core.microfacet.scattering`: the h(x,
+    ω_o) of method.md, section 1.
 
     points      :class:`Points`
     lights      has ``count`` and ``sample(index, x, active) → (wi, irradiance, distance)``
-    visibility  has ``tau`` (:mod:`mi_ntf.infer.visibility`)
+    visibility  has ``tau`` (:mod:`mi_ntf.infer.visibility`); None: no shadow. The light then does not pass the skin
+                either, so a point reflects as a surface does, ρ ⟨n,ω_i⟩⁺
 
     Returns radiance per point, a 3-tuple. The loop over lights is symbolic: compile time and memory do not depend on
     their number.
@@ -22,9 +24,10 @@ def reflect(points, lights, visibility):
 
     def body(i, r, g, b):
         wi, irradiance, distance = lights.sample(i, points.x, True)
-        diffuse, specular = microfacet.lobes(ops, wi, points.wo, points.normal, points.roughness)
+        model = microfacet.scattering if visibility else microfacet.lobes
+        diffuse, specular = model(ops, wi, points.wo, points.normal, points.roughness)
         lit = diffuse > 0
-        tau = dr.select(lit, visibility.tau(points.x, wi, distance, i, lit), 0)
+        tau = dr.select(lit, visibility.tau(points.x, wi, distance, i, lit), 0) if visibility else 1
         d = (1 - points.specular) * diffuse * tau
         s = points.specular * specular * tau
         r = r + irradiance[0] * (points.albedo[0] * d + s)

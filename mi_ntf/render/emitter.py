@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.errors import MiNtfError
-from ..infer.visibility import neural_transmittance, none, raymarch
+from ..infer.visibility import neural_transmittance, raymarch
 
 METHODS = ("neural_transmittance", "raymarch", "none")
 STEP = 2 / 384
@@ -59,14 +59,15 @@ def emitter_class() -> type:
                 # there.
                 ds.dist = dr.maximum(ds.dist, 1000 * far)
                 ds.p = it.p + ds.d * ds.dist
-            tau = self._method(dr.width(it.p)).tau(x, d, ds.dist / frame.length, mi.UInt32(0), active)
+            method = self._method()
+            tau = method.tau(x, d, ds.dist / frame.length, mi.UInt32(0), active) if method else 1
             ds.delta = dr.ones(mi.Bool, dr.width(ds.pdf))
             ds.emitter = mi.EmitterPtr(self)
             return ds, weight * tau
 
-        def _method(self, width: int):
+        def _method(self):
             if self.visibility == "none":
-                return none.NoVisibility()
+                return None
             if self.visibility == "neural_transmittance":
                 return neural_transmittance.NeuralTransmittance(self.medium.field.network)
             steps = tuple(dr.opaque(mi.Float, s) for s in raymarch.default_steps(STEP))

@@ -7,7 +7,7 @@ import mitsuba as mi
 
 from ..core.errors import MiNtfError
 from ..infer import march, shade
-from ..infer.visibility import METHODS, neural_transmittance, none, raymarch, transmittance_map
+from ..infer.visibility import METHODS, neural_transmittance, raymarch, transmittance_map
 from . import effects, lights
 
 CHUNK = 1 << 18
@@ -107,7 +107,7 @@ def _render(self, scene, sensor, seed: int, spp: int, develop: bool):
             break
         count = min(per_chunk, pixels - first)
         # Another stream for each chunk and seed; opaque, so that no seed is compiled into a kernel.
-        stream = mi.sample_tea_32(dr.opaque(mi.UInt32, seed), dr.opaque(mi.UInt32, first))[0]
+        stream = mi.sample_tea_32(_opaque(seed), dr.opaque(mi.UInt32, first))[0]
         sampler.seed(stream, count * spp)
         pixel = dr.arange(mi.UInt32, count * spp) // dr.opaque(mi.UInt32, spp) + dr.opaque(mi.UInt32, first)
         ray, weight, position = _camera_rays(sensor, film, sampler, pixel, size.x)
@@ -120,6 +120,13 @@ def _render(self, scene, sensor, seed: int, spp: int, develop: bool):
         dr.eval(block.tensor())
     film.put_block(block)
     return film.develop() if develop else mi.TensorXf()
+
+
+def _opaque(seed):
+    """A seed, Python number (from Python) or array (from the stock program), as a value that no kernel contains."""
+    value = mi.UInt32(seed)
+    dr.make_opaque(value)
+    return value
 
 
 def _camera_rays(sensor, film, sampler, pixel, width: int):
@@ -203,7 +210,7 @@ class SceneLight:
         if method == "neural_transmittance":
             return neural_transmittance.NeuralTransmittance(self.medium.field.network)
         if method == "none":
-            return none.NoVisibility()
+            return None
         offset = mi.sample_tea_float32(dr.arange(mi.UInt32, width), stream)
         steps = tuple(dr.opaque(mi.Float, s) for s in raymarch.default_steps(self.step))
         return raymarch.RayMarch(self.medium.source.density, grid, steps, offset)

@@ -42,9 +42,7 @@ def medium_class(phase_class: type) -> type:
         is_nrf = True
 
         def __init__(self, props):
-            path = (
-                str(mi.file_resolver().resolve(props.get("filename", ""))) if props.has_property("filename") else None
-            )
+            path = str(mi.file_resolver().resolve(props.get("filename", ""))) if "filename" in props else None
             if path is None:
                 raise MiNtfError(
                     'nrf medium: "filename" is missing; add <string name="filename" value="field.safetensors"/>'

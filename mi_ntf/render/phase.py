@@ -19,10 +19,10 @@ def phase_class() -> type:
         (none)             the ``nrf`` medium creates its phase function by itself
         =========== ====== ===================================================================
 
-        Value: ρ(R(x), ω_o, ω_i, n(x)) ⟨n(x), ω_i⟩⁺ in linear RGB, 1/sr, with the microfacet model of
-        :mod:`mi_ntf.core.microfacet`; it integrates over the sphere to the directional albedo, not to 1. Stock
-        ``volpath`` and ``prbvolpath`` with it solve the same equation as the ``nrf`` integrator (Bi et al. 2020, eq.
-        2).
+        Value: f = ρ(R(x), ω_o, ω_i, n(x)) (⟨n,ω_i⟩⁺ + ⟨n,ω_o⟩⁺) for light from the normal's side, linear RGB, 1/sr,
+        which makes an opaque skin reflect like a surface of the microfacet ρ
+        (:func:`mi_ntf.core.microfacet.scattering`). Its integral is no probability. Stock ``volpath`` and
+        ``prbvolpath`` at `max_depth` 2 solve the same equation as the ``nrf`` integrator (Bi et al. 2020, eq. 2).
 
         Does not support: use outside an ``nrf`` medium; polarised and spectral variants; adjoint (importance)
         transport.

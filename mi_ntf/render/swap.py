@@ -93,16 +93,23 @@ def _inline(root: ET.Element, source: Path, folder: Path, defaults: dict[str, st
 def _replaceable(root: ET.Element) -> list[ET.Element]:
     """Top-level shapes that neither emit nor measure."""
     lights = {e.get("id") for e in root.findall("emitter")} - {None}
-    return [s for s in root.findall("shape") if s.find("emitter") is None and s.find("sensor") is None
-            and not any(r.get("id") in lights for r in s.findall("ref"))]
+    return [
+        s
+        for s in root.findall("shape")
+        if s.find("emitter") is None
+        and s.find("sensor") is None
+        and not any(r.get("id") in lights for r in s.findall("ref"))
+    ]
 
 
 def _remove_shapes(root: ET.Element, scene: Path) -> int:
     """Remove what the field replaces; returns the place of the first."""
     shapes = _replaceable(root)
     if not shapes:
-        raise MiNtfError(f"{scene} has no shape that a field could replace (emitters stay); give the scene that "
-                         "`mi-ntf capture` photographed")
+        raise MiNtfError(
+            f"{scene} has no shape that a field could replace (emitters stay); give the scene that "
+            "`mi-ntf capture` photographed"
+        )
     place = list(root).index(shapes[0])
     for shape in shapes:
         root.remove(shape)

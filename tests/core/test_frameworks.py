@@ -95,6 +95,8 @@ FORMULAS = [
     # Directions rounded by 6e-8 under a lobe of width α ≥ 0.0225: 6e-8/α per order of derivative, unit peak-relative.
     Formula("lobes", lambda o, *c: microfacet.lobes(o, c[:3], c[3:6], c[6:9], c[9]),
             (_direction, _direction, _direction, _uniform(0.15, 1)), 2e-5, 2e-4),
+    Formula("scattering", lambda o, *c: microfacet.scattering(o, c[:3], c[3:6], c[6:9], c[9]),
+            (_direction, _direction, _direction, _uniform(0.15, 1)), 2e-5, 2e-4),
     Formula("lobes, collocated", lambda o, c, r: microfacet.lobes_collocated(o, c, r),
             (_uniform(-1, 0.999), _uniform(0.15, 1)), 2e-5, 2e-4),
     Formula("normalize", lambda o, *c: ops.normalize(o, c), (_point,), 5e-7, 1e-5, 1.0),

@@ -151,6 +151,35 @@ def test_light_from_behind_gives_nothing_and_all_is_finite(wi, wo, roughness):
         assert specular == 0 and diffuse == pytest.approx(max(wi[2], 0) / np.pi)
 
 
+@given(hemisphere, hemisphere, st.floats(0, 1), st.floats(0.15, 1))
+def test_phase_function_is_the_reflectance_times_both_cosines(wi, wo, s, roughness):
+    diffuse, specular = microfacet.scattering(ops, wi, wo, N, roughness)
+    expected = _rho_cos(wi, wo, N, 1.0, s, roughness) / wi[2] * (wi[2] + wo[2])
+    assert (1 - s) * diffuse + s * specular == pytest.approx(expected, rel=1e-11)
+
+
+@given(sphere, sphere, st.floats(0.15, 1))
+def test_phase_function_scatters_light_from_above_alone(wi, wo, roughness):
+    diffuse, specular = microfacet.scattering(ops, wi, wo, N, roughness)
+    if wi[2] <= 0:
+        assert diffuse == 0 and specular == 0
+    else:
+        assert diffuse == pytest.approx((wi[2] + max(wo[2], 0)) / np.pi) and specular >= 0
+
+
+@pytest.mark.parametrize("cosines", [(1.0, 1.0), (0.2, 0.9), (0.95, 0.1)])
+def test_an_opaque_skin_looks_like_the_surface(cosines):
+    # ∫ T(ω_o) T(ω_i) σ f ds through an exponential, a linear and a constant density: ρ ⟨n,ω_i⟩ each time.
+    wi, wo = _sphere(cosines[0], 0.3), _sphere(cosines[1], 2.0)
+    diffuse, _ = microfacet.scattering(ops, wi, wo, N, 0.5)
+    profiles = [(lambda z: np.expm1(z), lambda z: np.exp(z)), (lambda z: 40 * z * z, lambda z: 80 * z),
+                (lambda z: 90 * z, lambda z: 90)]  # optical depth below the top, and its derivative
+    for depth, sigma in profiles:
+        seen = quad(lambda z, d=depth, s=sigma: np.exp(-d(z) * (1 / wi[2] + 1 / wo[2])) * s(z) / wo[2], 0, 9,
+                    points=[1e-3, 0.01, 0.1, 0.5, 2], limit=400)[0]
+        assert seen * diffuse == pytest.approx(wi[2] / np.pi, rel=1e-6)
+
+
 def test_opposite_directions_have_no_half_vector_and_no_nan():
     wi = (np.float64(0.6), np.float64(0.0), np.float64(0.8))
     diffuse, specular = microfacet.lobes(ops, wi, tuple(-c for c in wi), N, 0.2)
@@ -163,6 +192,8 @@ def test_collocated_form_is_the_general_one_for_equal_directions(cos, roughness)
     # 1e-9: the sine between n and h comes from 1 − c² here and from a cross product there.
     general = microfacet.lobes(ops, w, w, N, roughness)
     np.testing.assert_allclose(microfacet.lobes_collocated(ops, cos, roughness), general, rtol=1e-9, atol=1e-15)
+    doubled = np.multiply(2, microfacet.lobes_collocated(ops, cos, roughness))
+    np.testing.assert_allclose(microfacet.scattering(ops, w, w, N, roughness), doubled, rtol=1e-9, atol=1e-15)
 
 
 @pytest.mark.parametrize("roughness", ROUGHNESS)

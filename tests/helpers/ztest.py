@@ -15,6 +15,9 @@ SIGNIFICANCE = 0.01
 PASS_SHARE = 0.9975
 """Share of pixels that must pass, as in Mitsuba's own render tests: heavy tails make single pixels fail."""
 
+NEGLIGIBLE = 1e-3
+"""Differences below this share of the reference's mean brightness count as equal."""
+
 
 def block_means(image: np.ndarray, size: int = 8) -> np.ndarray:
     """Means over size × size blocks of an (h, w, c) image: (h // size, w // size, c); a remainder at the far edges is
@@ -66,6 +69,9 @@ def check(images, references, label: str, block: int = 1) -> None:
     if block > 1:
         a, b = (np.stack([block_means(i, block) for i in group]) for group in (a, b))
     p = p_values(a, b)
+    # In deep shadow a path tracer sees nothing in almost every render, and its variance comes out as 0: a difference of
+    # a thousandth of the mean brightness is no evidence there.
+    p = np.where(np.abs(a.mean(0) - b.mean(0)) < NEGLIGIBLE * b.mean(), 1, p)
     threshold = 1 - (1 - SIGNIFICANCE) ** (1 / p.size)  # Šidák
     share = float((p >= threshold).mean())
     if share < PASS_SHARE:

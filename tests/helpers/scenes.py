@@ -1,0 +1,77 @@
+"""Small scenes around a field file, as Mitsuba dicts."""
+
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from helpers import fields
+from mi_ntf.core import field_file
+from mi_ntf.core.architecture import Similarity
+
+# An asymmetric object: no rotation or reflection maps it to itself. Off the origin, so that a lost transform shows.
+CENTERS = [(-0.3, 0.05, 0.0), (0.45, 0.3, 0.15), (0.1, -0.5, 0.35)]
+RADII = [0.5, 0.28, 0.2]
+SIMILARITY = Similarity((0.4, -0.2, 0.3), 1.5)
+
+
+def write_blobs(folder: Path, **options) -> Path:
+    """The asymmetric object as a field file."""
+    path = folder / "blobs.safetensors"
+    header, tensors = fields.blobs(CENTERS, RADII, similarity=SIMILARITY, **options)
+    field_file.save(path, header, tensors, np.float32)
+    return path
+
+
+def light(kind: str) -> dict:
+    """Light from the upper right front; `env`: a dim sky with one bright texel there."""
+    if kind == "directional":
+        return {
+            "type": "directional",
+            "direction": [-1, -1.2, -0.6],
+            "irradiance": {"type": "rgb", "value": [3, 2.5, 2]},
+        }
+    if kind == "point":
+        return {"type": "point", "position": [3.4, 3.0, 2.5], "intensity": {"type": "rgb", "value": [60, 50, 40]}}
+    image = np.full((8, 16, 3), 0.2, np.float32)
+    image[2, 5] = [9, 8, 6]
+    return {"type": "envmap", "bitmap": mi.Bitmap(image)}
+
+
+def film(size: int) -> dict:
+    """Square RGBA film with a box filter: pixels are independent of each other."""
+    return {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}, "pixel_format": "rgba"}
+
+
+def scene(field: Path | None, integrator: dict, lights: dict, *, size=64, spp=16, medium=None, shapes=None):
+    """The object in a sphere of null BSDF, seen from the front; `lights`: name → emitter dict."""
+    to_world = mi.ScalarTransform4f
+    center, radius = list(SIMILARITY.center), SIMILARITY.radius
+    look = to_world().look_at(origin=[center[0] + 1.2, center[1] + 1.5, center[2] + 5], target=center, up=[0, 1, 0])
+    result = {
+        "type": "scene",
+        "integrator": integrator,
+        "sensor": {
+            "type": "perspective",
+            "fov": 28,
+            "to_world": look,
+            "film": film(size),
+            "sampler": {"type": "independent", "sample_count": spp},
+        },
+        **lights,
+        **(shapes or {}),
+    }
+    if field is not None:
+        result["ball"] = {
+            "type": "sphere",
+            "center": center,
+            "radius": radius,
+            "bsdf": {"type": "null"},
+            "interior": {"type": "nrf", "filename": str(field), **(medium or {})},
+        }
+    return mi.load_dict(result)
+
+
+def render(loaded, seed=0, spp=0) -> np.ndarray:
+    """(h, w, 4) linear RGBA."""
+    return np.array(mi.render(loaded, seed=seed, spp=spp))

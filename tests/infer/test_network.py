@@ -1,0 +1,151 @@
+"""The Dr.Jit networks and their baked grid against the NumPy float64 reference."""
+
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers import fields
+
+from mi_ntf.core import field_file, reference
+from mi_ntf.core.architecture import Architecture, Encoding, Header, Network
+from mi_ntf.infer.grid import CELLS, GridField
+from mi_ntf.infer.network import MIN_DENSITY, NetworkField
+
+SCENES = Path(__file__).parents[2] / "scenes"
+
+
+def random_field(rng, encoding=None):
+    encoding = encoding or Encoding("planes", (16, 32), 4)
+    arch = Architecture(*(Network(encoding, (16, 24), points=p) for p in (1, 1, 5)))
+    return Header(arch), {k: rng.normal(size=s) * 0.4 for k, s in arch.skeleton().items()}
+
+
+def shipped(name):
+    return field_file.load(SCENES / name / "field.safetensors")
+
+
+CASES = ["random", "frequency", "statue", "globe", "knot"]
+
+
+@pytest.fixture(params=CASES)
+def case(request, rng):
+    if request.param == "random":
+        return random_field(rng)
+    if request.param == "frequency":
+        return random_field(rng, Encoding("frequency", octaves=4))
+    return shipped(request.param)
+
+
+def arrays(points):
+    return tuple(mi.Float(np.ascontiguousarray(c, np.float32)) for c in points.T)
+
+
+def close(ours, truth, tolerance=1e-5):
+    """Within `tolerance` of the output's range: float32 sums of some dozen products, 1e-7 each."""
+    truth = np.asarray(truth)
+    span = max(np.ptp(truth), 1e-3)
+    assert np.abs(np.asarray(ours) - truth).max() <= tolerance * span
+
+
+def test_density(case, rng):
+    header, tensors = case
+    x = rng.uniform(-0.57, 0.57, (20000, 3))
+    truth = reference.density(header.architecture, tensors, x.astype(np.float32).astype(np.float64))
+    truth[truth <= MIN_DENSITY] = 0
+    close(NetworkField(header, tensors, mi).density(arrays(x)), truth)
+
+
+def test_reflectance(case, rng):
+    header, tensors = case
+    x = rng.uniform(-0.57, 0.57, (20000, 3))
+    truth = reference.reflectance(header.architecture, tensors, x.astype(np.float32).astype(np.float64))
+    normal, albedo, roughness, specular = NetworkField(header, tensors, mi).reflectance(arrays(x))
+    for i, value in enumerate([*normal, *albedo, roughness, specular]):
+        # Normalisation divides by the raw normal's length, which can be small: ten times the error of the raw outputs.
+        close(value, truth[:, i], 1e-4 if i < 3 else 1e-5)
+
+
+def test_transmittance_parameters(case, rng):
+    header, tensors = case
+    o, d = rng.uniform(-0.5, 0.5, (5000, 3)), rng.normal(size=(5000, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    o, d = (v.astype(np.float32).astype(np.float64) for v in (o, d))
+    hit, a, b = reference.transmittance_parameters(header.architecture, tensors, o, d)
+    ours_hit, _, _, ours_a, ours_b = NetworkField(header, tensors, mi).transmittance_parameters(arrays(o), arrays(d))
+    assert (np.array(ours_hit) == hit).all()
+    close(np.log(ours_a), np.log(a))
+    close(ours_b, b)
+
+
+def test_gradient_of_density_reaches_positions(rng):
+    header, tensors = random_field(rng)
+    x = rng.uniform(-0.5, 0.5, (50, 3)).astype(np.float32).astype(np.float64)
+    # Away from texel borders, where bilinear interpolation has kinks that differences would straddle.
+    for r in (16, 32):
+        cell = (x + 1) / 2 * r - 0.5
+        x = x[(np.abs(cell - np.round(cell)) > 0.02).all(axis=1)]
+    p = arrays(x)
+    dr.enable_grad(p)
+    raw = dr.log(NetworkField(header, tensors, mi).density(p))
+    dr.backward(raw)
+    step = 1e-6
+    for axis in range(3):
+        e = np.eye(3)[axis] * step
+        difference = (
+            np.log(reference.density(header.architecture, tensors, x + e))
+            - np.log(reference.density(header.architecture, tensors, x - e))
+        ) / (2 * step)
+        close(dr.grad(p[axis]), difference, 1e-3)  # ReLU kinks inside ±1e-6 and float32 texel positions
+
+
+def test_density_is_zero_outside_the_sphere():
+    field = NetworkField(*fields.uniform(5.0), mi)
+    sigma = np.array(
+        field.density(arrays(np.array([[0.57, 0.57, 0.57], [0.58, 0.58, 0.58], [0.99, 0, 0], [1.01, 0, 0]])))
+    )
+    np.testing.assert_allclose(sigma, [5, 0, 5, 0], rtol=1e-5)
+
+
+def test_grid_holds_the_network_at_voxel_centres(rng):
+    network = NetworkField(*fields.blobs([(-0.2, 0.1, 0.0), (0.3, -0.2, 0.1)], [0.4, 0.3]), mi)
+    grid = GridField(network, 64, mi)
+    i = rng.integers(0, 64, (4000, 3))
+    p = arrays((i + 0.5) / 32 - 1)
+    # 1e-4 of a density of some hundred: texture coordinates are float32, slopes reach 1e4 per unit.
+    np.testing.assert_allclose(np.array(grid.density(p)), np.array(network.density(p)), atol=0.3)
+    ours, truth = grid.reflectance(p), network.reflectance(p)
+    for a, b in zip([*ours[0], *ours[1], *ours[2:]], [*truth[0], *truth[1], *truth[2:]], strict=True):
+        np.testing.assert_allclose(np.array(a), np.array(b), atol=2e-4)
+
+
+def test_grid_knows_where_density_is(rng):
+    network = NetworkField(*fields.blobs([(-0.3, 0.1, 0.0)], [0.25]), mi)
+    grid = GridField(network, 96, mi)
+    x = rng.uniform(-1, 1, (200000, 3))
+    sigma = np.array(grid.density(arrays(x)))
+    dense = x[sigma > 0]
+    cell = np.minimum(((dense + 1) / 2 * CELLS).astype(int), CELLS - 1)
+    clearance = np.array(grid.clearance).reshape(CELLS, CELLS, CELLS)
+    assert (clearance[cell[:, 2], cell[:, 1], cell[:, 0]] == 0).all()
+    assert np.linalg.norm(dense, axis=1).max() <= grid.radius
+    assert (dense.min(0) >= grid.bounds[0]).all() and (dense.max(0) <= grid.bounds[1]).all()
+    assert sigma.max() <= grid.majorant * (1 + 1e-6)
+    # Not wastefully wide: a ball of radius about 0.3 whose centre lies 0.32 out, plus two cells.
+    assert grid.radius < 0.72
+
+
+def test_clearance_is_the_chebyshev_distance(rng):
+    network = NetworkField(*fields.blobs([(0.1, 0.1, 0.0)], [0.2]), mi)
+    clearance = np.array(GridField(network, 64, mi).clearance).reshape((CELLS,) * 3)
+    occupied = np.argwhere(clearance == 0)
+    for cell in rng.integers(0, CELLS, (50, 3)):
+        truth = np.abs(occupied - cell).max(axis=1).min()
+        assert clearance[tuple(cell)] == min(truth, 16)
+
+
+def test_empty_field():
+    grid = GridField(NetworkField(*fields.empty(), mi), 32, mi)
+    assert grid.majorant == 0 and grid.radius == 0
+    assert (np.array(grid.clearance) > 0).all()

@@ -1,0 +1,254 @@
+"""The ``nrf`` integrator against stock ``volpath`` on the same field, analytic fields, the mesh, its own promises."""
+
+import time
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers import fields, scenes, ztest
+
+import mi_ntf.render
+from mi_ntf.core import field_file
+
+LIGHTS = ("directional", "point", "env")
+SEEDS = 8
+
+
+@pytest.fixture(autouse=True)
+def plugins(variant):
+    mi_ntf.render.register()
+
+
+@pytest.fixture(scope="module")
+def blobs(tmp_path_factory):
+    return scenes.write_blobs(tmp_path_factory.mktemp("field"), log_density=4.2)
+
+
+def nrf(visibility="raymarch", **options):
+    return {"type": "nrf", "visibility": visibility, "hide_emitters": True, **options}
+
+
+def renders(field, integrator, kind, spp, **options):
+    loaded = scenes.scene(field, integrator, {"light": scenes.light(kind)}, spp=spp, **options)
+    return [scenes.render(loaded, seed) for seed in range(SEEDS)]
+
+
+@pytest.mark.parametrize("kind", LIGHTS)
+def test_agrees_with_volpath(blobs, kind):
+    """The same single scattering by delta tracking: z-test per 4×4 block, and 8×8 block means within 2 %."""
+    # The environment in both as Mitsuba samples it: `light_samples` draws from the very map.
+    extra = {"light_samples": 4} if kind == "env" else {}
+    ours = renders(blobs, nrf(samples=1024, **extra), kind, 16)
+    theirs = renders(blobs, {"type": "volpath", "max_depth": 2, "hide_emitters": True}, kind, 48)
+    ztest.check([i[..., :3] for i in ours], [i[..., :3] for i in theirs], f"nrf volpath {kind}", block=4)
+    difference = ztest.block_difference(np.mean(ours, 0)[..., :3], np.mean(theirs, 0)[..., :3], 8, floor=0.2)
+    # volpath's own noise in a block: 64 pixels · 8 · 48 paths of relative spread about 1.5 (env: 3) each.
+    assert difference.max() < 0.02
+    alpha = ztest.block_difference(np.mean(ours, 0)[..., 3:], np.mean(theirs, 0)[..., 3:], 8, floor=0.2)
+    assert alpha.max() < 0.01
+
+
+def test_environment_as_directional_lights(blobs):
+    """The exhaustive sum over texels equals Mitsuba's sampling of the map, up to where in its texel a light sits."""
+    sampled = np.mean(renders(blobs, nrf(light_samples=8), "env", 16), 0)
+    summed = scenes.render(scenes.scene(blobs, nrf(), {"light": scenes.light("env")}, spp=32))
+    difference = ztest.block_difference(summed[..., :3], sampled[..., :3], 8, floor=0.2)
+    assert difference.max() < 0.06  # bright texel of 22°: its penumbra moves some light between blocks
+    assert summed[..., :3].mean() == pytest.approx(sampled[..., :3].mean(), rel=0.01)
+
+
+def test_map_and_network_field_agree_with_grid(blobs):
+    """`transmittance_map` against `raymarch`; the network as the field against its baked grid."""
+    lights = {"light": scenes.light("directional")}
+    march = scenes.render(scenes.scene(blobs, nrf(), lights, spp=64))
+    tmap = scenes.render(scenes.scene(blobs, nrf("transmittance_map"), lights, spp=64), seed=1)
+    network = scenes.render(scenes.scene(blobs, nrf(), lights, spp=64, medium={"representation": "network"}), seed=2)
+
+    def relative(a):
+        return np.sqrt(((a - march)[..., :3] ** 2).mean() / (march[..., :3] ** 2).mean())
+
+    assert relative(tmap) < 0.05
+    # Two renders of 64 spp differ by some 2 % in noise; trilinear voxels of a skin of their own width add more.
+    assert relative(network) < 0.06
+
+
+def test_empty_field_is_black_and_clear(tmp_path):
+    path = tmp_path / "empty.safetensors"
+    field_file.save(path, *fields.empty(), np.float32)
+    for visibility in ("raymarch", "transmittance_map", "neural_transmittance", "none"):
+        image = scenes.render(scenes.scene(path, nrf(visibility), {"light": scenes.light("directional")}, size=8))
+        assert (image == 0).all()
+
+
+def ball_scene(path, integrator, lights, size=32, spp=64):
+    """A field of identity similarity seen along −z by an orthographic camera over [−1, 1]²."""
+    return mi.load_dict({
+        "type": "scene",
+        "integrator": integrator,
+        "sensor": {
+            "type": "orthographic",
+            "to_world": mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]),
+            "film": scenes.film(size),
+            "sampler": {"type": "independent", "sample_count": spp},
+        },
+        "ball": {"type": "sphere", "bsdf": {"type": "null"}, "interior": {"type": "nrf", "filename": str(path),
+                                                                           "resolution": 256}},
+        **lights,
+    })  # fmt: skip
+
+
+HEAD_ON = {"light": {"type": "directional", "direction": [0, 0, -1], "irradiance": {"type": "rgb", "value": 3.0}}}
+
+
+def test_opaque_sphere_is_a_lambert_sphere(tmp_path):
+    """L = k E cos θ/π on a sphere lit from the camera; no light is lost to a self-shadow beyond the skin's own."""
+    path = tmp_path / "opaque.safetensors"
+    header, tensors = fields.blobs([(0, 0, 0)], [0.8], log_density=6.4, edge=60, albedo=(0.5, 0.5, 0.5), specular=1e-6)
+    field_file.save(path, header, tensors, np.float32)
+    image = scenes.render(ball_scene(path, nrf("none", samples=1024), HEAD_ON))
+    c = (np.arange(32) + 0.5) / 16 - 1
+    x, y = np.meshgrid(c, -c)
+    rho = np.hypot(x, y) / 0.8
+    inner = rho < 0.8
+    truth = 0.5 * 3 / np.pi * np.sqrt(np.maximum(1 - rho**2, 0))
+    # The level set of the Gaussian is exactly 0.8; the skin is 0.01 thick, which shifts cos θ by up to 2 % at ρ = 0.8.
+    np.testing.assert_allclose(image[inner][:, 0], truth[inner], rtol=0.03)
+    np.testing.assert_allclose(image[inner][:, 3], 1, atol=2e-3)
+    assert (image[rho > 1.1][:, 3] == 0).all()
+    # Light along the view ray loses as much as the view: ∫ T·T σ ds = ½ of ∫ T σ ds, on every opaque pixel.
+    marched = scenes.render(ball_scene(path, nrf("raymarch", samples=1024), HEAD_ON))
+    np.testing.assert_allclose(marched[inner][:, 0] / image[inner][:, 0], 0.5, rtol=0.02)
+
+
+def test_uniform_ball_has_the_closed_form_opacity(tmp_path):
+    """α = 1 − exp(−2 σ sqrt(1 − ρ²))."""
+    path = tmp_path / "uniform.safetensors"
+    field_file.save(path, *fields.uniform(0.7), np.float32)
+    image = scenes.render(ball_scene(path, nrf("none"), HEAD_ON))
+    c = (np.arange(32) + 0.5) / 16 - 1
+    rho = np.hypot(*np.meshgrid(c, c))
+    inner = rho < 0.9
+    truth = 1 - np.exp(-2 * 0.7 * np.sqrt(np.maximum(1 - rho**2, 0)))
+    np.testing.assert_allclose(image[inner][:, 3], truth[inner], atol=0.01)  # voxels of 1/128 at the sphere's surface
+
+
+def test_orientation(blobs):
+    """Lit from the same side by nrf, volpath, and path on spheres in the field's place, by both kinds of light."""
+    similarity = scenes.SIMILARITY
+    spheres = {
+        f"s{i}": {
+            "type": "sphere",
+            "center": [float(o + similarity.radius * v) for o, v in zip(similarity.center, c, strict=True)],
+            "radius": similarity.radius * r * 0.98,
+            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.6, 0.5, 0.4]}},
+        }
+        for i, (c, r) in enumerate(zip(scenes.CENTERS, scenes.RADII, strict=True))
+    }
+    image = np.zeros((16, 32, 3), np.float32)
+    image[5, 9] = 100  # one texel: light from one direction
+    env = {"type": "envmap", "bitmap": mi.Bitmap(image), "to_world": mi.ScalarTransform4f().rotate([0, 1, 0], 40)}
+    for emitter, extra in ((scenes.light("directional"), {}), (env, {"environment_lights": 512})):
+        lights = {"light": emitter}
+        ours = scenes.render(scenes.scene(blobs, nrf(**extra), lights, spp=16))[..., :3].sum(-1)
+        volpath = scenes.scene(blobs, {"type": "volpath", "max_depth": 2, "hide_emitters": True}, lights, spp=64)
+        volpath = scenes.render(volpath)[..., :3].sum(-1)
+        mesh = scenes.scene(
+            None, {"type": "path", "max_depth": 2, "hide_emitters": True}, lights, spp=64, shapes=spheres
+        )
+        mesh = scenes.render(mesh)[..., :3].sum(-1)
+
+        def correlation(a, b):
+            return np.corrcoef(a.ravel(), b.ravel())[0, 1]
+
+        # Normals of the blobs point away from the field's origin, not each ball's own: shading differs, sides do not.
+        assert correlation(ours, volpath) > 0.97
+        assert correlation(ours, mesh) > 0.75
+        for wrong in (mesh[:, ::-1], mesh[::-1], mesh.T):
+            assert correlation(ours, mesh) > correlation(ours, wrong) + 0.15
+
+
+def test_background_and_alpha(blobs):
+    """With visible emitters the environment shows through, and pixels are opaque; hidden, alpha is the opacity."""
+    lights = {"light": scenes.light("env")}
+    shown = scenes.render(scenes.scene(blobs, nrf("none", hide_emitters=False), lights))
+    hidden = scenes.render(scenes.scene(blobs, nrf("none"), lights))
+    assert (shown[..., 3] == 1).all()
+    corner = hidden[..., 3] == 0
+    assert corner.any() and (hidden[..., 3] > 0.99).any()
+    reference = scenes.scene(None, {"type": "path", "max_depth": 2}, lights)
+    # The empty corner sees the map itself; 64 jittered rays of 16 spp against as many others.
+    np.testing.assert_allclose(shown[corner][:, :3].mean(0), scenes.render(reference)[corner][:, :3].mean(0), rtol=0.02)
+
+
+def test_seeds_spp_and_chunks(blobs, monkeypatch):
+    """One seed, one image; another seed, another; chunks of pixels change the noise, not the mean."""
+    loaded = scenes.scene(blobs, nrf(), {"light": scenes.light("point")}, size=32)
+    first = scenes.render(loaded, 3)
+    np.testing.assert_array_equal(first, scenes.render(loaded, 3))
+    assert np.abs(first - scenes.render(loaded, 4)).max() > 1e-3
+    error = [np.abs(scenes.render(loaded, 1, spp=n) - scenes.render(loaded, 2, spp=512)).mean() for n in (4, 64)]
+    assert error[1] < error[0] / 2.5  # sixteen times the samples: a quarter of the error
+    monkeypatch.setattr("mi_ntf.render.integrator.CHUNK", 1000)
+    assert scenes.render(loaded, 3).mean() == pytest.approx(first.mean(), rel=0.02)
+
+
+def test_crop_window(blobs):
+    """A crop shows the same pixels as the whole picture."""
+    loaded = scenes.scene(blobs, nrf(), {"light": scenes.light("directional")}, size=32)
+    whole = scenes.render(loaded, spp=256)
+    parameters = mi.traverse(loaded)
+    parameters["sensor.film.crop_size"], parameters["sensor.film.crop_offset"] = [12, 8], [10, 14]
+    parameters.update()
+    crop = scenes.render(loaded, spp=256)
+    assert crop.shape == (8, 12, 4)
+    np.testing.assert_allclose(crop, whole[14:22, 10:22], atol=0.05)  # noise of 256 jittered rays at edges
+    assert np.corrcoef(crop.ravel(), whole[14:22, 10:22].ravel())[0, 1] > 0.99
+
+
+def test_timeout_ends_early(blobs, monkeypatch):
+    monkeypatch.setattr("mi_ntf.render.integrator.CHUNK", 256)
+    loaded = scenes.scene(blobs, nrf(timeout=1e-3), {"light": scenes.light("env")}, size=64)
+    start = time.monotonic()
+    image = scenes.render(loaded)
+    assert time.monotonic() - start < 60
+    assert (image[32:] == 0).all()  # 16 of 4096 pixels were begun
+
+
+def test_develop_false_leaves_the_image_in_the_film(blobs):
+    """What the stock program does: render(develop=False), then the film writes."""
+    loaded = scenes.scene(blobs, nrf("none"), {"light": scenes.light("point")}, size=16)
+    loaded.integrator().render(loaded, 0, seed=5, spp=4, develop=False)
+    np.testing.assert_allclose(np.array(loaded.sensors()[0].film().develop()), scenes.render(loaded, 5, 4), atol=1e-6)
+
+
+def test_placement_by_to_world_and_scale(tmp_path):
+    """Twice the size, rotated, moved, with the light moved along and brightened by the square: the same image."""
+    path = scenes.write_blobs(tmp_path)
+    plain = scenes.render(scenes.scene(path, nrf(), {"light": scenes.light("point")}, spp=64))
+    place = mi.ScalarTransform4f().translate([1, 2, -1]).rotate([0, 1, 0], 70)
+    twice = place @ mi.ScalarTransform4f().scale(2.0)
+    center, radius = scenes.SIMILARITY.center, scenes.SIMILARITY.radius
+    eye = [center[0] + 1.2, center[1] + 1.5, center[2] + 5]
+    point = twice @ mi.ScalarPoint3f([3.4, 3.0, 2.5])
+    moved = mi.load_dict({
+        "type": "scene",
+        "integrator": nrf(),
+        "sensor": {
+            "type": "perspective",
+            "fov": 28,
+            "to_world": place @ mi.ScalarTransform4f().look_at(
+                [2 * v for v in eye], [2 * v for v in center], [0, 1, 0]),
+            "film": scenes.film(64),
+            "sampler": {"type": "independent", "sample_count": 64},
+        },
+        "ball": {
+            "type": "sphere",
+            "to_world": twice @ mi.ScalarTransform4f().translate(list(center)).scale(radius),
+            "bsdf": {"type": "null"},
+            "interior": {"type": "nrf", "filename": str(path), "to_world": place, "scale": 2.0},
+        },
+        "light": {"type": "point", "position": list(point), "intensity": {"type": "rgb", "value": [240, 200, 160]}},
+    })  # fmt: skip
+    # Equal seeds draw equal samples; float32 coordinates differ in the last digits, which flips samples at borders.
+    np.testing.assert_allclose(scenes.render(moved), plain, atol=0.02)
+    assert np.abs(scenes.render(moved) - plain).mean() < 1e-4
