@@ -125,7 +125,7 @@ def _network(data: dict) -> Network:
 
 FAST = Architecture(
     density=Network(Encoding("planes", (64, 128), 8), (32,)),
-    reflectance=Network(Encoding("planes", (128,), 16), (64,)),
+    reflectance=Network(Encoding("planes", (48, 128), 10), (64,)),
     transmittance=Network(Encoding("planes", (64,), 8), (64, 64), points=16),
 )
 """Trains in minutes on two CPU cores: 12 bilinear fetches per sample and small perceptrons."""

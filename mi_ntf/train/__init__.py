@@ -2,7 +2,8 @@
 
 import os
 
-# Threads that wait for work sleep instead of spinning: on a machine that does other work too, spinning costs most of the time.
+# Threads that wait for work sleep instead of spinning: on a machine that does other work too, spinning costs most of
+# the time. OpenMP reads this once, when PyTorch is imported.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 from .config import PRESETS, TrainConfig

@@ -10,7 +10,10 @@ from .occupancy import Occupancy
 
 
 class Baked:
-    """`sigma` and `slope` (−∇ of the blurred opacity) of [−1, 1]³ on cells³ cells, [z, y, x]; refreshed by :meth:`update`."""
+    """`sigma` (1, 1, k, k, k) and `slope` (1, 3, k, k, k), −∇ of the blurred opacity: [−1, 1]³ as [z, y, x].
+
+    Both come from :meth:`update`.
+    """
 
     def __init__(self, cells: int):
         self.cells = cells
@@ -73,11 +76,15 @@ def blur(grid: torch.Tensor, deviation: float = 1.25) -> torch.Tensor:
 
 
 def _fetch(grid: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
-    """Trilinear values (channels, n) of a grid (1, channels, z, y, x) at x (n, 3). Halves, since the batch is what runs in parallel."""
+    """Trilinear values (channels, n) of a grid (1, channels, z, y, x) at x (n, 3).
+
+    In two halves, since ``grid_sample`` runs the batch in parallel, not the points.
+    """
     n = len(x)
     if n % 2:
         x = torch.cat([x, x[:1]])
-    out = F.grid_sample(grid.expand(2, -1, -1, -1, -1), x.view(2, -1, 1, 1, 3), "bilinear", "border", align_corners=False)
+    halves = x.reshape(2, -1, 1, 1, 3)
+    out = F.grid_sample(grid.expand(2, -1, -1, -1, -1), halves, "bilinear", "border", align_corners=False)
     return out[:, :, :, 0, 0].transpose(0, 1).reshape(grid.shape[1], -1)[:, :n]
 
 
@@ -87,10 +94,10 @@ def uniform_directions(n: int, generator: torch.Generator) -> torch.Tensor:
 
 
 def random_chords(n: int, reach: float, generator: torch.Generator):
-    """Chords of two uniform points on the sphere (method.md, section 5, augmentation) that meet the ball of radius `reach`.
+    """Chords of two uniform points on the sphere (method.md, section 5) that meet the ball of radius `reach`.
 
-    A point of the chord and its direction (n, 3). Such a line has a uniform direction, and its distance r from the centre has r² uniform, so r is
-    drawn from the ball directly.
+    Returns a point and the direction of each, (n, 3). Such a line has a uniform direction, and the square of its
+    distance from the centre is uniform too: so no chord has to be drawn in vain.
     """
     d = uniform_directions(n, generator)
     across = F.normalize(torch.linalg.cross(d, uniform_directions(n, generator)), dim=1)

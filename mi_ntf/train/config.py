@@ -1,4 +1,4 @@
-"""What decides a training run. Times in the schedule are shares of the whole run, so it scales with --minutes and --steps."""
+"""What decides a training run. Times are shares of the whole run, so a schedule scales with --minutes and --steps."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ class TrainConfig:
     """One recipe. Lengths in field units (unit-sphere radii), weights relative to the colour loss."""
 
     architecture: Architecture = FAST
-    samples: int = 40000
+    samples: int = 20000
     """Field samples a step; the number of camera rays follows from how many samples a ray takes."""
     step: float = 1 / 80
     """Length of the cells of the quadrature: 160 across the unit sphere."""
@@ -18,7 +18,7 @@ class TrainConfig:
     """Occupancy grid, cells along an edge."""
     bake: int = 128
     """Density grid for normals and transmittance targets, cells along an edge."""
-    lr_planes: float = 2e-2
+    lr_planes: float = 0.1
     lr_layers: float = 3e-3
     lr_end: float = 0.03
     """Share of the learning rates that is left at the end (exponential decay)."""
@@ -29,7 +29,7 @@ class TrainConfig:
     facing: float = 0.1
     empty: float = 0.05
     """Weight of σ → 0 outside the visual hull, where no photograph's ray is sampled."""
-    smooth: float = 2e-3
+    smooth: float = 2e-4
     """Weight of total variation of the planes."""
     ntf_from: float = 0.4
     """Transmittance training starts here, the field has formed."""

@@ -7,7 +7,7 @@ import torch
 from .networks import Networks
 from .occupancy import Occupancy, from_networks
 from .rays import Rays
-from .render import render
+from .render import render, scatter_sum
 
 CUT = 0.1
 """The renderer treats σ below this as empty."""
@@ -32,13 +32,13 @@ def render_all(networks: Networks, rays: Rays, occupancy: Occupancy, step: float
             image = render(networks, part, occupancy.samples(part, step, generator), step)
             color[where] += image.color / passes
             alpha[where] += image.alpha / passes
-            normal[where] += torch.zeros(len(part), 3).index_add(0, image.shaded, image.weight[:, None] * image.normal) / passes
+            normal[where] += scatter_sum(image.weight[:, None] * image.normal, image.shaded, len(part)) / passes
     return color, alpha, normal
 
 
 def psnr(predicted: torch.Tensor, target: torch.Tensor, images: int) -> dict[str, float]:
-    """Mean over `images` of their PSNR (dB): of sRGB-encoded images clipped to [0, 1] (`srgb`, the field's habit) and of
-    linear ones with peak 1 (`linear`)."""
+    """Mean over `images` of their PSNR (dB): `srgb` of sRGB-encoded images clipped to [0, 1], as papers report it, and
+    `linear` of linear ones with peak 1."""
     def mean(a, b):
         mse = (a - b).square().view(images, -1).mean(1).clamp(min=1e-12)
         return float((-10 * mse.log10()).mean())

@@ -4,7 +4,6 @@ import torch
 import torch.nn.functional as F
 
 from ..core import logistic, spheres
-from ..core.architecture import Architecture
 from . import ops
 from .baked import Baked, chords, random_chords, uniform_directions
 from .networks import Networks
@@ -13,7 +12,7 @@ from .rays import Rays
 from .render import Image, scatter_sum
 
 DARK = 0.05
-"""Brightness, in units of the photographs' bright parts, from which differences count absolutely rather than relatively."""
+"""Brightness, in units of the photographs' bright parts, below which differences count absolutely."""
 
 
 def color(predicted: torch.Tensor, target: torch.Tensor, exposure: float) -> torch.Tensor:
@@ -37,7 +36,7 @@ def normals(image: Image, d: torch.Tensor, baked: Baked):
 
 
 def emptiness(networks: Networks, x: torch.Tensor) -> torch.Tensor:
-    """Hinge on ln σ at points `x` that must be empty: pushes to under a third of LOG_EMPTY's σ, without a gradient below."""
+    """Hinge on ln σ at points `x` that must be empty: pushes under a third of LOG_EMPTY's σ, with no gradient below."""
     return F.relu(networks.log_density(x) - (LOG_EMPTY - 1)).mean()
 
 
@@ -47,7 +46,8 @@ def total_variation(networks: Networks) -> torch.Tensor:
     for name, p in networks.tensors.items():
         if ".planes." in name and not name.startswith("transmittance"):
             scale = (p.shape[1] / 128) ** 2
-            terms.append(scale * ((p[:, 1:] - p[:, :-1]).square().mean() + (p[:, :, 1:] - p[:, :, :-1]).square().mean()))
+            down, across = p[:, 1:] - p[:, :-1], p[:, :, 1:] - p[:, :, :-1]
+            terms.append(scale * (down.square().mean() + across.square().mean()))
     return sum(terms)
 
 
@@ -81,7 +81,7 @@ def transmittance(networks: Networks, baked: Baked, surface: torch.Tensor, count
 
 
 def transmittance_color(networks: Networks, image: Image, rays: Rays, exposure: float, count: int) -> torch.Tensor:
-    """‖I_nt − I‖² of the first `count` camera rays: pixels lit by τ_nt in place of the marched light (method.md, section 5)."""
+    """‖I_nt − I‖² of the first `count` rays: pixels lit by τ_nt instead of the marched light (method.md, section 5)."""
     near = (image.shaded < count).nonzero()[:, 0]
     ray, x = image.shaded[near], image.x[near]
     toward = -rays.d[:count]
@@ -89,8 +89,3 @@ def transmittance_color(networks: Networks, image: Image, rays: Rays, exposure: 
     tau = logistic.transmittance(ops, (x * toward[ray]).sum(1), a[ray], b[ray])
     pixel = scatter_sum((image.weight[near].detach() * tau)[:, None] * image.radiance[near].detach(), ray, count)
     return color(pixel, rays.target[:count, :3], exposure)
-
-
-def part(architecture: Architecture, tensors: dict, names: tuple[str, ...]) -> list[torch.Tensor]:
-    """The tensors of the named networks, in the file's order."""
-    return [tensors[k] for k in architecture.skeleton() if k.split(".")[0] in names]

@@ -1,4 +1,4 @@
-"""The three networks in PyTorch: the trainable twin of :mod:`mi_ntf.core.reference`, same conventions, same tensor names.
+"""The three networks in PyTorch: the trainable twin of :mod:`mi_ntf.core.reference`, same conventions, same names.
 
 Tensors live in the file's own layout, planes as (3, v, u, channels): seen as (3, channels, v, u) that is PyTorch's
 "channels last", the layout in which ``grid_sample`` is three times faster.
@@ -43,7 +43,7 @@ class Networks:
         return F.normalize(raw[:, :3], dim=1, eps=1e-10), rest[:, :3], roughness, rest[:, 4]
 
     def transmittance_parameters(self, o: torch.Tensor, d: torch.Tensor):
-        """``(hit, a, b)``, each (n,), of the rays through `o` (n, 3) along the unit directions `d` towards the light."""
+        """``(hit, a, b)``, each (n,), of rays through `o` (n, 3) along unit directions `d` towards the light."""
         net = self.architecture.transmittance
         hit, m, h = spheres.chord(ops, o.unbind(1), d.unbind(1))
         p1, p2 = (torch.stack(p, dim=1) for p in spheres.end_points(m, d.unbind(1), h))
@@ -55,7 +55,7 @@ class Networks:
 
 
 def density_from_log(raw: torch.Tensor) -> torch.Tensor:
-    """σ = exp(raw), clipped as in the format. The clip is invisible to gradients, so that no point is stuck beyond it."""
+    """σ = exp(raw), clipped as in the format. Gradients do not see the clip, so that no point is stuck beyond it."""
     clipped = raw + (raw.clamp(MIN_LOG_DENSITY, MAX_LOG_DENSITY) - raw).detach()
     return torch.exp(clipped)
 
@@ -120,11 +120,11 @@ def _scatter(grad: torch.Tensor, x: torch.Tensor, y: torch.Tensor, r: int) -> to
 
 
 def initial(architecture: Architecture, log_density: float, generator: torch.Generator) -> Networks:
-    """Fresh networks: planes near 1 (so that no factor of the product hides the others), He layers, σ near exp(`log_density`)."""
+    """Fresh networks: planes near 1 (no factor of the product hides the others), He layers, ln σ near `log_density`."""
     tensors = {}
     for name, shape in architecture.skeleton().items():
         if ".planes." in name:
-            value = 1 + 0.1 * torch.randn(shape, generator=generator)
+            value = 1 + 0.02 * torch.randn(shape, generator=generator)
         elif name.endswith("weight"):
             value = torch.randn(shape, generator=generator) * math.sqrt(2 / shape[1])
         else:

@@ -23,6 +23,7 @@ class Occupancy:
         self.index = hull.reshape(-1).nonzero()[:, 0]
         self.sigma = torch.full((self.cells**3,), -1.0)
         self.sigma[self.index] = 0.0
+        self.level = torch.zeros(len(self.index))
         self.outside = (~hull).reshape(-1).nonzero()[:, 0]
         self.stray = self.outside[:0]
         """Cells outside the hull where the networks still put matter; kept up by :meth:`update`."""
@@ -35,14 +36,14 @@ class Occupancy:
 
     @torch.no_grad()
     def update(self, networks: Networks, generator: torch.Generator, decay: float = 0.8) -> None:
-        """Take new densities at random points of every cell of the hull; old ones fade, so that a thin skin is not lost."""
+        """Take new densities at random points of every cell; old ones fade slowly, so that a thin skin is not lost."""
         n = self.cells
         new = networks.density(self.positions(self.index, generator))
-        self.level = new if not hasattr(self, "level") else torch.maximum(self.level * decay, new)
+        self.level = torch.maximum(self.level * decay, new)
         grid = torch.zeros(n**3)
         grid[self.index] = (self.level > FULL_BELOW).float()
         near = F.max_pool3d(grid.view(1, 1, n, n, n), 3, 1, 1).view(-1)[self.index] > 0
-        # The latest value, not the faded maximum, decides how much light a cell takes: never hide what is behind a ghost.
+        # The latest value, not the faded maximum, decides how much light a cell takes: ghosts hide nothing.
         self.sigma[self.index] = torch.where(near, new, -1.0)
         x = self.positions(self.outside, generator)
         stray = [networks.log_density(p) > LOG_EMPTY for p in x.split(65536)]
@@ -63,7 +64,7 @@ class Occupancy:
     def tighten(self, rays: Rays, chunk: int = 32768) -> tuple[torch.Tensor, Rays]:
         """The rays that meet an occupied cell, with `t0`, `t1` around those cells. Also returns their indices.
 
-        Two passes, blocks of 4³ cells (and their neighbours) and then cells: most rays and most of their lengths leave early.
+        Two passes, blocks of 4³ cells (and their neighbours), then cells: most rays leave early.
         """
         n, block = self.cells, 4
         full = F.pad((self.sigma >= 0).float().view(1, 1, n, n, n), (0, -n % block) * 3)
@@ -89,7 +90,10 @@ class Occupancy:
 
 
 def _spans(rays: Rays, full: torch.Tensor, extent: float, step: float, chunk: int) -> tuple[torch.Tensor, Rays]:
-    """Rays that find a full cell of `full` (k, k, k), which covers [−1, extent − 1]³, in steps of `step`; and their spans."""
+    """Indices of the rays that find a full cell of `full` (k, k, k) in steps of `step`, and those rays with spans.
+
+    `full` covers [−1, extent − 1]³.
+    """
     k, flat = full.shape[0], full.reshape(-1)
     keep, starts, ends = [], [], []
     for first in range(0, len(rays), chunk):
@@ -115,7 +119,7 @@ def _spans(rays: Rays, full: torch.Tensor, extent: float, step: float, chunk: in
 
 @torch.no_grad()
 def from_networks(networks: Networks, cells: int, threshold: float, generator: torch.Generator) -> Occupancy:
-    """Occupancy of the field alone, without photographs: all cells of the unit ball with σ > `threshold` at one of 4 points."""
+    """Occupancy of a field without photographs: cells of the unit ball with σ > `threshold` at one of 4 points."""
     axis = (torch.arange(cells) + 0.5) * (2 / cells) - 1
     ball = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).norm(dim=-1) < 1
     grid = Occupancy(ball)

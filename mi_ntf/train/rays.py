@@ -37,8 +37,8 @@ def from_split(split: Split, name: str) -> Rays:
     n, height, width = split.images.shape[:3]
     away = np.linalg.norm(split.light_pos - split.c2w[:, :3, 3], axis=1) / split.radius
     if away.max() > 0.02:
-        raise MiNtfError(f"split '{name}', frame {away.argmax()}: the light is {away.max():.3g} object radii from the camera; "
-                         "training needs collocated photographs (flash at the lens), as `mi-ntf capture` makes them")
+        raise MiNtfError(f"split '{name}', frame {away.argmax()}: the light is {away.max():.3g} object radii from the "
+                         "camera; training needs photographs with a flash at the lens, as `mi-ntf capture` makes them")
     o, d = pixel_rays(split.c2w, split.focal, width, height)
     o = (o - split.center) / split.radius
     light = np.broadcast_to((split.light_intensity / split.radius**2)[:, None, None], (n, height, width, 3))
@@ -80,8 +80,8 @@ def visual_hull(split: Split, cells: int) -> torch.Tensor:
         empty = seen & (alpha[v.clamp(0, height - 1), u.clamp(0, width - 1)] < 1e-3)
         x, inside = x[~empty], inside[~empty]
     if not len(inside):
-        raise MiNtfError("no point in space is covered by the object in all photographs; check 'transform_matrix' (OpenGL "
-                         "axes), 'camera_angle_x' and 'unit_sphere' of transforms_train.json")
+        raise MiNtfError("no point in space is covered by the object in all photographs; check 'transform_matrix' "
+                         "(OpenGL axes), 'camera_angle_x' and 'unit_sphere' of transforms_train.json")
     hull = torch.zeros(cells**3, dtype=torch.bool)
     hull[inside] = True
     return hull.view(cells, cells, cells)

@@ -20,9 +20,8 @@ from .networks import Networks, density_from_log
 from .rays import Rays
 
 SURFACE = 2.0
-"""The phase function of the field at ω_i = ω_o in multiples of ρ⟨n,ω_i⟩. Single scattering in an opaque medium that scatters
-with f returns f·⟨n,ω_i⟩/(⟨n,ω_i⟩ + ⟨n,ω_o⟩) (Lommel and Seeliger; Chandrasekhar 1960, section 6): with
-f = ρ (⟨n,ω_i⟩ + ⟨n,ω_o⟩) it looks like a surface of reflectance ρ, from all sides. Collocated, that is 2ρ⟨n,ω_i⟩."""
+"""``microfacet.scattering`` over ``microfacet.lobes_collocated``: the field scatters with ρ (⟨n,ω_i⟩ + ⟨n,ω_o⟩), which
+makes an opaque field look like a surface of reflectance ρ from all sides; collocated, that is 2ρ⟨n,ω_i⟩."""
 MIN_WEIGHT = 1e-4
 """Samples with a smaller alpha weight are not shaded."""
 
@@ -41,10 +40,10 @@ class Image:
     raw: torch.Tensor
 
 
-def weights(sigma: torch.Tensor, ray: torch.Tensor, count: int, step: float):
-    """``(w, v)``, alpha and light weights of packed samples: `ray` (s,) ascending, `sigma` (s,), `count` rays.
+def weights(sigma: torch.Tensor, ray: torch.Tensor, step: float):
+    """``(w, v)``, alpha and light weights of packed samples: `ray` (s,) ascending, `sigma` (s,).
 
-    Sums run over all rays at once, in float64: the sum in front of the last ray is 10⁵ and float32 would keep two decimals.
+    Sums run over all rays at once, in float64: at the last ray the sum is 10⁵, of which float32 keeps two decimals.
     """
     depth = sigma * step
     total = depth.double().cumsum(0)
@@ -61,7 +60,7 @@ def scatter_sum(value: torch.Tensor, ray: torch.Tensor, count: int) -> torch.Ten
 
 
 def shade(networks: Networks, x: torch.Tensor, d: torch.Tensor, t: torch.Tensor, light: torch.Tensor):
-    """``(radiance, normal)``: what the points `x` scatter back along −d, per unit of light weight, light/t² arriving."""
+    """``(radiance, normal)``: what the points `x` scatter back along −d per unit of light weight v."""
     normal, albedo, roughness, specular = networks.reflectance(x)
     cos = -(normal * d).sum(1)
     diffuse, glossy = microfacet.lobes_collocated(ops, cos, roughness)
@@ -74,7 +73,7 @@ def render(networks: Networks, rays: Rays, samples, step: float) -> Image:
     ray, t = samples
     x = torch.addcmul(rays.o[ray], rays.d[ray], t[:, None])
     raw = networks.log_density(x)
-    w, v = weights(density_from_log(raw), ray, len(rays), step)
+    w, v = weights(density_from_log(raw), ray, step)
     alpha = scatter_sum(w, ray, len(rays))
     near = (w.detach() > MIN_WEIGHT).nonzero()[:, 0]
     ray, t, x = ray[near], t[near], x[near]

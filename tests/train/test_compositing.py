@@ -5,6 +5,8 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="training needs PyTorch: pip install 'mi-ntf[train]'")
 
+from mi_ntf.core import microfacet  # noqa: E402
+from mi_ntf.core import ops as numpy_ops  # noqa: E402
 from mi_ntf.train import evaluate, losses, networks, render  # noqa: E402
 from mi_ntf.train.baked import Baked  # noqa: E402
 from mi_ntf.train.config import PRESETS  # noqa: E402
@@ -44,7 +46,7 @@ def test_packed_weights_equal_a_double_loop():
     counts, step = [3, 0, 5, 1], 0.05
     ray = np.repeat(np.arange(4), counts)
     sigma = rng.uniform(0, 40, len(ray)).astype(np.float32)
-    w, v = render.weights(torch.tensor(sigma), torch.tensor(ray), 4, step)
+    w, v = render.weights(torch.tensor(sigma), torch.tensor(ray), step)
     for r in range(4):
         front = 1.0
         for j in np.nonzero(ray == r)[0]:
@@ -75,7 +77,7 @@ def test_uniform_ball_has_the_closed_form():
 def test_an_opaque_plane_looks_like_its_surface():
     """The reason of SURFACE: v sums to 1/2 behind an opaque front, however coarse the cells are."""
     for step in (0.2, 0.01):
-        w, v = render.weights(torch.full((400,), 600.0), torch.zeros(400, dtype=torch.long), 1, step)
+        w, v = render.weights(torch.full((400,), 600.0), torch.zeros(400, dtype=torch.long), step)
         assert abs(float(w.sum()) - 1) < 1e-6
         assert abs(render.SURFACE * float(v.sum()) - 1) < 1e-6
 
@@ -143,3 +145,12 @@ def test_psnr_of_a_known_error():
     assert evaluate.psnr(a, b, 2)["linear"] == pytest.approx(20.0, abs=1e-3)
     # sRGB of 0.5 and 0.6: 0.73536 and 0.79774 → −20 lg 0.06238
     assert evaluate.psnr(a, b, 2)["srgb"] == pytest.approx(24.10, abs=0.01)
+
+
+def test_surface_factor_is_the_phase_function_seen_from_the_light():
+    """SURFACE · lobes_collocated is what the renderers' phase function gives for ω_i = ω_o."""
+    cos, roughness = np.linspace(0.05, 1, 20), np.linspace(0.2, 1, 20)
+    w = (np.sqrt(1 - cos**2), 0 * cos, cos)
+    expected = microfacet.scattering(numpy_ops, w, w, (0 * cos, 0 * cos, 1 + 0 * cos), roughness)
+    actual = microfacet.lobes_collocated(numpy_ops, cos, roughness)
+    np.testing.assert_allclose(render.SURFACE * np.array(actual), expected, rtol=1e-12)  # float64 rounding

@@ -36,7 +36,8 @@ def test_networks_agree_with_the_oracle(dtype, tolerance):
     tensors, nets = field(dtype)
     x, d = points(200)
     tx, td = torch.tensor(x, dtype=dtype), torch.tensor(d, dtype=dtype)
-    expected = [reference.density(SMALL, tensors, x), *np.split(reference.reflectance(SMALL, tensors, x), (3, 6, 7), axis=1),
+    matter = np.split(reference.reflectance(SMALL, tensors, x), (3, 6, 7), axis=1)
+    expected = [reference.density(SMALL, tensors, x), *matter,
                 *reference.transmittance_parameters(SMALL, tensors, x * 0.5, d)[1:]]
     actual = [nets.density(tx), *nets.reflectance(tx), *nets.transmittance_parameters(tx * 0.5, td)[1:]]
     for want, have in zip(expected, actual, strict=True):
@@ -60,8 +61,8 @@ FORMULAS = {
     "parameters": (lambda o, a, b, h: sum(logistic.parameters(o, a, b, h)), 3),
     "chord": (lambda o, x, y, z: spheres.chord(o, (x, y, z), (0.6, 0.0, 0.8))[2], 3),
     "collocated": (lambda o, c, r: sum(microfacet.lobes_collocated(o, c, r)), 2),
-    "lobes": (lambda o, x, r: sum(microfacet.lobes(o, (0 * x + 0.6, 0 * x, 0 * x + 0.8), (0 * x, 0 * x + 0.6, 0 * x + 0.8),
-                                                   (x, 0 * x, 0 * x + 1), r)), 2),
+    "scattering": (lambda o, x, r: sum(microfacet.scattering(
+        o, (0 * x + 0.6, 0 * x, 0 * x + 0.8), (0 * x, 0 * x + 0.6, 0 * x + 0.8), (x, 0 * x, 0 * x + 1), r)), 2),
 }
 
 

@@ -7,12 +7,12 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="training needs PyTorch: pip install 'mi-ntf[train]'")
 
+from train import two_spheres  # noqa: E402
+
 from mi_ntf.core import field_file  # noqa: E402
 from mi_ntf.core.errors import MiNtfError  # noqa: E402
 from mi_ntf.data import schema  # noqa: E402
 from mi_ntf.train import train, trainer  # noqa: E402
-
-from train import two_spheres  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +21,7 @@ def photographs(tmp_path_factory):
 
 
 def test_short_run_learns_the_spheres(photographs, tmp_path):
-    """An all-black picture of them has 13 dB; 120 steps must explain most of what is seen, also after rounding to float16."""
+    """An all-black picture has 11 dB; the field must explain most of what is seen, also after rounding to float16."""
     out = tmp_path / "field.safetensors"
     report = train(photographs, out, steps=120)
     assert report["test"]["srgb"] > 20, report
@@ -47,9 +47,8 @@ def test_same_seed_gives_the_same_losses_and_a_checkpoint_continues_them(photogr
     third = run(photographs, tmp_path / "a", 20)
     third.resume()
     assert third.step == 6
-    # The baked grid is renewed at a resumption, so normals differ a little from then on.
-    np.testing.assert_allclose([_step(third) for _ in range(6)], expected[6:], rtol=0.05)
-    with pytest.raises(MiNtfError, match="belongs to a run with other settings.*delete the file"):
+    assert [_step(third) for _ in range(6)] == expected[6:]
+    with pytest.raises(MiNtfError, match=r"belongs to a run with other settings.*delete the file"):
         run(photographs, tmp_path / "a", 21).resume()
 
 
@@ -75,7 +74,7 @@ def test_bad_photographs(tmp_path):
     bad = schema.read_image(folder / "train/0001.exr")
     bad[3, 4] = np.nan
     schema.write_exr(folder / "train/0001.exr", bad)
-    with pytest.raises(MiNtfError, match="0001.exr: 1 pixels are NaN"):
+    with pytest.raises(MiNtfError, match=r"0001\.exr: 1 pixels are NaN"):
         train(folder, tmp_path / "f", steps=1)
     path = folder / "transforms_val.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"frames": []}))

@@ -1,4 +1,4 @@
-"""A small data set without a renderer: two Lambert spheres, one behind the other, ray-traced in NumPy with the light at the lens."""
+"""A small data set without a renderer: two Lambert spheres, ray-traced in NumPy with the light at the lens."""
 
 from pathlib import Path
 
