@@ -48,7 +48,7 @@ def total_variation(networks: Networks) -> torch.Tensor:
             scale = (p.shape[1] / 128) ** 2
             down, across = p[:, 1:] - p[:, :-1], p[:, :, 1:] - p[:, :, :-1]
             terms.append(scale * (down.square().mean() + across.square().mean()))
-    return sum(terms)
+    return torch.stack(terms).sum()
 
 
 def transmittance(networks: Networks, baked: Baked, surface: torch.Tensor, count: int, generator: torch.Generator,

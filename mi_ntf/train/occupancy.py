@@ -100,7 +100,7 @@ def _spans(rays: Rays, full: torch.Tensor, extent: float, step: float, chunk: in
         part = rays[slice(first, first + chunk)]
         count = max(1, int(((part.t1 - part.t0).max() / step).ceil()))
         t = part.t0[:, None] + (torch.arange(count) + 0.5) * step
-        cell = 0
+        cell = torch.zeros_like(t, dtype=torch.int32)
         for axis in range(3):
             x = torch.addcmul(part.o[:, axis:axis + 1] + 1, part.d[:, axis:axis + 1], t)
             cell = cell * k + x.mul_(k / extent).int().clamp_(0, k - 1)

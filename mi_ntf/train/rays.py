@@ -39,10 +39,11 @@ def from_split(split: Split, name: str) -> Rays:
     if away.max() > 0.02:
         raise MiNtfError(f"split '{name}', frame {away.argmax()}: the light is {away.max():.3g} object radii from the "
                          "camera; training needs photographs with a flash at the lens, as `mi-ntf capture` makes them")
-    o, d = pixel_rays(split.c2w, split.focal, width, height)
-    o = (o - split.center) / split.radius
-    light = np.broadcast_to((split.light_intensity / split.radius**2)[:, None, None], (n, height, width, 3))
-    o, d, light = (torch.from_numpy(np.array(a, np.float32).reshape(-1, 3)) for a in (o, d, light))
+    origins, directions = pixel_rays(split.c2w, split.focal, width, height)
+    origins = (origins - split.center) / split.radius
+    intensity = np.broadcast_to((split.light_intensity / split.radius**2)[:, None, None], (n, height, width, 3))
+    o, d, light = (torch.from_numpy(np.array(a, np.float32).reshape(-1, 3)) for a in
+                   (origins, directions, intensity))
     t0, t1 = sphere_span(o, d)
     return Rays(o, d, t0, t1, torch.from_numpy(split.images.reshape(-1, 4)), light)
 

@@ -69,7 +69,8 @@ class _Run:
         bright = self.rays["train"].target
         bright = bright[bright[:, 3] > 0.99][:, :3].mean(1)
         self.exposure = 1 / max(float(bright.quantile(0.95)) if 0 < len(bright) else 1.0, 1e-6)
-        self.step, self.spent, self.history = 0, 0.0, []
+        self.step, self.spent = 0, 0.0
+        self.history: list[dict] = []
         self.samples_per_ray, self.last_bake = 30.0, 0
 
     def _optimizer(self, *names: str) -> torch.optim.Adam:
@@ -243,8 +244,8 @@ class _Run:
 
     def finish(self) -> dict:
         """Write the field, read it back, measure it, and store the report in its header."""
-        center = tuple(float(v) for v in self.splits["train"].center)
-        similarity = Similarity(center, float(self.splits["train"].radius))
+        x, y, z = map(float, self.splits["train"].center)
+        similarity = Similarity((x, y, z), float(self.splits["train"].radius))
         tensors = networks.to_tensors(self.nets)
         report = {k: v for k, v in json.loads(self.identity).items() if k != "config"}
         report |= {"steps_done": self.step, "seconds": round(self.spent, 1), "history": self.history}
