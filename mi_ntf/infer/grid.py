@@ -7,38 +7,43 @@ import numpy as np
 
 from ..core.ops import normalize
 from . import ops
-from .network import NetworkField
+from .network import MIN_DENSITY, NetworkField, cut_density
 
 CELLS = 64
 """Resolution of the occupancy grid that marches skip by."""
 
 
+REFLECTANCE_RESOLUTION = 128
+"""Reflectance varies more slowly than density and takes eight times the memory: it is baked no finer than this."""
+
+
 class GridField:
-    """Density and reflectance of `field`, sampled once at `resolution`³ voxel centres of [−1, 1]³, trilinear between.
+    """Density and reflectance of `field`, sampled once at voxel centres of [−1, 1]³, trilinear between.
+
+    Density is baked as ln σ at `resolution`³: the networks' own σ is the exponential of a smooth function, which
+    trilinear ln σ follows far closer than trilinear σ does. Reflectance: ``REFLECTANCE_RESOLUTION``³ at most.
 
     Also holds the occupancy: `clearance` (``CELLS``³ floats) is the Chebyshev distance, in cells, to the nearest cell
-    with density anywhere in it; `radius`, the radius of the smallest origin-centred ball around all density;
-    `majorant`, the largest density. Memory: 36 bytes a voxel.
+    with density anywhere in it; `bounds`, the box around all density; `hull` (k, 3), points whose convex hull holds
+    it; `majorant`, an upper bound of the density.
     """
 
     def __init__(self, field: NetworkField, resolution: int, dj: ModuleType):
         self.dj = dj
-        sigma, reflectance = _bake(field, resolution, dj)
-        self.majorant = float(sigma.max())
-        self._sigma = _texture(sigma[..., None], dj)
-        self._reflectance = _texture(reflectance, dj)
-        occupied = _occupied_cells(sigma)
+        log_sigma = _bake(lambda p: [field.log_density(p)], 1, resolution, dj)
+        self._log_sigma = _texture(log_sigma, dj)
+        values = _bake(lambda p: _flat(field.reflectance(p)), 8, min(resolution, REFLECTANCE_RESOLUTION), dj)
+        self._reflectance = _texture(values, dj)
+        dense = log_sigma[..., 0] > np.log(MIN_DENSITY)
+        self.majorant = float(np.exp(log_sigma.max())) if dense.any() else 0.0
+        occupied = _occupied_cells(dense)
         self.clearance = dj.Float(_chebyshev_distance(occupied).ravel())
-        centres = (np.argwhere(occupied)[:, ::-1] + 0.5) * (2 / CELLS) - 1
-        reach = np.linalg.norm(np.abs(centres) + 1 / CELLS, axis=1).max() if len(centres) else 0.0
-        self.radius = float(min(reach, 1.0))
-        box = (centres.min(0) - 1 / CELLS, centres.max(0) + 1 / CELLS) if len(centres) else (np.zeros(3), np.zeros(3))
-        self.bounds = tuple(np.clip(side, -1, 1) for side in box)
+        self.hull = _support_points(occupied)
+        self.bounds = self.hull.min(0), self.hull.max(0)
 
     def density(self, p):
         """σ at `p`, 1/(unit-sphere radius)."""
-        inside = (dr.abs(p[0]) < 1) & (dr.abs(p[1]) < 1) & (dr.abs(p[2]) < 1)
-        return dr.select(inside, self._sigma.eval(self._uvw(p))[0], 0)
+        return cut_density(dr.exp(self._log_sigma.eval(self._uvw(p))[0]), p)
 
     def reflectance(self, p):
         """As :meth:`NetworkField.reflectance`."""
@@ -49,41 +54,62 @@ class GridField:
         return self.dj.Array3f(*(0.5 * c + 0.5 for c in p))
 
 
+def _flat(reflectance) -> list:
+    normal, albedo, roughness, specular = reflectance
+    return [*normal, *albedo, roughness, specular]
+
+
 def _texture(values: np.ndarray, dj: ModuleType):
     return dj.Texture3f(
         dj.TensorXf(np.ascontiguousarray(values, np.float32)), use_accel=False, wrap_mode=dr.WrapMode.Clamp
     )
 
 
-def _bake(field: NetworkField, resolution: int, dj: ModuleType) -> tuple[np.ndarray, np.ndarray]:
-    """σ (z, y, x) and reflectance (z, y, x, 8), one slab of z at a time to bound the memory."""
+def _bake(evaluate, channels: int, resolution: int, dj: ModuleType) -> np.ndarray:
+    """`evaluate(p)`, a list of `channels` arrays, at all voxel centres: (z, y, x, channels). Slabs of z bound the
+    memory."""
     axis = (np.arange(resolution, dtype=np.float32) + 0.5) * (2 / resolution) - 1
-    y, x = (dj.Float(v.ravel()) for v in np.meshgrid(axis, axis, indexing="ij"))
-    sigma = np.empty((resolution,) * 3, np.float32)
-    reflectance = np.empty((resolution,) * 3 + (8,), np.float32)
-    for k, z in enumerate(axis):
-        p = (x, y, dr.opaque(dj.Float, float(z)))
-        normal, albedo, roughness, specular = field.reflectance(p)
-        values = [field.density(p), *normal, *albedo, roughness, specular]
+    slab = max(1, min(resolution, (1 << 20) // resolution**2))
+    result = np.empty((resolution,) * 3 + (channels,), np.float32)
+    for first in range(0, resolution, slab):
+        z, y, x = np.meshgrid(axis[first : first + slab], axis, axis, indexing="ij")
+        p = tuple(dj.Float(c.ravel()) for c in (x, y, z))
+        values = evaluate(p)
         dr.eval(values)
-        values = np.stack([np.broadcast_to(v.numpy(), x.shape) for v in values], -1)
-        sigma[k] = values[:, 0].reshape(resolution, resolution)
-        reflectance[k] = values[:, 1:].reshape(resolution, resolution, 8)
-    return sigma, reflectance
+        values = np.stack([np.broadcast_to(v.numpy(), x.size) for v in values], -1)
+        result[first : first + slab] = values.reshape(*x.shape, channels)
+    return result
 
 
-def _occupied_cells(sigma: np.ndarray) -> np.ndarray:
-    """Cells (z, y, x) of the occupancy grid that trilinear interpolation of `sigma` gives any density."""
-    n = sigma.shape[0]
+def _occupied_cells(dense: np.ndarray) -> np.ndarray:
+    """Cells (z, y, x) of the occupancy grid that interpolation between the voxels `dense` gives any density."""
+    n = dense.shape[0]
     occupied = np.zeros((CELLS,) * 3, bool)
     # A voxel's density reaches one voxel to each side of its centre.
-    k, j, i = np.nonzero(sigma > 0)
+    k, j, i = np.nonzero(dense)
     low = [np.clip(np.floor((c - 0.5) / n * CELLS - 1e-4), 0, CELLS - 1).astype(int) for c in (k, j, i)]
     high = [np.clip(np.floor((c + 1.5) / n * CELLS + 1e-4), 0, CELLS - 1).astype(int) for c in (k, j, i)]
     spread = max((int((b - a).max()) for a, b in zip(low, high, strict=True)), default=0) if len(k) else 0
     for dz, dy, dx in np.ndindex(*(spread + 1,) * 3):
         occupied[tuple(np.minimum(a + d, b) for a, b, d in zip(low, high, (dz, dy, dx), strict=True))] = True
     return occupied
+
+
+def _support_points(occupied: np.ndarray, directions: int = 400) -> np.ndarray:
+    """Corners of occupied cells that lie furthest along many directions, (k, 3) float64; the origin where there is
+    none.
+
+    Their hull misses less than a cell of the true one, which the cells' own dilation makes up for.
+    """
+    corners = np.argwhere(occupied)[:, None, ::-1] + np.stack(np.meshgrid(*[[0, 1]] * 3), -1).reshape(-1, 3)
+    corners = np.unique(corners.reshape(-1, 3), axis=0) * (2 / CELLS) - 1.0
+    if not len(corners):
+        return np.zeros((1, 3))
+    z = 1 - (np.arange(directions) + 0.5) * 2 / directions
+    phi = np.arange(directions) * np.pi * (3 - 5**0.5)
+    fan = np.stack([np.sqrt(1 - z * z) * np.cos(phi), np.sqrt(1 - z * z) * np.sin(phi), z], 1)
+    fan = np.concatenate([fan, np.eye(3), -np.eye(3)])
+    return corners[np.unique((corners @ fan.T).argmax(0))]
 
 
 def _chebyshev_distance(occupied: np.ndarray, limit: int = 16) -> np.ndarray:

@@ -18,6 +18,12 @@ MIN_DENSITY = 0.1
 Training drives empty space below it; every renderer of the field (also stock `volpath`) sees the same zero."""
 
 
+def cut_density(sigma, p):
+    """`sigma`, but 0 outside the unit sphere and below ``MIN_DENSITY``."""
+    inside = p[0] * p[0] + p[1] * p[1] + p[2] * p[2] < 1
+    return dr.select(inside & (sigma > MIN_DENSITY), sigma, 0)
+
+
 class NetworkField:
     """Density, reflectance and ray transmittance of one field, evaluated by its networks.
 
@@ -32,12 +38,14 @@ class NetworkField:
         self._reflectance = _Network(arch.reflectance.encoding, "reflectance", tensors, dj)
         self._transmittance = _Network(arch.transmittance.encoding, "transmittance", tensors, dj)
 
-    def density(self, p):
-        """σ at `p`, 1/(unit-sphere radius); 0 outside the unit sphere and below ``MIN_DENSITY``."""
+    def log_density(self, p):
+        """ln σ at `p`, clipped to the legal range; without the cuts of :meth:`density`."""
         (raw,) = self._density.layers(self._density.encode(p))
-        sigma = dr.exp(dr.clip(raw, MIN_LOG_DENSITY, MAX_LOG_DENSITY))
-        inside = p[0] * p[0] + p[1] * p[1] + p[2] * p[2] < 1
-        return dr.select(inside & (sigma > MIN_DENSITY), sigma, 0)
+        return dr.clip(raw, MIN_LOG_DENSITY, MAX_LOG_DENSITY)
+
+    def density(self, p):
+        """σ at `p`, 1/(unit-sphere radius)."""
+        return cut_density(dr.exp(self.log_density(p)), p)
 
     def reflectance(self, p):
         """``(normal, albedo, roughness, specular)``: two 3-tuples and two scalars, ranges as in core.reference."""

@@ -167,7 +167,7 @@ class SceneLight:
                 else transmittance_map.field_source(self.medium.source.density, field.grid, self.step)
             )
             self.map = transmittance_map.TransmittanceMap(
-                self.table, integrator.map_resolution, field.grid.radius, source, mi
+                self.table, integrator.map_resolution, field.grid.hull, source, mi
             )
 
     def trace(self, ray, sampler, stream):

@@ -27,7 +27,7 @@ def medium_class(phase_class: type) -> type:
         to_world         transform placement after `scale`; rotation, translation, uniform scale (default: identity)
         scale            float     scene units per capture unit, > 0 (default: 1)
         representation   string    ``grid``: baked voxels; ``network``: the networks, exact and slower (default: grid)
-        resolution       integer   voxels per side of the baked grid, 16 to 512 (default: 128; memory 36 B a voxel)
+        resolution       integer   voxels per side of the baked grid, 16 to 512 (default: 192; 4 bytes each)
         ================ ========= ====================================================================================
 
         The medium fills the sphere around the captured object (the file's similarity: centre and radius in capture
@@ -55,7 +55,7 @@ def medium_class(phase_class: type) -> type:
                     f'nrf medium: representation is "{self.representation}", expected one of '
                     + ", ".join(REPRESENTATIONS)
                 )
-            resolution = int(props.get("resolution", 128))
+            resolution = int(props.get("resolution", 192))
             if not 16 <= resolution <= 512:
                 raise MiNtfError(f"nrf medium: resolution is {resolution}, expected 16 to 512")
             self.field = field.load(path, resolution)

@@ -34,7 +34,7 @@ def light(kind: str) -> dict:
     if kind == "point":
         return {"type": "point", "position": [3.4, 3.0, 2.5], "intensity": {"type": "rgb", "value": [60, 50, 40]}}
     image = np.full((8, 16, 3), 0.2, np.float32)
-    image[2, 5] = [9, 8, 6]
+    image[2, 5] = [3, 2.5, 2]
     return {"type": "envmap", "bitmap": mi.Bitmap(image)}
 
 

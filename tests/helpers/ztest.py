@@ -23,7 +23,7 @@ def block_means(image: np.ndarray, size: int = 8) -> np.ndarray:
     """Means over size × size blocks of an (h, w, c) image: (h // size, w // size, c); a remainder at the far edges is
     dropped. Averages are nearer to normal than pixels are."""
     h, w, c = image.shape[0] // size, image.shape[1] // size, image.shape[2]
-    return image[:h * size, :w * size].reshape(h, size, w, size, c).mean(axis=(1, 3))
+    return image[: h * size, : w * size].reshape(h, size, w, size, c).mean(axis=(1, 3))
 
 
 def block_difference(image: np.ndarray, reference: np.ndarray, size: int = 8, floor: float = 0.05) -> np.ndarray:
@@ -75,8 +75,14 @@ def check(images, references, label: str, block: int = 1) -> None:
     threshold = 1 - (1 - SIGNIFICANCE) ** (1 / p.size)  # Šidák
     share = float((p >= threshold).mean())
     if share < PASS_SHARE:
-        _fail(label, a, b, p, f"{share:.2%} of {p.size} values pass at p ≥ {threshold:.1e}, {PASS_SHARE:.2%} must; "
-                              f"means {a.mean():.5g} and {b.mean():.5g}")
+        _fail(
+            label,
+            a,
+            b,
+            p,
+            f"{share:.2%} of {p.size} values pass at p ≥ {threshold:.1e}, {PASS_SHARE:.2%} must; "
+            f"means {a.mean():.5g} and {b.mean():.5g}",
+        )
     # A bias too small for any single pixel shows in the mean of all of them.
     total = float(p_values(a.mean(axis=(1, 2, 3)), b.mean(axis=(1, 2, 3))))
     if total < SIGNIFICANCE / 10:
@@ -86,8 +92,10 @@ def check(images, references, label: str, block: int = 1) -> None:
 def _fail(label: str, a: np.ndarray, b: np.ndarray, p: np.ndarray, why: str) -> None:
     folder = Path(tempfile.mkdtemp(prefix=f"ztest_{label.replace(' ', '_').replace('/', '_')}_"))
     for name, image in [("image", a.mean(0)), ("reference", b.mean(0)), ("log10_p", np.log10(np.maximum(p, 1e-30)))]:
-        channels = {c: np.ascontiguousarray(image[..., i], np.float32) for i, c in zip(range(image.shape[-1]), "RGBA",
-                                                                                       strict=False)}
+        channels = {
+            c: np.ascontiguousarray(image[..., i], np.float32)
+            for i, c in zip(range(image.shape[-1]), "RGBA", strict=False)
+        }
         header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
         with OpenEXR.File(header, channels) as file:
             file.write(str(folder / f"{name}.exr"))

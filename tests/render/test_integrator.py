@@ -11,7 +11,7 @@ import mi_ntf.render
 from mi_ntf.core import field_file
 
 LIGHTS = ("directional", "point", "env")
-SEEDS = 8
+SEEDS = 4
 
 
 @pytest.fixture(autouse=True)
@@ -21,7 +21,7 @@ def plugins(variant):
 
 @pytest.fixture(scope="module")
 def blobs(tmp_path_factory):
-    return scenes.write_blobs(tmp_path_factory.mktemp("field"), log_density=4.2)
+    return scenes.write_blobs(tmp_path_factory.mktemp("field"), log_density=3.5)
 
 
 def nrf(visibility="raymarch", **options):
@@ -38,13 +38,13 @@ def test_agrees_with_volpath(blobs, kind):
     """The same single scattering by delta tracking: z-test per 4×4 block, and 8×8 block means within 2 %."""
     # The environment in both as Mitsuba samples it: `light_samples` draws from the very map.
     extra = {"light_samples": 4} if kind == "env" else {}
-    ours = renders(blobs, nrf(samples=1024, **extra), kind, 16)
-    theirs = renders(blobs, {"type": "volpath", "max_depth": 2, "hide_emitters": True}, kind, 48)
-    ztest.check([i[..., :3] for i in ours], [i[..., :3] for i in theirs], f"nrf volpath {kind}", block=4)
-    difference = ztest.block_difference(np.mean(ours, 0)[..., :3], np.mean(theirs, 0)[..., :3], 8, floor=0.2)
-    # volpath's own noise in a block: 64 pixels · 8 · 48 paths of relative spread about 1.5 (env: 3) each.
+    ours = renders(blobs, nrf(samples=1024, **extra), kind, 64)
+    theirs = renders(blobs, {"type": "volpath", "max_depth": 2, "hide_emitters": True}, kind, 96)
+    ztest.check([i[..., :3] for i in ours], [i[..., :3] for i in theirs], f"nrf volpath {kind}", block=8)
+    # volpath's own noise in a block of 64 pixels · 4 · 96 paths of relative spread 1 to 1.5: 0.6 to 1 %.
+    difference = ztest.block_difference(np.mean(ours, 0)[..., :3], np.mean(theirs, 0)[..., :3], 8, floor=0.3)
     assert difference.max() < 0.02
-    alpha = ztest.block_difference(np.mean(ours, 0)[..., 3:], np.mean(theirs, 0)[..., 3:], 8, floor=0.2)
+    alpha = ztest.block_difference(np.mean(ours, 0)[..., 3:], np.mean(theirs, 0)[..., 3:], 8, floor=0.3)
     assert alpha.max() < 0.01
 
 
@@ -115,9 +115,9 @@ def test_opaque_sphere_is_a_lambert_sphere(tmp_path):
     np.testing.assert_allclose(image[inner][:, 0], truth[inner], rtol=0.03)
     np.testing.assert_allclose(image[inner][:, 3], 1, atol=2e-3)
     assert (image[rho > 1.1][:, 3] == 0).all()
-    # Light along the view ray loses as much as the view: ∫ T·T σ ds = ½ of ∫ T σ ds, on every opaque pixel.
+    # With the shadow march the light passes the skin, half of it is lost there, and the phase function makes up for it.
     marched = scenes.render(ball_scene(path, nrf("raymarch", samples=1024), HEAD_ON))
-    np.testing.assert_allclose(marched[inner][:, 0] / image[inner][:, 0], 0.5, rtol=0.02)
+    np.testing.assert_allclose(marched[inner][:, 0] / image[inner][:, 0], 1, rtol=0.02)
 
 
 def test_uniform_ball_has_the_closed_form_opacity(tmp_path):
@@ -195,13 +195,13 @@ def test_seeds_spp_and_chunks(blobs, monkeypatch):
 def test_crop_window(blobs):
     """A crop shows the same pixels as the whole picture."""
     loaded = scenes.scene(blobs, nrf(), {"light": scenes.light("directional")}, size=32)
-    whole = scenes.render(loaded, spp=256)
+    whole = scenes.render(loaded, spp=1024)
     parameters = mi.traverse(loaded)
     parameters["sensor.film.crop_size"], parameters["sensor.film.crop_offset"] = [12, 8], [10, 14]
     parameters.update()
-    crop = scenes.render(loaded, spp=256)
+    crop = scenes.render(loaded, spp=1024)
     assert crop.shape == (8, 12, 4)
-    np.testing.assert_allclose(crop, whole[14:22, 10:22], atol=0.05)  # noise of 256 jittered rays at edges
+    np.testing.assert_allclose(crop, whole[14:22, 10:22], atol=0.05)  # alpha at an edge: ½/√1024, times three
     assert np.corrcoef(crop.ravel(), whole[14:22, 10:22].ravel())[0, 1] > 0.99
 
 

@@ -29,8 +29,10 @@ MESH = """<scene version="3.9.0">
     <emitter type="envmap"><string name="filename" value="env.exr"/></emitter>
 </scene>
 """
-SENSOR = '<scene version="3.9.0"><sensor type="perspective"><sampler type="independent">' \
-         '<integer name="sample_count" value="$spp"/></sampler></sensor></scene>'
+SENSOR = (
+    '<scene version="3.9.0"><sensor type="perspective"><sampler type="independent">'
+    '<integer name="sample_count" value="$spp"/></sampler></sensor></scene>'
+)
 LIGHT = '<scene version="3.9.0"><emitter type="envmap"><string name="filename" value="env.exr"/></emitter></scene>'
 
 
@@ -74,9 +76,14 @@ def test_integrator_is_replaced_and_keeps_hide_emitters(folder):
     (integrator,) = root.findall("integrator")
     assert integrator.get("type") == "nrf"
     assert [(e.tag, e.get("name"), e.get("value")) for e in integrator] == [
-        ("string", "visibility", "$visibility"), ("boolean", "hide_emitters", "true")]
+        ("string", "visibility", "$visibility"),
+        ("boolean", "hide_emitters", "true"),
+    ]
     assert {d.get("name"): d.get("value") for d in root.findall("default")} == {
-        "visibility": "auto", "spp": "64", "light": "point"}
+        "visibility": "auto",
+        "spp": "64",
+        "light": "point",
+    }
 
 
 def test_emitters_includes_and_what_they_use_stay(folder):
@@ -92,7 +99,9 @@ def test_emitters_includes_and_what_they_use_stay(folder):
 def test_paths_move_with_the_output(folder):
     root = _swap(folder, folder.parent / "out" / "deep" / "scene.xml")
     assert [e.get("filename") for e in root.findall("include")] == [
-        "../../scene/sensor.xml", "../../scene/light_$light.xml"]
+        "../../scene/sensor.xml",
+        "../../scene/light_$light.xml",
+    ]
     assert root.find("emitter/string").get("value") == "../../scene/env.exr"
     assert root.find("shape/medium/string").get("value") == "../../scene/f.safetensors"
     # The included light names env.exr, which Mitsuba seeks in the main scene's folder and in <path>s.
@@ -102,13 +111,17 @@ def test_paths_move_with_the_output(folder):
 def test_includes_with_shapes_are_inlined_recursively(folder):
     (folder / "parts").mkdir()
     (folder / "parts" / "all.xml").write_text(
-        '<scene version="3.9.0"><include filename="inner.xml"/><include filename="lights.xml"/></scene>')
+        '<scene version="3.9.0"><include filename="inner.xml"/><include filename="lights.xml"/></scene>'
+    )
     (folder / "parts" / "inner.xml").write_text(
-        '<scene version="3.9.0"><bsdf type="diffuse" id="b"/><shape type="cube"><ref id="b"/></shape></scene>')
+        '<scene version="3.9.0"><bsdf type="diffuse" id="b"/><shape type="cube"><ref id="b"/></shape></scene>'
+    )
     (folder / "parts" / "lights.xml").write_text(
-        '<scene version="3.9.0"><shape type="rectangle"><emitter type="area"/></shape></scene>')
+        '<scene version="3.9.0"><shape type="rectangle"><emitter type="area"/></shape></scene>'
+    )
     (folder / "mesh.xml").write_text(
-        '<scene version="3.9.0"><default name="p" value="all"/><include filename="parts/$p.xml"/></scene>')
+        '<scene version="3.9.0"><default name="p" value="all"/><include filename="parts/$p.xml"/></scene>'
+    )
     root = _swap(folder, folder / "scene.xml")
     assert [s.get("type") for s in root.findall("shape")] == ["sphere"]
     assert root.findall("bsdf") == []
@@ -125,13 +138,19 @@ def test_the_shipped_scene(folder):
     assert all((folder / e.get("filename").replace("$light", "point")).is_file() for e in root.findall("include"))
 
 
-@pytest.mark.parametrize(("text", "message"), [
-    ("no xml", r"mesh.xml is not XML .*give the XML file of a Mitsuba scene"),
-    ("<shape/>", r"root element is <shape>, expected <scene>"),
-    ('<scene><shape type="cube"><emitter type="area"/></shape></scene>', r"no shape that a field could replace"),
-    ('<scene><include filename="gone.xml"/></scene>', r"included file 'gone.xml' does not exist beside it$"),
-    ('<scene><include filename="a_$b.xml"/></scene>', r"included file 'a_\$b.xml' .*give its \$parameters a <default>"),
-])
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("no xml", r"mesh.xml is not XML .*give the XML file of a Mitsuba scene"),
+        ("<shape/>", r"root element is <shape>, expected <scene>"),
+        ('<scene><shape type="cube"><emitter type="area"/></shape></scene>', r"no shape that a field could replace"),
+        ('<scene><include filename="gone.xml"/></scene>', r"included file 'gone.xml' does not exist beside it$"),
+        (
+            '<scene><include filename="a_$b.xml"/></scene>',
+            r"included file 'a_\$b.xml' .*give its \$parameters a <default>",
+        ),
+    ],
+)
 def test_errors(folder, text, message):
     (folder / "mesh.xml").write_text(text)
     with pytest.raises(MiNtfError, match=message):

@@ -18,5 +18,5 @@ class RayMarch:
 
 def default_steps(step: float) -> tuple[float, float, float]:
     """Steps from the camera march's cell length: as fine beside the point, a tenth of the distance further off, and
-    never longer than an occupancy cell, which would jump over thin parts."""
-    return step, max(step, 2 / 64), 0.1
+    never longer than half an occupancy cell, which would jump over thin parts."""
+    return step, max(step, 1 / 64), 0.1

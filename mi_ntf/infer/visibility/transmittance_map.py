@@ -1,13 +1,9 @@
 """The transmittance map: per light, a 2-D table of the logistic's (a, b) (method.md, section 6; Shafiei et al. 2021,
 section 3.3, with the slips of its algorithms corrected).
 
-Parametrisation per light, both covering the ball around all density (`radius` ≤ 1) and nothing more:
-
-    directional   parallel rays through an m × m grid on the disc through the origin perpendicular to the light
-    point         rays of a pinhole at the light, m × m over the square that circumscribes the ball's silhouette
-
-A texel holds (a, b) of the ray through its centre, towards the light. A lookup evaluates the four nearest rays, each at
-the plane through the point that is perpendicular to the direction to the light, and interpolates the four τ bilinearly.
+A light's rays: parallel (directional) or through a pinhole at the light (point). The map is the smallest of a few
+rectangles around the object as the light sees it, m × m texels. A texel holds (a, b) of the ray through its centre,
+towards the light. A lookup evaluates the four nearest rays and interpolates the four τ bilinearly, never (a, b).
 """
 
 from types import ModuleType
@@ -22,32 +18,30 @@ from .. import ops
 from ..lights import LightTable
 from ..march import clear_distance, safe_inverse
 
+_ROW = 17
+
 
 class TransmittanceMap:
     """Maps of all lights of a table, m × m texels each, in one Dr.Jit texture of (a, b), layer upon layer.
 
-    `fit(o, d) → (a, b)` solves the logistic of rays through `o` towards the light along `d`. `radius`: of the ball
-    around all density. Memory: 8 m² bytes a light.
+    `fit(o, d) → (a, b)` solves the logistic of rays through `o` towards the light along `d`. `hull` (k, 3): points
+    whose convex hull holds all density, inside a ball of `radius`. Memory: 8 m² bytes a light.
     """
 
-    def __init__(self, lights: LightTable, resolution: int, radius: float, fit, dj: ModuleType):
+    def __init__(self, lights: LightTable, resolution: int, hull: np.ndarray, fit, dj: ModuleType):
         self.dj, self.m, self.count = dj, resolution, lights.count
-        self.radius = max(radius, 1e-3)
-        axis, u, v, position, spread = _frames(lights, self.radius)
-        # One row of 14 floats a light: frame (axis points away from the light), position, half width, point flag.
-        rows = np.concatenate([axis, u, v, position, spread[:, None], lights.is_point[:, None]], axis=1)
-        self._rows = dj.Float(rows.astype(np.float32).ravel())
+        self._rows = dj.Float(_frames(lights, hull).astype(np.float32).ravel())
         self.texture = self._build(fit)
 
     def tau(self, x, wi, distance, index, active):
         """Bilinear τ of the four nearest texel rays; 1 outside the map."""
         light = self._light(index, active)
-        axis, u, v, position, spread, point = light
+        axis, u, v, position, window, point = light
         rel = tuple(a - point * b for a, b in zip(x, position, strict=True))
-        depth = dr.select(point > 0, dot(rel, axis), 1)
-        scale = dr.rcp(dr.maximum(depth, 1e-6) * spread)
-        fu = (dot(rel, u) * scale * 0.5 + 0.5) * self.m - 0.5
-        fv = (dot(rel, v) * scale * 0.5 + 0.5) * self.m - 0.5
+        depth = dr.select(point > 0, dr.maximum(dot(rel, axis), 1e-6), 1)
+        inverse = dr.rcp(depth)
+        fu = ((dot(rel, u) * inverse - window[0]) / window[2] * 0.5 + 0.5) * self.m - 0.5
+        fv = ((dot(rel, v) * inverse - window[1]) / window[3] * 0.5 + 0.5) * self.m - 0.5
         inside = active & (fu > -0.5) & (fv > -0.5) & (fu < self.m - 0.5) & (fv < self.m - 0.5)
         iu, iv = dr.floor(fu), dr.floor(fv)
         wu, wv = fu - iu, fv - iv
@@ -55,7 +49,7 @@ class TransmittanceMap:
         for du, dv in ((0, 0), (1, 0), (0, 1), (1, 1)):
             tu, tv = (dr.clip(c, 0, self.m - 1) for c in (iu + du, iv + dv))
             a, b = self._fetch(index, tu, tv, inside)
-            t = self._coordinate(light, x, wi, distance, tu, tv)
+            t = self._coordinate(light, x, wi, tu, tv)
             weight = (wu if du else 1 - wu) * (wv if dv else 1 - wv)
             result += weight * logistic.transmittance(ops, t, a, b)
         return dr.select(inside, result, 1)
@@ -67,30 +61,27 @@ class TransmittanceMap:
         return pair[0], pair[1]
 
     def _light(self, index, active):
-        base = self.dj.UInt32(index) * 14
-        row = [dr.gather(self.dj.Float, self._rows, base + i, active) for i in range(14)]
-        return tuple(row[0:3]), tuple(row[3:6]), tuple(row[6:9]), tuple(row[9:12]), row[12], row[13]
+        """Axis away from the light, two vectors across, position, window (centre u, v; half width u, v), point flag."""
+        base = self.dj.UInt32(index) * _ROW
+        row = [dr.gather(self.dj.Float, self._rows, base + i, active) for i in range(_ROW)]
+        return tuple(row[0:3]), tuple(row[3:6]), tuple(row[6:9]), tuple(row[9:12]), tuple(row[12:16]), row[16]
 
     def _ray(self, light, tu, tv):
-        """Point and direction (towards the light) of the ray through texel (tu, tv)'s centre."""
-        axis, u, v, position, spread, point = light
-        su, sv = (((c + 0.5) * (2 / self.m) - 1) * spread for c in (tu, tv))
+        """A point of the ray through texel (tu, tv)'s centre, and its direction towards the light."""
+        axis, u, v, position, window, point = light
+        su = ((tu + 0.5) * (2 / self.m) - 1) * window[2] + window[0]
+        sv = ((tv + 0.5) * (2 / self.m) - 1) * window[3] + window[1]
         offset = tuple(su * a + sv * b for a, b in zip(u, v, strict=True))
         out = tuple(a + point * c for a, c in zip(axis, offset, strict=True))
         norm = dr.rsqrt(dot(out, out))
         origin = tuple(dr.select(point > 0, p, c) for p, c in zip(position, offset, strict=True))
         return origin, tuple(-c * norm for c in out)
 
-    def _coordinate(self, light, x, wi, distance, tu, tv):
-        """t' on the texel's ray where the plane through x perpendicular to ω_i cuts it.
-
-        Directional: all rays are parallel, t' = ⟨x, ω'⟩ on every one. Point light at L: the ray leaves L along −ω', so
-        the plane lies s = |x − L|/⟨ω', ω_i⟩ away and t' = ⟨L, ω'⟩ − s.
-        """
-        point = light[5] > 0
-        _, d = self._ray(light, tu, tv)
-        s = distance / dr.maximum(dot(d, wi), 1e-3)
-        return dr.select(point, dot(light[3], d) - dr.select(point, s, 0), dot(x, d))
+    def _coordinate(self, light, x, wi, tu, tv):
+        """t' on the texel's ray where the plane through x perpendicular to ω_i cuts it."""
+        origin, d = self._ray(light, tu, tv)
+        rel = tuple(a - b for a, b in zip(x, origin, strict=True))
+        return dot(origin, d) + dot(rel, wi) / dr.maximum(dot(d, wi), 1e-3)
 
     def _build(self, fit):
         texels = self.m * self.m
@@ -110,10 +101,10 @@ class TransmittanceMap:
         return self.dj.Texture2f(tensor, use_accel=False, filter_mode=dr.FilterMode.Nearest)
 
 
-def _frames(lights: LightTable, radius: float):
-    """Per light: unit axis away from the light, two perpendicular unit vectors, position (0 if directional), half
-    width."""
+def _frames(lights: LightTable, hull: np.ndarray) -> np.ndarray:
+    """The rows of :meth:`TransmittanceMap._light`, (n, 17) float64."""
     distance = np.linalg.norm(lights.where, axis=1)
+    radius = np.linalg.norm(hull, axis=1).max()
     near = lights.is_point & (distance <= radius * 1.001)
     if near.any():
         raise MiNtfError(
@@ -123,12 +114,33 @@ def _frames(lights: LightTable, radius: float):
         )
     axis = -lights.where / distance[:, None]
     helper = np.where(np.abs(axis[:, :1]) > 0.9, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
-    u = np.cross(axis, helper)
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
-    v = np.cross(axis, u)
-    sine = np.minimum(radius / distance, 0.9995)
-    spread = np.where(lights.is_point, sine / np.sqrt(1 - sine**2), radius)
-    return axis, u, v, np.where(lights.is_point[:, None], lights.where, 0.0), spread
+    side = np.cross(axis, helper)
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    up = np.cross(axis, side)
+    best, area = None, np.full(lights.count, np.inf)
+    for angle in np.arange(8) * np.pi / 16:
+        u = np.cos(angle) * side + np.sin(angle) * up
+        v = np.cos(angle) * up - np.sin(angle) * side
+        window = _window(lights, axis, u, v, hull)
+        row = np.concatenate([u, v, window], axis=1)
+        size = window[:, 2] * window[:, 3]
+        best = row if best is None else np.where((size < area)[:, None], row, best)
+        area = np.minimum(area, size)
+    position = np.where(lights.is_point[:, None], lights.where, 0.0)
+    return np.concatenate([axis, best[:, :6], position, best[:, 6:], lights.is_point[:, None]], axis=1)
+
+
+def _window(lights: LightTable, axis, u, v, hull) -> np.ndarray:
+    """Centre and half width, along u and v, of the rectangle that holds `hull` as each light sees it: (n, 4)."""
+    rows = []
+    for along in (u, v):
+        place = hull @ along.T  # (k, n)
+        offset = np.where(lights.is_point, (lights.where * along).sum(1), 0.0)
+        away = np.where(lights.is_point, hull @ axis.T - (lights.where * axis).sum(1), 1.0)
+        place = (place - offset) / away
+        low, high = place.min(0), place.max(0)
+        rows.append(((low + high) / 2, np.maximum((high - low) / 2, 1e-3)))
+    return np.stack([rows[0][0], rows[1][0], rows[0][1], rows[1][1]], axis=1)
 
 
 def network_source(field):
