@@ -43,8 +43,10 @@ class Occupancy:
         grid = torch.zeros(n**3)
         grid[self.index] = (self.level > FULL_BELOW).float()
         near = F.max_pool3d(grid.view(1, 1, n, n, n), 3, 1, 1).view(-1)[self.index] > 0
-        # The latest value, not the faded maximum, decides how much light a cell takes: ghosts hide nothing.
-        self.sigma[self.index] = torch.where(near, new, -1.0)
+        # A cell takes as much light as its thinnest neighbour would: skins, which fill cells in part, hide nothing.
+        grid[self.index] = new
+        least = -F.max_pool3d(-grid.view(1, 1, n, n, n), 3, 1, 1).view(-1)[self.index]
+        self.sigma[self.index] = torch.where(near, least, -1.0)
         x = self.positions(self.outside, generator)
         stray = [networks.log_density(p) > LOG_EMPTY for p in x.split(65536)]
         self.stray = self.outside[torch.cat(stray)] if stray else self.outside
