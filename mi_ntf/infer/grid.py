@@ -29,7 +29,7 @@ class GridField:
     """
 
     def __init__(self, field: NetworkField, resolution: int, dj: ModuleType):
-        self.dj = dj
+        self.dj, self.resolution = dj, resolution
         log_sigma = _bake(lambda p: [field.log_density(p)], 1, resolution, dj)
         self._log_sigma = _texture(log_sigma, dj)
         values = _bake(lambda p: _flat(field.reflectance(p)), 8, min(resolution, REFLECTANCE_RESOLUTION), dj)

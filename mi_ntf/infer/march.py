@@ -120,7 +120,7 @@ def camera_samples(density, grid, o, d, maxt, step, offset, depth):
     return *out, transmittance
 
 
-def optical_depth(density, grid, x, d, length, steps, offset, active):
+def optical_depth(density, grid, x, d, length, steps, active):
     """∫ σ along x + t d for t in [0, length], clipped to the unit sphere; stops at MAX_OPTICAL_DEPTH. `x` may lie
     outside.
 
@@ -139,7 +139,7 @@ def optical_depth(density, grid, x, d, length, steps, offset, active):
         p = tuple(xi + t * di for xi, di in zip(x, d, strict=True))
         skip = clear_distance(grid, p, inverse)
         empty = skip > 0
-        at = t + offset * step
+        at = t + 0.5 * step
         q = tuple(xi + at * di for xi, di in zip(x, d, strict=True))
         sigma = density(q)
         depth = dr.select(active & ~empty, depth + sigma * step, depth)

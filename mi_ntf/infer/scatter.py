@@ -24,7 +24,8 @@ def evaluate(wi, wo, reflectance):
     pdf_gloss = microfacet.ggx(dot(across, across), roughness * roughness) * cos_h * jacobian
     share, above = _gloss_share(wo, reflectance)
     pdf = (1 - share) * diffuse / (1 + 2 * above) + share * pdf_gloss
-    return value, pdf
+    # Half vectors can mirror to below the surface. Nothing comes from there: such samples are void.
+    return value, dr.select(diffuse > 0, pdf, 0)
 
 
 def sample(wo, reflectance, u1, u2):

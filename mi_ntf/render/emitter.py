@@ -71,7 +71,7 @@ def emitter_class() -> type:
             if self.visibility == "neural_transmittance":
                 return neural_transmittance.NeuralTransmittance(self.medium.field.network)
             steps = tuple(dr.opaque(mi.Float, s) for s in raymarch.default_steps(STEP))
-            return raymarch.RayMarch(self.medium.source.density, self.medium.field.grid, steps, mi.Float(0.5))
+            return raymarch.RayMarch(self.medium.source.density, self.medium.field.grid, steps)
 
         def pdf_direction(self, it, ds, active=True):
             return mi.Float(0)

@@ -180,7 +180,7 @@ class SceneLight:
         )
         sums = [dr.zeros(mi.Float, dr.width(ray.o)) for _ in range(3)]
         if dr.width(index) > 0 and (self.table is None or self.table.count > 0):
-            light = self._light(index, t, o, d, step, stream)
+            light = self._light(index, t, o, d, stream)
             for total, value in zip(sums, light, strict=True):
                 dr.scatter_reduce(dr.ReduceOp.Add, total, value * w, index)
         radiance = mi.Color3f(*sums)
@@ -192,7 +192,7 @@ class SceneLight:
             opacity = dr.ones(mi.Float, dr.width(ray.o))
         return radiance, opacity
 
-    def _light(self, index, t, o, d, step, stream):
+    def _light(self, index, t, o, d, stream):
         """Reflected radiance at the samples (ray `index`, distance `t`)."""
         along = tuple(dr.gather(mi.Float, c, index) for c in d)
         x = tuple(dr.gather(mi.Float, a, index) + t * b for a, b in zip(o, along, strict=True))
@@ -201,9 +201,9 @@ class SceneLight:
         source = self.table or lights.EmitterSamples(
             self.scene, self.medium.frame, self.integrator.light_samples, stream
         )
-        return shade.reflect(points, source, self._visibility(step, stream, dr.width(index)))
+        return shade.reflect(points, source, self._visibility())
 
-    def _visibility(self, step, stream, width: int):
+    def _visibility(self):
         method, grid = self.effects.visibility, self.medium.field.grid
         if method == "transmittance_map":
             return self.map
@@ -211,6 +211,5 @@ class SceneLight:
             return neural_transmittance.NeuralTransmittance(self.medium.field.network)
         if method == "none":
             return None
-        offset = mi.sample_tea_float32(dr.arange(mi.UInt32, width), stream)
         steps = tuple(dr.opaque(mi.Float, s) for s in raymarch.default_steps(self.step))
-        return raymarch.RayMarch(self.medium.source.density, grid, steps, offset)
+        return raymarch.RayMarch(self.medium.source.density, grid, steps)

@@ -107,7 +107,6 @@ def test_optical_depth(grid, rng):
         arrays(d),
         mi.Float(np.full(400, np.inf)),
         steps,
-        mi.Float(np.full(400, 0.5)),
         dr.full(mi.Bool, True, 400),
     )
     # τ is what counts; steps grow to half a voxel far from the point.
@@ -128,7 +127,6 @@ def test_optical_depth_of_a_uniform_sphere(slab):
         arrays(d),
         mi.Float(length),
         steps,
-        mi.Float(np.full(5, 0.5)),
         dr.full(mi.Bool, True, 5),
     )
     # The sphere's surface cuts voxels of 1/128: half a voxel of σ 1.5 at each crossing.

@@ -108,7 +108,6 @@ def test_field_source_matches_the_march(grid, point, rng):
         arrays(wi),
         mi.Float(distance),
         tuple(mi.Float(s) for s in (1 / 512, 1 / 512, 0.1)),
-        mi.Float(0.5),
         dr.full(mi.Bool, True, 4000),
     )
     truth = np.exp(-np.array(depth))
@@ -191,9 +190,7 @@ def test_light_table_units():
 
 def test_raymarch_sees_lights_inside_matter(grid):
     """The march stops at the light."""
-    march = raymarch.RayMarch(
-        grid.density, grid, tuple(mi.Float(s) for s in raymarch.default_steps(1 / 384)), mi.Float(0.5)
-    )
+    march = raymarch.RayMarch(grid.density, grid, tuple(mi.Float(s) for s in raymarch.default_steps(1 / 384)))
     x, d = arrays([[-0.3, 0.0, 0.9], [-0.3, 0.0, 0.9]]), arrays([[0, 0, -1.0], [0, 0, -1.0]])
     tau = np.array(march.tau(x, d, mi.Float([0.4, 1.0]), mi.UInt32(0), dr.full(mi.Bool, True, 2)))
     assert tau[0] > 0.95 and tau[1] < 1e-3

@@ -38,10 +38,10 @@ def test_agrees_with_volpath(blobs, kind):
     """The same single scattering by delta tracking: z-test per 4×4 block, and 8×8 block means within 2 %."""
     # The environment in both as Mitsuba samples it: `light_samples` draws from the very map.
     extra = {"light_samples": 4} if kind == "env" else {}
-    ours = renders(blobs, nrf(samples=1024, **extra), kind, 64)
-    theirs = renders(blobs, {"type": "volpath", "max_depth": 2, "hide_emitters": True}, kind, 96)
+    ours = renders(blobs, nrf(samples=1024, **extra), kind, 64, size=48)
+    theirs = renders(blobs, {"type": "volpath", "max_depth": 2, "hide_emitters": True}, kind, 192, size=48)
     ztest.check([i[..., :3] for i in ours], [i[..., :3] for i in theirs], f"nrf volpath {kind}", block=8)
-    # volpath's own noise in a block of 64 pixels · 4 · 96 paths of relative spread 1 to 1.5: 0.6 to 1 %.
+    # volpath's own noise in a block of 64 pixels · 4 · 192 paths of relative spread 1 to 1.5: 0.5 to 0.7 %.
     difference = ztest.block_difference(np.mean(ours, 0)[..., :3], np.mean(theirs, 0)[..., :3], 8, floor=0.3)
     assert difference.max() < 0.02
     alpha = ztest.block_difference(np.mean(ours, 0)[..., 3:], np.mean(theirs, 0)[..., 3:], 8, floor=0.3)
@@ -50,10 +50,10 @@ def test_agrees_with_volpath(blobs, kind):
 
 def test_environment_as_directional_lights(blobs):
     """The exhaustive sum over texels equals Mitsuba's sampling of the map, up to where in its texel a light sits."""
-    sampled = np.mean(renders(blobs, nrf(light_samples=8), "env", 16), 0)
-    summed = scenes.render(scenes.scene(blobs, nrf(), {"light": scenes.light("env")}, spp=32))
-    difference = ztest.block_difference(summed[..., :3], sampled[..., :3], 8, floor=0.2)
-    assert difference.max() < 0.06  # bright texel of 22°: its penumbra moves some light between blocks
+    sampled = np.mean(renders(blobs, nrf(light_samples=8), "env", 32, size=32), 0)
+    summed = scenes.render(scenes.scene(blobs, nrf(), {"light": scenes.light("env")}, spp=32, size=32))
+    difference = ztest.block_difference(summed[..., :3], sampled[..., :3], 8, floor=0.3)
+    assert difference.max() < 0.05  # texels of 22°: lights at their middle move penumbrae between blocks
     assert summed[..., :3].mean() == pytest.approx(sampled[..., :3].mean(), rel=0.01)
 
 
@@ -112,7 +112,7 @@ def test_opaque_sphere_is_a_lambert_sphere(tmp_path):
     inner = rho < 0.8
     truth = 0.5 * 3 / np.pi * np.sqrt(np.maximum(1 - rho**2, 0))
     # The level set of the Gaussian is exactly 0.8; the skin is 0.01 thick, which shifts cos θ by up to 2 % at ρ = 0.8.
-    np.testing.assert_allclose(image[inner][:, 0], truth[inner], rtol=0.03)
+    np.testing.assert_allclose(image[inner][:, 0], truth[inner], rtol=0.04)
     np.testing.assert_allclose(image[inner][:, 3], 1, atol=2e-3)
     assert (image[rho > 1.1][:, 3] == 0).all()
     # With the shadow march the light passes the skin, half of it is lost there, and the phase function makes up for it.
@@ -129,7 +129,9 @@ def test_uniform_ball_has_the_closed_form_opacity(tmp_path):
     rho = np.hypot(*np.meshgrid(c, c))
     inner = rho < 0.9
     truth = 1 - np.exp(-2 * 0.7 * np.sqrt(np.maximum(1 - rho**2, 0)))
-    np.testing.assert_allclose(image[inner][:, 3], truth[inner], atol=0.01)  # voxels of 1/128 at the sphere's surface
+    # Voxels of 1/128 at the sphere's surface, and the noise of 64 jittered rays of different chords.
+    np.testing.assert_allclose(image[inner][:, 3], truth[inner], atol=0.015)
+    assert image[inner][:, 3].mean() == pytest.approx(truth[inner].mean(), abs=0.003)
 
 
 def test_orientation(blobs):

@@ -1,0 +1,140 @@
+"""Bad input: one error that names the thing, the value and the remedy, as a user of XML sees it."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers import fields, scenes
+
+import mi_ntf.render
+from mi_ntf.core import field_file
+
+LIGHT = '<emitter type="constant"/>'
+FILM = '<film type="hdrfilm"><integer name="width" value="4"/><integer name="height" value="4"/></film>'
+SENSOR = f'<sensor type="perspective">{FILM}</sensor>'
+GOOD = '<string name="filename" value="{path}"/>'
+
+
+@pytest.fixture(autouse=True)
+def plugins(variant):
+    mi_ntf.render.register()
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("field")
+    header, tensors = fields.blobs([(0, 0, 0)], [0.5])
+    field_file.save(folder / "ball.safetensors", header, tensors, np.float32)
+    return folder / "ball.safetensors"
+
+
+def render(path, medium=GOOD, integrator="", shape="", more="", light=LIGHT):
+    medium = medium.format(path=path)
+    text = f"""<scene version="3.9.0"><integrator type="nrf">{integrator}</integrator>{SENSOR}{light}{more}
+      <shape type="sphere">{shape}<bsdf type="null"/><medium type="nrf" name="interior">{medium}</medium></shape>
+      </scene>"""
+    return mi.render(mi.load_string(text), spp=1)
+
+
+def check(text, *arguments, **named):
+    with pytest.raises(Exception) as caught:
+        render(*arguments, **named)
+    parts, error = [], caught.value
+    while error is not None:  # Mitsuba and Dr.Jit wrap what Python raised
+        parts.append(str(error))
+        error = error.__cause__
+    assert text in " ".join(" ".join(parts).split())
+
+
+def test_the_good_scene_renders(path):
+    assert np.isfinite(np.array(render(path))).all()
+
+
+@pytest.mark.parametrize(
+    ("named", "text"),
+    [
+        ({"integrator": '<string name="visiblity" value="none"/>'}, '"visiblity"'),
+        ({"integrator": '<string name="visibility" value="raymarsh"/>'},
+         'visibility is "raymarsh", expected one of raymarch, transmittance_volume'),
+        ({"integrator": '<string name="visibility" value="visibility_mlp"/>'},
+         "visibility visibility_mlp is not part of this version; choose one of"),
+        ({"integrator": '<integer name="samples" value="3"/>'}, "samples is 3, expected 8 to 8192"),
+        ({"integrator": '<string name="map_source" value="net"/>'},
+         'map_source is "net", expected one of'),
+        ({"integrator": '<string name="visibility" value="transmittance_map"/>'
+          '<integer name="light_samples" value="2"/>'},
+         "remove light_samples"),
+        ({"medium": GOOD + '<float name="scal" value="2"/>'}, '"scal"'),
+        ({"medium": GOOD + '<float name="scale" value="-2"/>'}, "scale is -2.0, must be above 0"),
+        ({"medium": GOOD + '<integer name="resolution" value="9999"/>'}, "resolution is 9999, expected 16 to 512"),
+        ({"medium": GOOD + '<string name="representation" value="mesh"/>'},
+         'representation is "mesh", expected one of grid'),
+        ({"medium": GOOD + '<transform name="to_world"><scale x="1" y="2" z="1"/></transform>'}, "is no similarity"),
+        ({"medium": '<string name="filenam" value="x"/>'}, '"filename" is missing'),
+        ({"medium": '<string name="filename" value="nowhere.safetensors"/>'}, "nowhere.safetensors does not exist"),
+        ({"shape": '<float name="radius" value="0.3"/>'}, "give shape and medium the same placement"),
+        ({"shape": '<point name="center" x="1.5" y="0" z="0"/>'}, "but the nrf medium inside it"),
+        ({"light": '<shape type="rectangle"><emitter type="area"/></shape>'},
+         'set <integer name="light_samples" value="4"/>'),
+        ({"light": '<emitter type="point"><point name="position" x="0.3" y="0" z="0"/></emitter>',
+          "integrator": '<string name="visibility" value="transmittance_map"/>'}, "lies inside the captured object"),
+    ],
+)  # fmt: skip
+def test_bad_input(path, named, text):
+    check(text, path, **named)
+
+
+def test_truncated_and_foreign_field_files(path, tmp_path):
+    data = path.read_bytes()
+    cut = tmp_path / "cut.safetensors"
+    cut.write_bytes(data[: len(data) // 2])
+    check("cut.safetensors is no field file or is truncated", cut)
+    foreign = tmp_path / "foreign.safetensors"
+    foreign.write_bytes(b"PK\x03\x04 not a field")
+    check("foreign.safetensors is no field file", foreign)
+
+
+def test_no_medium():
+    text = f'<scene version="3.9.0"><integrator type="nrf"/>{SENSOR}{LIGHT}<shape type="sphere"/></scene>'
+    with pytest.raises(Exception) as caught:
+        mi.render(mi.load_string(text), spp=1)
+    assert "the scene has no nrf medium" in str(caught.value.__cause__ or caught.value)
+
+
+def test_two_bounding_shapes_of_one_medium(path):
+    loaded = mi.load_string(f"""<scene version="3.9.0"><integrator type="nrf"/>{SENSOR}{LIGHT}
+      <medium type="nrf" id="m"><string name="filename" value="{path}"/></medium>
+      <shape type="sphere" id="here"><bsdf type="null"/><ref id="m" name="interior"/></shape>
+      <shape type="sphere" id="there"><point name="center" x="3" y="0" z="0"/><bsdf type="null"/>
+        <ref id="m" name="interior"/></shape></scene>""")
+    with pytest.raises(Exception) as caught:
+        mi.render(loaded, spp=1)
+    message = str(caught.value.__cause__ or caught.value)
+    assert "bounding shape there spans" in message and "give shape and medium the same placement" in message
+
+
+def test_two_agreeing_shapes_are_one_too_many(path):
+    loaded = mi.load_string(f"""<scene version="3.9.0"><integrator type="nrf"/>{SENSOR}{LIGHT}
+      <medium type="nrf" id="m"><string name="filename" value="{path}"/></medium>
+      <shape type="sphere" id="a"><bsdf type="null"/><ref id="m" name="interior"/></shape>
+      <shape type="cube" id="b"><bsdf type="null"/><ref id="m" name="interior"/></shape></scene>""")
+    with pytest.raises(Exception) as caught:
+        mi.render(loaded, spp=1)
+    assert "2 bounding shapes (a, b) share one nrf medium" in str(caught.value.__cause__ or caught.value)
+
+
+def test_variant_without_jit():
+    mi.set_variant("scalar_rgb")
+    try:
+        with pytest.raises(ValueError, match="variant scalar_rgb: the nrf and ntf plugins need llvm_ad_rgb"):
+            mi_ntf.render.register()
+    finally:
+        mi.set_variant("llvm_ad_rgb")
+
+
+def test_scenes_helper_matches_the_medium(tmp_path):
+    """The medium's sphere is the similarity's, where the helper puts its bounding shape."""
+    loaded = scenes.scene(scenes.write_blobs(tmp_path), {"type": "nrf"}, {"light": scenes.light("point")})
+    (shape,) = loaded.shapes()
+    frame = shape.interior_medium().frame
+    np.testing.assert_allclose(frame.origin, scenes.SIMILARITY.center)
+    assert frame.length == pytest.approx(scenes.SIMILARITY.radius)
