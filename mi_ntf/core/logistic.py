@@ -87,7 +87,9 @@ def through_quantiles(ops, t75, t50, t25):
     """The logistic through three crossings, ``(a, b)`` in closed form.
 
     `t75`, `t50`, `t25`: where τ is 3/4, 1/2, 1/4 (t75 ≥ t50 ≥ t25: τ falls away from the light, towards smaller t).
-    logit(3/4) − logit(1/4) = 2 ln 3, hence a = 2 ln 3/(t75 − t25); b = t50.
+    logit(3/4) − logit(1/4) = 2 ln 3, hence a = 2 ln 3/(t75 − t25). b = t50 for a symmetric profile. Density that rises
+    exponentially into a skin has τ = exp(−e^−t) instead, steeper on the dark side: the least-squares logistic under the
+    camera's own weights then lies 0.35 of the quartiles' asymmetry closer to the light.
     """
     slope = 2.1972245773362196 / ops.maximum(t75 - t25, 1e-6)
-    return ops.minimum(slope, 665.0), t50
+    return ops.minimum(slope, 665.0), 0.3 * t50 + 0.35 * (t75 + t25)

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import quad
+from scipy.optimize import minimize
 from scipy.special import expit
 
 from mi_ntf.core import logistic, ops
@@ -91,6 +92,16 @@ def test_through_quantiles_inverts_the_logistic(b, a):
     a2, b2 = logistic.through_quantiles(ops, t75, t50, t25)
     assert a2 == pytest.approx(a, rel=1e-9)  # t75 − t25 down to 0.004, its rounding 2e-16, and more
     assert b2 == pytest.approx(b, abs=1e-15)
+
+
+def test_through_quantiles_fits_an_exponential_skin():
+    # τ = exp(−e^−t): against the least-squares logistic under the weights of samples seen from the light, −dτ/dt.
+    t = np.linspace(-8, 14, 8001)
+    skin = np.exp(-np.exp(-t))
+    weight = np.exp(-t) * skin
+    a, b = logistic.through_quantiles(ops, *(-np.log(-np.log(q)) for q in (0.75, 0.5, 0.25)))
+    best = minimize(lambda p: (weight * (logistic.transmittance(ops, t, *p) - skin) ** 2).sum(), [1.4, 0.4])
+    assert b == pytest.approx(best.x[1], abs=0.01) and a == pytest.approx(best.x[0], rel=0.05)
 
 
 def test_through_quantiles_of_a_step_has_the_largest_slope():

@@ -24,7 +24,7 @@ def write_blobs(folder: Path, **options) -> Path:
 
 
 def light(kind: str) -> dict:
-    """Light from the upper right front; `env`: a dim sky with one bright texel there."""
+    """Light from the upper right front; `env`: a smooth sky that is brightest there."""
     if kind == "directional":
         return {
             "type": "directional",
@@ -33,8 +33,9 @@ def light(kind: str) -> dict:
         }
     if kind == "point":
         return {"type": "point", "position": [3.4, 3.0, 2.5], "intensity": {"type": "rgb", "value": [60, 50, 40]}}
-    image = np.full((8, 16, 3), 0.2, np.float32)
-    image[2, 5] = [3, 2.5, 2]
+    v, u = np.mgrid[:16, :32] / 16
+    sky = 0.6 + 0.5 * np.cos(np.pi * (u - 0.65)) * np.sin(np.pi * v) + 0.3 * np.cos(np.pi * v)
+    image = (sky[..., None] * [1.0, 0.9, 0.8]).astype(np.float32)
     return {"type": "envmap", "bitmap": mi.Bitmap(image)}
 
 
@@ -43,7 +44,17 @@ def film(size: int) -> dict:
     return {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}, "pixel_format": "rgba"}
 
 
-def scene(field: Path | None, integrator: dict, lights: dict, *, size=64, spp=16, medium=None, shapes=None):
+def scene(
+    field: Path | None,
+    integrator: dict,
+    lights: dict,
+    *,
+    size=64,
+    spp=16,
+    medium=None,
+    shapes=None,
+    sampler="independent",
+):
     """The object in a sphere of null BSDF, seen from the front; `lights`: name → emitter dict."""
     to_world = mi.ScalarTransform4f
     center, radius = list(SIMILARITY.center), SIMILARITY.radius
@@ -56,7 +67,7 @@ def scene(field: Path | None, integrator: dict, lights: dict, *, size=64, spp=16
             "fov": 28,
             "to_world": look,
             "film": film(size),
-            "sampler": {"type": "independent", "sample_count": spp},
+            "sampler": {"type": sampler, "sample_count": spp},
         },
         **lights,
         **(shapes or {}),

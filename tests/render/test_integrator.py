@@ -21,7 +21,7 @@ def plugins(variant):
 
 @pytest.fixture(scope="module")
 def blobs(tmp_path_factory):
-    return scenes.write_blobs(tmp_path_factory.mktemp("field"), log_density=3.5)
+    return scenes.write_blobs(tmp_path_factory.mktemp("field"), log_density=3.0)
 
 
 def nrf(visibility="raymarch", **options):
@@ -37,11 +37,13 @@ def renders(field, integrator, kind, spp, **options):
 def test_agrees_with_volpath(blobs, kind):
     """The same single scattering by delta tracking: z-test per 4×4 block, and 8×8 block means within 2 %."""
     # The environment in both as Mitsuba samples it: `light_samples` draws from the very map.
-    extra = {"light_samples": 4} if kind == "env" else {}
-    ours = renders(blobs, nrf(samples=1024, **extra), kind, 64, size=48)
-    theirs = renders(blobs, {"type": "volpath", "max_depth": 2, "hide_emitters": True}, kind, 192, size=48)
+    extra = {"light_samples": 2} if kind == "env" else {}
+    ours = renders(blobs, nrf(samples=1024, **extra), kind, 64, size=48, sampler="multijitter")
+    theirs = renders(
+        blobs, {"type": "volpath", "max_depth": 2, "hide_emitters": True}, kind, 144, size=48, sampler="multijitter"
+    )
     ztest.check([i[..., :3] for i in ours], [i[..., :3] for i in theirs], f"nrf volpath {kind}", block=8)
-    # volpath's own noise in a block of 64 pixels · 4 · 192 paths of relative spread 1 to 1.5: 0.5 to 0.7 %.
+    # volpath's own noise in a block of 64 pixels · 4 · 144 paths of relative spread 1: 0.5 %.
     difference = ztest.block_difference(np.mean(ours, 0)[..., :3], np.mean(theirs, 0)[..., :3], 8, floor=0.3)
     assert difference.max() < 0.02
     alpha = ztest.block_difference(np.mean(ours, 0)[..., 3:], np.mean(theirs, 0)[..., 3:], 8, floor=0.3)
@@ -50,8 +52,10 @@ def test_agrees_with_volpath(blobs, kind):
 
 def test_environment_as_directional_lights(blobs):
     """The exhaustive sum over texels equals Mitsuba's sampling of the map, up to where in its texel a light sits."""
-    sampled = np.mean(renders(blobs, nrf(light_samples=8), "env", 32, size=32), 0)
-    summed = scenes.render(scenes.scene(blobs, nrf(), {"light": scenes.light("env")}, spp=32, size=32))
+    sampled = np.mean(renders(blobs, nrf(light_samples=8), "env", 16, size=32), 0)
+    summed = scenes.render(
+        scenes.scene(blobs, nrf(environment_lights=128), {"light": scenes.light("env")}, spp=16, size=32)
+    )
     difference = ztest.block_difference(summed[..., :3], sampled[..., :3], 8, floor=0.3)
     assert difference.max() < 0.05  # texels of 22°: lights at their middle move penumbrae between blocks
     assert summed[..., :3].mean() == pytest.approx(sampled[..., :3].mean(), rel=0.01)
@@ -67,9 +71,10 @@ def test_map_and_network_field_agree_with_grid(blobs):
     def relative(a):
         return np.sqrt(((a - march)[..., :3] ** 2).mean() / (march[..., :3] ** 2).mean())
 
-    assert relative(tmap) < 0.05
-    # Two renders of 64 spp differ by some 2 % in noise; trilinear voxels of a skin of their own width add more.
-    assert relative(network) < 0.06
+    # Skins of the blobs are a tenth of their radius thick: one logistic is off by some per cent there.
+    assert relative(tmap) < 0.08
+    # Two renders of 64 spp differ by some 2 % in noise; trilinear voxels of ln σ add little.
+    assert relative(network) < 0.04
 
 
 def test_empty_field_is_black_and_clear(tmp_path):
@@ -117,7 +122,8 @@ def test_opaque_sphere_is_a_lambert_sphere(tmp_path):
     assert (image[rho > 1.1][:, 3] == 0).all()
     # With the shadow march the light passes the skin, half of it is lost there, and the phase function makes up for it.
     marched = scenes.render(ball_scene(path, nrf("raymarch", samples=1024), HEAD_ON))
-    np.testing.assert_allclose(marched[inner][:, 0] / image[inner][:, 0], 1, rtol=0.02)
+    np.testing.assert_allclose(marched[inner][:, 0] / image[inner][:, 0], 1, rtol=0.06)  # 64 spp, two renders
+    assert (marched[inner][:, 0] / image[inner][:, 0]).mean() == pytest.approx(1, abs=0.02)
 
 
 def test_uniform_ball_has_the_closed_form_opacity(tmp_path):
@@ -132,6 +138,15 @@ def test_uniform_ball_has_the_closed_form_opacity(tmp_path):
     # Voxels of 1/128 at the sphere's surface, and the noise of 64 jittered rays of different chords.
     np.testing.assert_allclose(image[inner][:, 3], truth[inner], atol=0.015)
     assert image[inner][:, 3].mean() == pytest.approx(truth[inner].mean(), abs=0.003)
+
+
+def side(image) -> np.ndarray:
+    """Unit vector in the picture from the middle of the silhouette to the middle of the light on it."""
+    y, x = np.mgrid[: image.shape[0], : image.shape[1]]
+    middle = [np.array([(w * x).sum(), (w * y).sum()]) / w.sum() for w in (image[..., :3].sum(-1), image[..., 3])]
+    shift = middle[0] - middle[1]
+    assert np.linalg.norm(shift) > 1  # pixels: the light does come from a side
+    return shift / np.linalg.norm(shift)
 
 
 def test_orientation(blobs):
@@ -151,22 +166,17 @@ def test_orientation(blobs):
     env = {"type": "envmap", "bitmap": mi.Bitmap(image), "to_world": mi.ScalarTransform4f().rotate([0, 1, 0], 40)}
     for emitter, extra in ((scenes.light("directional"), {}), (env, {"environment_lights": 512})):
         lights = {"light": emitter}
-        ours = scenes.render(scenes.scene(blobs, nrf(**extra), lights, spp=16))[..., :3].sum(-1)
+        ours = scenes.render(scenes.scene(blobs, nrf(**extra), lights, spp=16))
         volpath = scenes.scene(blobs, {"type": "volpath", "max_depth": 2, "hide_emitters": True}, lights, spp=64)
-        volpath = scenes.render(volpath)[..., :3].sum(-1)
+        volpath = scenes.render(volpath)
         mesh = scenes.scene(
             None, {"type": "path", "max_depth": 2, "hide_emitters": True}, lights, spp=64, shapes=spheres
         )
-        mesh = scenes.render(mesh)[..., :3].sum(-1)
+        mesh = scenes.render(mesh)
 
-        def correlation(a, b):
-            return np.corrcoef(a.ravel(), b.ravel())[0, 1]
-
+        lit = [side(image) for image in (ours, volpath, mesh)]
         # Normals of the blobs point away from the field's origin, not each ball's own: shading differs, sides do not.
-        assert correlation(ours, volpath) > 0.97
-        assert correlation(ours, mesh) > 0.75
-        for wrong in (mesh[:, ::-1], mesh[::-1], mesh.T):
-            assert correlation(ours, mesh) > correlation(ours, wrong) + 0.15
+        assert np.dot(lit[0], lit[1]) > 0.99 and np.dot(lit[0], lit[2]) > 0.8
 
 
 def test_background_and_alpha(blobs):
