@@ -1,0 +1,128 @@
+"""The stock `mitsuba` program with the plugins of this package: same picture as Python, clean exits, clear errors."""
+
+import numpy as np
+import pytest
+from helpers import scenes
+from helpers.programs import run_program
+
+import mi_ntf.render
+from mi_ntf.evaluate.compare import read_image
+
+SCENE = """<scene version="3.9.0">
+  <default name="visibility" value="auto"/> <default name="spp" value="4"/>
+  <integrator type="{integrator}">{options}</integrator>
+  <sensor type="perspective">
+    <float name="fov" value="28"/>
+    <transform name="to_world"><lookat origin="1.6, 1.3, 5.3" target="0.4, -0.2, 0.3" up="0, 1, 0"/></transform>
+    <film type="hdrfilm"><integer name="width" value="32"/><integer name="height" value="24"/>
+      <string name="pixel_format" value="rgba"/><string name="component_format" value="float32"/></film>
+    <sampler type="independent"><integer name="sample_count" value="$spp"/></sampler>
+  </sensor>
+  {light}
+  <shape type="sphere">
+    <point name="center" x="0.4" y="-0.2" z="0.3"/><float name="radius" value="1.5"/><bsdf type="null"/>
+    <medium type="nrf" name="interior"><string name="filename" value="blobs.safetensors"/></medium>
+  </shape>
+</scene>"""
+POINT = (
+    '<emitter type="point"><point name="position" x="3.4" y="3" z="2.5"/><rgb name="intensity" value="60"/></emitter>'
+)
+NRF = {"integrator": "nrf", "options": '<string name="visibility" value="$visibility"/>', "light": POINT}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("stock")
+    scenes.write_blobs(folder)
+    return folder
+
+
+def write(folder, name="scene.xml", **fill):
+    (folder / name).write_text(SCENE.format(**{**NRF, **fill}))
+    return folder / name
+
+
+@pytest.mark.parametrize("visibility", ["raymarch", "neural_transmittance", "transmittance_map", "none"])
+def test_equals_rendering_from_python(folder, variant, visibility, tmp_path):
+    """Same scene, same seed, other process and other working directory: equal to 1e-4."""
+    path = write(folder)
+    out = tmp_path / "stock.exr"
+    done = run_program("mitsuba", "-m", "llvm_ad_rgb", "-D", f"visibility={visibility}", "-o", out, path, cwd=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    mi_ntf.render.register()
+    ours = np.array(variant.render(variant.load_file(str(path), visibility=visibility), seed=0))
+    assert ours[..., :3].max() > 0.05
+    np.testing.assert_allclose(read_image(out), ours, atol=1e-4)
+
+
+def test_twenty_runs_in_a_row_exit_cleanly(folder, tmp_path):
+    path = write(folder)
+    for _ in range(20):
+        done = run_program("mitsuba", "-m", "llvm_ad_rgb", "-D", "spp=1", "-o", tmp_path / "a.exr", path, cwd=tmp_path)
+        assert done.returncode == 0 and "rror" not in done.stderr, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("integrator", ["volpath", "prbvolpath"])
+def test_stock_volumetric_integrators_see_the_field(folder, integrator, tmp_path):
+    """The same medium under Mitsuba's own path tracers: the pixel means agree."""
+    options = '<integer name="max_depth" value="2"/>'
+    path = write(folder, f"{integrator}.xml", integrator=integrator, options=options)
+    reference = write(folder)
+    images = []
+    for file, spp in ((path, 64), (reference, 64)):
+        out = tmp_path / f"{file.stem}.exr"
+        done = run_program("mitsuba", "-m", "llvm_ad_rgb", "-D", f"spp={spp}", "-o", out, file, cwd=tmp_path)
+        assert done.returncode == 0, done.stdout + done.stderr
+        images.append(read_image(out))
+    # 49 000 paths, a tenth of which reach the light, of relative spread about 1: 1.5 %, times two.
+    assert images[0][..., :3].mean() == pytest.approx(images[1][..., :3].mean(), rel=0.03)
+    assert images[0][..., 3].mean() == pytest.approx(images[1][..., 3].mean(), rel=0.02)
+
+
+def test_misspelt_property_is_named_with_its_line(folder, tmp_path):
+    path = write(folder, "bad.xml", options='<string name="visiblity" value="none"/>')
+    done = run_program("mitsuba", "-m", "llvm_ad_rgb", path, cwd=tmp_path)
+    assert done.returncode != 0
+    assert "visiblity" in done.stdout + done.stderr and "bad.xml" in done.stdout + done.stderr
+
+
+def test_missing_field_file(folder, tmp_path):
+    text = SCENE.format(**NRF).replace("blobs.safetensors", "nowhere.safetensors")
+    (folder / "lost.xml").write_text(text)
+    done = run_program("mitsuba", "-m", "llvm_ad_rgb", folder / "lost.xml", cwd=tmp_path)
+    assert done.returncode != 0 and "nowhere.safetensors does not exist; make one with" in done.stdout + done.stderr
+
+
+def test_ntf_emitter_shadows_a_floor(folder, tmp_path, variant):
+    """Stock `path` with an ordinary floor: the field's shadow falls on it, where a march says it does."""
+    mi_ntf.render.register()
+    floor = """<scene version="3.9.0"><integrator type="path"><integer name="max_depth" value="2"/></integrator>
+      <sensor type="orthographic"><transform name="to_world"><scale value="3"/>
+        <lookat origin="0.4, 5, 0.3" target="0.4, -3, 0.3" up="0, 0, 1"/></transform>
+        <film type="hdrfilm"><integer name="width" value="32"/><integer name="height" value="32"/></film></sensor>
+      <medium type="nrf" id="field"><string name="filename" value="blobs.safetensors"/></medium>
+      <emitter type="ntf"><string name="visibility" value="{visibility}"/><ref id="field"/>
+        <emitter type="directional"><vector name="direction" x="0" y="-1" z="0"/><rgb name="irradiance" value="3"/>
+        </emitter></emitter>
+      <shape type="rectangle"><transform name="to_world"><scale value="4"/><rotate x="1" angle="-90"/>
+        <translate x="0.4" y="-2" z="0.3"/></transform>
+        <bsdf type="diffuse"><rgb name="reflectance" value="0.5"/></bsdf></shape></scene>"""
+    images = {}
+    for visibility in ("raymarch", "none"):
+        path = folder / f"floor_{visibility}.xml"
+        path.write_text(floor.format(visibility=visibility))
+        images[visibility] = np.array(variant.render(variant.load_file(str(path)), spp=16))[..., 0]
+    open_floor = 0.5 * 3 / np.pi
+    np.testing.assert_allclose(images["none"], open_floor, rtol=1e-4)
+    # Straight light: the floor is dark beneath the balls (their soft skins left out), lit elsewhere.
+    corner = images["raymarch"][:3, :3]
+    np.testing.assert_allclose(corner, open_floor, rtol=1e-3)
+    medium = variant.load_dict({"type": "nrf", "filename": str(folder / "blobs.safetensors"), "scale": 1.0})
+    c = (np.arange(32) + 0.5) / 16 - 1
+    dark = images["raymarch"] < 0.1 * open_floor
+    x, z = np.meshgrid(0.4 - 3 * c, 0.3 - 3 * c)  # the camera looks down, x to its left
+    for ball, radius in zip(scenes.CENTERS, scenes.RADII, strict=True):
+        where = [o + 1.5 * b for o, b in zip(scenes.SIMILARITY.center, ball, strict=True)]
+        distance = np.hypot(x - where[0], z - where[2]) / 1.5
+        assert dark[distance < 0.65 * radius].all()
+    assert dark.mean() < 0.2 and medium.frame.length == pytest.approx(1.5)
