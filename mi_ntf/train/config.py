@@ -12,8 +12,8 @@ class TrainConfig:
     architecture: Architecture = FAST
     samples: int = 20000
     """Field samples a step; the number of camera rays follows from how many samples a ray takes."""
-    step: float = 1 / 80
-    """Length of the cells of the quadrature: 160 across the unit sphere."""
+    step: float = 1 / 100
+    """Length of the cells of the quadrature: 200 across the unit sphere."""
     cells: int = 96
     """Occupancy grid, cells along an edge."""
     bake: int = 128
@@ -29,6 +29,10 @@ class TrainConfig:
     facing: float = 0.1
     empty: float = 0.05
     """Weight of σ → 0 outside the visual hull, where no photograph's ray is sampled."""
+    even: float = 5e-3
+    """Weight of an even density along surfaces."""
+    sharp: float = 1e-3
+    """Weight of thin skins: −ln σ where pictures see matter."""
     smooth: float = 2e-4
     """Weight of total variation of the planes."""
     ntf_from: float = 0.4

@@ -28,12 +28,13 @@ MIN_WEIGHT = 1e-4
 
 @dataclass(frozen=True)
 class Image:
-    """Rendered rays and, for the losses, their shaded samples (index `shaded` into the n rays)."""
+    """Rendered rays and, for the losses, their shaded samples: of ray `shaded`, sample `index` of `raw`."""
 
     color: torch.Tensor
     alpha: torch.Tensor
     x: torch.Tensor
     shaded: torch.Tensor
+    index: torch.Tensor
     weight: torch.Tensor
     normal: torch.Tensor
     radiance: torch.Tensor
@@ -79,4 +80,4 @@ def render(networks: Networks, rays: Rays, samples, step: float) -> Image:
     ray, t, x = ray[near], t[near], x[near]
     radiance, normal = shade(networks, x, rays.d[ray], t, rays.light[ray])
     color = scatter_sum(v[near, None] * radiance, ray, len(rays))
-    return Image(color, alpha, x, ray, w[near], normal, radiance, raw)
+    return Image(color, alpha, x, ray, near, w[near], normal, radiance, raw)

@@ -1,0 +1,78 @@
+"""Every command and snippet of the README runs, with smaller settings where its own would take minutes."""
+
+import re
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+from helpers.programs import run_program
+
+ROOT = Path(__file__).parents[1]
+TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
+BLOCKS = dict(re.findall(r"```(\w+)\n(.*?)```", TEXT, re.S))
+COMMANDS = [line.split("#")[0].split() for line in TEXT.splitlines() if re.match(r"    (mi-ntf|mitsuba|make) ", line)]
+SMALLER = {"capture": "--views 12 --size 24 --test-views 1 --spp 2".split()}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """The shipped scenes, a mesh scene of one's own, and two images, as the README's commands expect them."""
+    folder = tmp_path_factory.mktemp("readme")
+    shutil.copytree(ROOT / "scenes", folder / "scenes")
+    sys.path.insert(0, str(ROOT / "examples"))
+    try:
+        from own_mesh import BOXES
+    finally:
+        sys.path.pop(0)
+    (folder / "scene.xml").write_text(BOXES)
+    shutil.copy(ROOT / "scenes/statue/reference_point.exr", folder / "a.exr")
+    shutil.copy(ROOT / "scenes/statue/reference_env.exr", folder / "reference.exr")
+    return folder
+
+
+def check(*words, folder):
+    done = run_program(*words, cwd=folder)
+    assert done.returncode == 0, f"{words}\n{done.stdout}\n{done.stderr}"
+    return done.stdout
+
+
+def test_xml_snippet(folder):
+    small = BLOCKS["xml"].replace('"256"', '"24"').replace('value="16"', 'value="2"')
+    (folder / "snippet.xml").write_text(small)
+    check("mitsuba", "-m", "llvm_ad_rgb", "-o", "snippet.exr", "snippet.xml", folder=folder)
+    assert (folder / "snippet.exr").stat().st_size > 0
+
+
+def test_python_snippet(folder):
+    (folder / "snippet.py").write_text(BLOCKS["python"] + "assert image.shape == (64, 64, 4)\n")
+    check("python", "snippet.py", folder=folder)
+
+
+def test_commands_in_their_order(folder):
+    """Later commands use the files of earlier ones."""
+    ran = set()
+    for words in COMMANDS:
+        if words[0] == "make":  # they install, or run this suite
+            assert re.search(rf"^{words[1]}:", (ROOT / "Makefile").read_text(), re.M)
+            continue
+        if words[1] == "train":
+            words[words.index("--minutes") + 1] = "0.1"
+        extra = SMALLER.get(words[1], [])
+        if words[0] == "mitsuba":
+            # `$res` of the shipped scenes; a swapped one is small by itself.
+            small = ["-D", "res=16"] if "scenes/" in words[-1] else []
+            words = [words[0], *small, *words[1:]]
+        if words[1] == "info":
+            assert "similarity" in check(*words, folder=folder)
+        else:
+            check(*words, *extra, folder=folder)
+        ran.add(words[1] if words[0] == "mi-ntf" else "mitsuba")
+    assert ran == {"capture", "train", "swap", "mitsuba", "info", "compare"}
+
+
+def test_names_in_the_table_are_the_plugins(folder):
+    from mi_ntf.infer.visibility import AVAILABLE
+
+    rows = re.findall(r"^\| `(\w+)` \|", TEXT, re.M)
+    assert set(AVAILABLE) <= set(rows)
