@@ -39,8 +39,9 @@ def normals(image: Image, d: torch.Tensor, baked: Baked):
 def evenness(networks: Networks, image: Image, count: int, generator: torch.Generator) -> torch.Tensor:
     """Squared change of ln σ along the surface, in random directions perpendicular to the (detached) predicted normals.
 
-    Photographs with the light at the camera hardly see small bumps of the density, since nothing is in shadow there; lit
-    from elsewhere the bumps shade each other and show as blotches. Differences over 0.005 to 0.02 at `count` samples.
+    Photographs with the light at the camera hardly see small bumps of the density, since nothing is in shadow there;
+    lit from elsewhere the bumps shade each other and show as blotches. Differences over 0.005 to 0.02 at `count`
+    samples.
     """
     seen = (image.weight.detach() > 0.02).nonzero()[:, 0]
     if not len(seen):

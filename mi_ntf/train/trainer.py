@@ -124,7 +124,8 @@ class _Run:
         loss = loss + c.normal * toward + c.facing * away
         loss = loss + c.empty * torch.relu(image.raw - MAX_LOG_DENSITY).mean()
         loss = loss + c.even * losses.evenness(self.nets, image, 2048, g)
-        loss = loss - c.sharp * (image.weight.detach() * image.raw[image.index].clamp(max=MAX_LOG_DENSITY)).sum() / len(batch)
+        matter = image.raw[image.index].clamp(max=MAX_LOG_DENSITY)
+        loss = loss - c.sharp * (image.weight.detach() * matter).sum() / len(batch)
         x = self.occupancy.must_be_empty(1536, g)
         if len(x):
             loss = loss + c.empty * losses.emptiness(self.nets, x)

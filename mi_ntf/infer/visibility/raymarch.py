@@ -18,5 +18,6 @@ class RayMarch:
 
 def default_steps(step: float) -> tuple[float, float, float]:
     """Steps from the camera march's cell length: finer beside the point, which lies in the skin that makes the depth, a
-    fifth of the distance further off, and never longer than half an occupancy cell, which would jump over thin parts."""
+    fifth of the distance further off, and never longer than half an occupancy cell, which would jump over thin
+    parts."""
     return 0.375 * step, max(step, 1 / 64), 0.2
