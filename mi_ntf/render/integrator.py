@@ -164,7 +164,9 @@ class SceneLight:
             source = (
                 transmittance_map.network_source(field.network)
                 if integrator.map_source == "network"
-                else transmittance_map.field_source(self.medium.source.density, field.grid, self.step)
+                else transmittance_map.field_source(
+                    self.medium.source.density, field.grid, dr.opaque(mi.Float, self.step)
+                )
             )
             self.map = transmittance_map.TransmittanceMap(
                 self.table, integrator.map_resolution, field.grid.hull, source, mi
