@@ -141,7 +141,7 @@ def test_transmittance_loss_leaves_the_field_alone():
 
 
 def test_evenness_sees_slopes_along_the_surface_alone():
-    """ln σ = 8z does not change along surfaces of normal −z; across x-normals it differs by 16·offset·cos, ⟨cos²⟩ = ½."""
+    """ln σ = 8z does not change along surfaces of normal −z; for normals x it differs by 16·offset·cos, ⟨cos²⟩ = ½."""
     class Ramp:
         def log_density(self, x):
             return 8 * x[:, 2]
