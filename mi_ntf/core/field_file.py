@@ -29,6 +29,7 @@ def save(path: str | Path, header: Header, tensors: dict[str, np.ndarray], dtype
         raise MiNtfError(f"cannot write {path}: folder {Path(path).parent} does not exist; create it first")
     temporary = Path(f"{path}.part")
     safetensors.numpy.save_file(data, temporary, metadata={_KEY: json.dumps(header.to_json())})
+    temporary.chmod(0o644)  # safetensors makes files for their owner alone
     os.replace(temporary, path)
 
 
