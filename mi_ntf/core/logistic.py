@@ -92,4 +92,4 @@ def through_quantiles(ops, t75, t50, t25):
     camera's own weights then lies 0.35 of the quartiles' asymmetry closer to the light.
     """
     slope = 2.1972245773362196 / ops.maximum(t75 - t25, 1e-6)
-    return ops.minimum(slope, 665.0), 0.3 * t50 + 0.35 * (t75 + t25)
+    return ops.minimum(slope, 665.0), t50 + 0.35 * ((t75 - t50) - (t50 - t25))

@@ -86,8 +86,9 @@ FORMULAS = [
     # ln a is 6.5 tanh: 6.5·2e-7 of a; derivative likewise.
     Formula("parameters", lambda o, *c: logistic.parameters(o, *c), (_uniform(-12, 12), _uniform(-5, 5),
             _uniform(0.05, 1)), 3e-6, 1e-5),
+    # t75 − t25 ≥ 0.04, rounded by 1e-7. ∂a/∂b is the difference of two terms 2.2/0.04², each rounded by 6e-8.
     Formula("through_quantiles", lambda o, b, u, v: logistic.through_quantiles(o, b + u, b, b - v),
-            (T, _log_uniform(0.02, 1), _log_uniform(0.02, 1)), 3e-6, 3e-5),  # t75 − t25 ≥ 0.04, rounded by 1e-7
+            (T, _log_uniform(0.02, 1), _log_uniform(0.02, 1)), 3e-6, 3e-5, 10.0),
     # dD/dα is a difference of two terms 1000 times its value where it crosses zero.
     Formula("ggx", lambda o, s, a: [microfacet.ggx(s, a)], (_uniform(0, 1), _log_uniform(0.0225, 1)), 1e-6, 3e-5),
     Formula("smith_g1", lambda o, c, a: [microfacet.smith_g1(o, c, a)], (_uniform(0, 1), _log_uniform(0.0225, 1)),
