@@ -129,6 +129,18 @@ def test_map_covers_every_point_with_density(grid, rng):
         assert np.array(tmap.tau(arrays(x), arrays(wi), mi.Float(distance), mi.UInt32(0), True)).max() < 1e-6
 
 
+def test_texels_are_square_and_no_more_than_asked_for(grid):
+    """A map of m × m texels on an oblong object has oblong texels, which waste half of them."""
+    tall = grid.hull * [0.3, 1.0, 0.3]
+    for lights in (table(False), table(True)):
+        tmap = TransmittanceMap(lights, 64, tall, analytic_source(1.0, lambda o, d: o[0]), mi)
+        _, _, _, _, window, _, columns = (np.array(v) for v in tmap._light(mi.UInt32(0), True))
+        lines = np.array(tmap._lines(mi.Float(columns)))
+        assert 0.95 * 64**2 < columns[0] * lines[0] <= 64**2
+        assert (window[2] / columns) / (window[3] / lines) == pytest.approx(1, abs=0.06)  # whole texels of 30 or more
+        assert window[2] / window[3] > 1.5 or window[3] / window[2] > 1.5
+
+
 def test_outside_and_clear_rays_are_lit(grid):
     tmap = TransmittanceMap(table(False), 16, grid.hull, field_source(grid.density, grid, mi.Float(0.01)), mi)
     b = np.array(tmap.texture.tensor())[..., 1]

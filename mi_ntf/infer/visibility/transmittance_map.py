@@ -2,8 +2,9 @@
 section 3.3, with the slips of its algorithms corrected).
 
 A light's rays: parallel (directional) or through a pinhole at the light (point). The map is the smallest of a few
-rectangles around the object as the light sees it, m × m texels. A texel holds (a, b) of the ray through its centre,
-towards the light. A lookup evaluates the four nearest rays and interpolates the four τ bilinearly, never (a, b).
+rectangles around the object as the light sees it, cut into at most m² square texels: as many as a map of m × m, where
+they serve best. A texel holds (a, b) of the ray through its centre, towards the light. A lookup evaluates the four
+nearest rays and interpolates the four τ bilinearly, never (a, b).
 """
 
 from types import ModuleType
@@ -18,11 +19,11 @@ from .. import ops
 from ..lights import LightTable
 from ..march import clear_distance, safe_inverse
 
-_ROW = 17
+_ROW = 18
 
 
 class TransmittanceMap:
-    """Maps of all lights of a table, m × m texels each, in one Dr.Jit texture of (a, b), layer upon layer.
+    """Maps of all lights of a table, m² texels each, in one Dr.Jit texture of (a, b), layer upon layer.
 
     `fit(o, d) → (a, b)` solves the logistic of rays through `o` towards the light along `d`. `hull` (k, 3): points
     whose convex hull holds all density, inside a ball of `radius`. Memory: 8 m² bytes a light.
@@ -30,47 +31,52 @@ class TransmittanceMap:
 
     def __init__(self, lights: LightTable, resolution: int, hull: np.ndarray, fit, dj: ModuleType):
         self.dj, self.m, self.count = dj, resolution, lights.count
-        self._rows = dj.Float(_frames(lights, hull).astype(np.float32).ravel())
+        self._rows = dj.Float(_frames(lights, hull, resolution).astype(np.float32).ravel())
         self.texture = self._build(fit)
 
     def tau(self, x, wi, distance, index, active):
         """Bilinear τ of the four nearest texel rays; 1 outside the map."""
         light = self._light(index, active)
-        axis, u, v, position, window, point = light
+        axis, u, v, position, window, point, columns = light
+        lines = self._lines(columns)
         rel = tuple(a - point * b for a, b in zip(x, position, strict=True))
         depth = dr.select(point > 0, dr.maximum(dot(rel, axis), 1e-6), 1)
         inverse = dr.rcp(depth)
-        fu = ((dot(rel, u) * inverse - window[0]) / window[2] * 0.5 + 0.5) * self.m - 0.5
-        fv = ((dot(rel, v) * inverse - window[1]) / window[3] * 0.5 + 0.5) * self.m - 0.5
-        inside = active & (fu > -0.5) & (fv > -0.5) & (fu < self.m - 0.5) & (fv < self.m - 0.5)
+        fu = ((dot(rel, u) * inverse - window[0]) / window[2] * 0.5 + 0.5) * columns - 0.5
+        fv = ((dot(rel, v) * inverse - window[1]) / window[3] * 0.5 + 0.5) * lines - 0.5
+        inside = active & (fu > -0.5) & (fv > -0.5) & (fu < columns - 0.5) & (fv < lines - 0.5)
         iu, iv = dr.floor(fu), dr.floor(fv)
         wu, wv = fu - iu, fv - iv
         result = 0
         for du, dv in ((0, 0), (1, 0), (0, 1), (1, 1)):
-            tu, tv = (dr.clip(c, 0, self.m - 1) for c in (iu + du, iv + dv))
-            a, b = self._fetch(index, tu, tv, inside)
+            tu, tv = dr.clip(iu + du, 0, columns - 1), dr.clip(iv + dv, 0, lines - 1)
+            a, b = self._fetch(index, columns, tu, tv, inside)
             t = self._coordinate(light, x, wi, tu, tv)
             weight = (wu if du else 1 - wu) * (wv if dv else 1 - wv)
             result += weight * logistic.transmittance(ops, t, a, b)
         return dr.select(inside, result, 1)
 
-    def _fetch(self, index, tu, tv, active):
+    def _lines(self, columns):
+        return dr.floor((self.m * self.m + 0.5) / columns)
+
+    def _fetch(self, index, columns, tu, tv, active):
         uint = self.dj.UInt32
-        texel = (uint(index) * self.m + uint(tv)) * self.m + uint(tu)
+        texel = uint(index) * (self.m * self.m) + uint(tv) * uint(columns) + uint(tu)
         pair = dr.gather(self.dj.Array2f, self.texture.tensor().array, texel, active)
         return pair[0], pair[1]
 
     def _light(self, index, active):
-        """Axis away from the light, two vectors across, position, window (centre u, v; half width u, v), point flag."""
+        """Axis away from the light, two vectors across, position, window (centre u, v; half width u, v), point flag,
+        texels along u."""
         base = self.dj.UInt32(index) * _ROW
         row = [dr.gather(self.dj.Float, self._rows, base + i, active) for i in range(_ROW)]
-        return tuple(row[0:3]), tuple(row[3:6]), tuple(row[6:9]), tuple(row[9:12]), tuple(row[12:16]), row[16]
+        return tuple(row[0:3]), tuple(row[3:6]), tuple(row[6:9]), tuple(row[9:12]), tuple(row[12:16]), row[16], row[17]
 
     def _ray(self, light, tu, tv):
         """A point of the ray through texel (tu, tv)'s centre, and its direction towards the light."""
-        axis, u, v, position, window, point = light
-        su = ((tu + 0.5) * (2 / self.m) - 1) * window[2] + window[0]
-        sv = ((tv + 0.5) * (2 / self.m) - 1) * window[3] + window[1]
+        axis, u, v, position, window, point, columns = light
+        su = ((tu + 0.5) * (2 / columns) - 1) * window[2] + window[0]
+        sv = ((tv + 0.5) * (2 / self._lines(columns)) - 1) * window[3] + window[1]
         offset = tuple(su * a + sv * b for a, b in zip(u, v, strict=True))
         out = tuple(a + point * c for a, c in zip(axis, offset, strict=True))
         norm = dr.rsqrt(dot(out, out))
@@ -92,8 +98,8 @@ class TransmittanceMap:
             n = min(chunk, self.count - first)
             i = dr.arange(self.dj.UInt32, n * texels) + dr.opaque(self.dj.UInt32, first * texels)
             light = self._light(i // texels, True)
-            rest = i % texels
-            origin, d = self._ray(light, self.dj.Float(rest % self.m), self.dj.Float(rest // self.m))
+            rest, columns = i % texels, self.dj.UInt32(light[6])
+            origin, d = self._ray(light, self.dj.Float(rest % columns), self.dj.Float(rest // columns))
             a, b = fit(origin, d)
             dr.scatter(values, self.dj.Array2f(a, b), i)
             dr.eval(values)
@@ -101,8 +107,8 @@ class TransmittanceMap:
         return self.dj.Texture2f(tensor, use_accel=False, filter_mode=dr.FilterMode.Nearest)
 
 
-def _frames(lights: LightTable, hull: np.ndarray) -> np.ndarray:
-    """The rows of :meth:`TransmittanceMap._light`, (n, 17) float64."""
+def _frames(lights: LightTable, hull: np.ndarray, resolution: int) -> np.ndarray:
+    """The rows of :meth:`TransmittanceMap._light`, (n, 18) float64."""
     distance = np.linalg.norm(lights.where, axis=1)
     radius = np.linalg.norm(hull, axis=1).max()
     near = lights.is_point & (distance <= radius * 1.001)
@@ -127,7 +133,8 @@ def _frames(lights: LightTable, hull: np.ndarray) -> np.ndarray:
         best = row if best is None else np.where((size < area)[:, None], row, best)
         area = np.minimum(area, size)
     position = np.where(lights.is_point[:, None], lights.where, 0.0)
-    return np.concatenate([axis, best[:, :6], position, best[:, 6:], lights.is_point[:, None]], axis=1)
+    columns = np.clip(np.round(resolution * np.sqrt(best[:, 8:9] / best[:, 9:10])), 2, resolution**2 // 2)
+    return np.concatenate([axis, best[:, :6], position, best[:, 6:], lights.is_point[:, None], columns], axis=1)
 
 
 def _window(lights: LightTable, axis, u, v, hull) -> np.ndarray:
