@@ -1,1 +1,2 @@
-"""Data sets of collocated photographs: the format (`schema`) and the virtual camera that makes them (`capture`)."""
+"""Data sets of collocated photographs: the format (`schema`), everything that is read (`readers`), and the virtual
+camera that makes them (`capture`)."""

@@ -16,26 +16,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.data import schema
+from mi_ntf.data.bounds import bounding_sphere
 
 DISTANCE = 3.2  # camera to object's centre, in radii of the bounding sphere
 MARGIN = 1.04   # bounding sphere over the object's extent: room for a soft surface in the field
 SURFACE_INTEGRATORS = ("PathIntegrator", "DirectIntegrator")
-
-
-def bounding_sphere(points: np.ndarray) -> tuple[np.ndarray, float]:
-    """Centre (3,) and radius of a sphere around `points` (P, 3), near the smallest, without margin.
-
-    Source: Badoiu and Clarkson 2003, "Smaller core-sets for balls": step by 1/(i+1) towards the farthest point.
-    """
-    points = np.asarray(points, dtype=np.float64)
-    center = 0.5 * (points.min(0) + points.max(0))
-    best, radius = center, float(np.linalg.norm(points - center, axis=1).max())
-    for i in range(1, 200):
-        distance = np.linalg.norm(points - center, axis=1)
-        if distance.max() < radius:
-            best, radius = center, float(distance.max())
-        center = center + (points[distance.argmax()] - center) / (i + 1)
-    return best, radius
 
 
 def view_directions(count: int, rng: np.random.Generator) -> np.ndarray:

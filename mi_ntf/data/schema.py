@@ -1,6 +1,7 @@
-"""The data set: a folder of photographs with one `transforms_<split>.json` a split (train, val, test).
+"""Data sets: what is in memory (`Split`), our own format on disk, and the pinhole camera.
 
-The NeRF-synthetic/Blender convention, and per frame the light that took part:
+A data set of `mi-ntf capture` is a folder with one `transforms_<split>.json` a split (train, val, test), in the
+NeRF-synthetic/Blender convention, and per frame the light that took part:
 
     {"camera_angle_x": 0.63, "w": 128, "h": 128,                  horizontal field of view (radians), size (pixels)
      "unit_sphere": {"center": [x, y, z], "radius": r},           field = (world - center) / radius, object inside 1
@@ -10,25 +11,28 @@ The NeRF-synthetic/Blender convention, and per frame the light that took part:
                  "pl_intensity": [r, g, b]}, ...]}                radiant intensity, W/sr, linear RGB
 
 Images are linear RGBA radiance with alpha premultiplied, as a renderer with a box filter writes them (background 0), in
-EXR. PNG (8 bit, sRGB, straight alpha) is read too and turned into the same. Lengths are those of the captured world.
-NumPy only: training reads this file where no renderer is installed.
+EXR. Lengths are those of the captured world. What else is read, and how: `readers`. NumPy only: training reads data
+where no renderer is installed.
 """
 
 import json
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from mi_ntf.core.errors import MiNtfError
+from mi_ntf.data.images import read_image, write_exr
+
+__all__ = ["SPLITS", "Found", "Frame", "Split", "Transforms", "View", "focal_length", "load_split",
+           "mitsuba_to_opengl", "pixel_rays", "read_image", "write_exr", "write_transforms"]
 
 SPLITS = ("train", "val", "test")
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One photograph: where the file is and where camera and light were (world units)."""
+    """One photograph to be written: where the file is and where camera and light were (world units)."""
 
     file: str
     c2w: np.ndarray
@@ -49,79 +53,52 @@ class Transforms:
 
 
 @dataclass(frozen=True)
+class View:
+    """One photograph as a reader found it, pixels not yet read. `None`: the data set does not say."""
+
+    where: str
+    """File and frame, for messages."""
+    image: Path
+    masks: list[Path]
+    """Where its mask may lie."""
+    c2w: np.ndarray
+    """(4, 4) camera-to-world, OpenGL axes."""
+    camera: tuple[float, ...]
+    """(horizontal field of view in radians,), or (fx, fy, cx, cy) in pixels; cx, cy from the top left corner."""
+    size: tuple[int, int] | None = None
+    """(width, height) in pixels."""
+    light_pos: np.ndarray | None = None
+    light_intensity: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a reader found in a folder, pixels not yet read. World units; `sphere` is (center (3,), radius)."""
+
+    views: dict[str, list[View]]
+    sphere: tuple[np.ndarray, float] | None = None
+    points: np.ndarray | None = None
+    """(P, 3) reconstructed points."""
+    notes: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
 class Split:
     """A split in memory. N frames of H x W pixels; float32 unless noted.
 
-    images (N, H, W, 4) linear premultiplied RGBA · c2w (N, 4, 4) float64, OpenGL axes · focal in pixels ·
-    light_pos (N, 3) world · light_intensity (N, 3) · center (3,) and radius: field = (world - center) / radius.
+    images (N, H, W, 4) linear premultiplied RGBA · c2w (N, 4, 4) float64, OpenGL axes · focal (N, 2) fx, fy and
+    principal (N, 2) cx, cy in pixels from the top left corner, float64 · light_pos (N, 3) world ·
+    light_intensity (N, 3) · center (3,) and radius: field = (world - center) / radius.
     """
 
     images: np.ndarray
     c2w: np.ndarray
-    focal: float
+    focal: np.ndarray
+    principal: np.ndarray
     light_pos: np.ndarray
     light_intensity: np.ndarray
     center: np.ndarray
     radius: float
-
-
-def _numbers(entry: dict, key: str, shape: tuple[int, ...], where: str) -> np.ndarray:
-    """The finite float array `entry[key]` of `shape` (float64), or a MiNtfError that begins with `where`."""
-    if key not in entry:
-        raise MiNtfError(f"{where}: '{key}' is missing; see mi_ntf/data/schema.py for the format")
-    try:
-        value = np.array(entry[key], dtype=np.float64)
-    except (TypeError, ValueError):
-        raise MiNtfError(f"{where}: '{key}' is {entry[key]!r}, expected numbers of shape {shape}") from None
-    if value.shape != shape:
-        raise MiNtfError(f"{where}: '{key}' has shape {value.shape}, expected {shape}; write it as nested lists")
-    if not np.isfinite(value).all():
-        raise MiNtfError(f"{where}: '{key}' is not finite: {value.tolist()}; correct the pose or light")
-    return value
-
-
-def _positive(entry: dict, key: str, where: str) -> float:
-    value = float(_numbers(entry, key, (), where))
-    if value <= 0.0:
-        raise MiNtfError(f"{where}: '{key}' is {value:g}, must be positive")
-    return value
-
-
-def _frame(entry: dict, where: str) -> Frame:
-    if "file_path" not in entry:
-        raise MiNtfError(f"{where}: 'file_path' is missing; name the image relative to the folder")
-    c2w = _numbers(entry, "transform_matrix", (4, 4), where)
-    error = np.abs(c2w[:3, :3].T @ c2w[:3, :3] - np.eye(3)).max()
-    if error > 1e-3 or np.linalg.det(c2w[:3, :3]) < 0 or np.abs(c2w[3] - (0, 0, 0, 1)).max() > 1e-6:
-        raise MiNtfError(f"{where}: 'transform_matrix' is no rigid motion (rotation off by {error:.2g}, determinant "
-                         f"{np.linalg.det(c2w[:3, :3]):.3g}); remove scale and mirroring, keep the last row 0 0 0 1")
-    if "pl_pos" not in entry or "pl_intensity" not in entry:
-        raise MiNtfError(f"{where}: 'pl_pos' or 'pl_intensity' is missing; training needs photographs taken with a "
-                         "known point light (for a flash on the camera: pl_pos = the camera's position)")
-    light = [_numbers(entry, key, (3,), where) for key in ("pl_pos", "pl_intensity")]
-    return Frame(str(entry["file_path"]), c2w, *light)
-
-
-def read_transforms(folder: Path, split: str) -> Transforms:
-    """Read and check `transforms_<split>.json`. Raises MiNtfError."""
-    path = Path(folder) / f"transforms_{split}.json"
-    if split not in SPLITS:
-        raise MiNtfError(f"split '{split}' is unknown; it is one of {', '.join(SPLITS)}")
-    if not path.is_file():
-        raise MiNtfError(f"{path} does not exist; make a data set with `mi-ntf capture SCENE.xml {folder}`")
-    try:
-        data = json.loads(path.read_text())
-    except json.JSONDecodeError as error:
-        raise MiNtfError(f"{path}: not valid JSON ({error}); the file is damaged, capture it again") from None
-    if not data.get("frames"):
-        raise MiNtfError(f"{path}: 'frames' is empty or missing; a split needs one photograph at least")
-    frames = [_frame(entry, f"{path}, frame {i}") for i, entry in enumerate(data["frames"])]
-    angle = _positive(data, "camera_angle_x", str(path))
-    if angle >= np.pi:
-        raise MiNtfError(f"{path}: 'camera_angle_x' is {angle:g}, must be below pi; it is in radians")
-    sphere, where = data.get("unit_sphere", {}), f"{path}, unit_sphere"
-    return Transforms(angle, int(_positive(data, "w", str(path))), int(_positive(data, "h", str(path))),
-                      _numbers(sphere, "center", (3,), where), _positive(sphere, "radius", where), frames)
 
 
 def write_transforms(folder: Path, split: str, transforms: Transforms) -> Path:
@@ -139,101 +116,25 @@ def write_transforms(folder: Path, split: str, transforms: Transforms) -> Path:
     return path
 
 
-def read_image(path: Path) -> np.ndarray:
-    """Linear premultiplied RGBA (H, W, 4) float32 of an EXR (RGB or RGBA) or an 8-bit PNG (sRGB, straight alpha).
-
-    Raises MiNtfError where the file is missing, unreadable, of another kind, or holds NaN or infinity.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise MiNtfError(f"{path} does not exist; the data set is incomplete, run the capture again (it resumes)")
-    reader = {".exr": _read_exr, ".png": _read_png}.get(path.suffix.lower())
-    if reader is None:
-        raise MiNtfError(f"{path}: images of type '{path.suffix}' are not read; convert it to .exr or .png")
-    try:
-        pixels = reader(path)
-    except MiNtfError:
-        raise
-    except Exception as error:  # OpenEXR and Pillow raise many kinds for a damaged file
-        raise MiNtfError(f"{path}: cannot be read as an image ({error}); delete it and capture it again") from error
-    bad = int(np.count_nonzero(~np.isfinite(pixels).all(-1)))
-    if bad:
-        raise MiNtfError(f"{path}: {bad} pixels are NaN or infinite; delete it and capture it again")
-    return pixels
-
-
-def _read_exr(path: Path) -> np.ndarray:
-    import OpenEXR
-
-    with OpenEXR.File(str(path), separate_channels=True) as file:
-        channels = {name: np.array(c.pixels, dtype=np.float32) for name, c in file.channels().items()}
-    missing = [name for name in "RGB" if name not in channels]
-    if missing:
-        raise MiNtfError(f"{path}: has channels {', '.join(sorted(channels))}, lacks {', '.join(missing)}; "
-                         "write it as RGB or RGBA")
-    alpha = channels.get("A", np.ones_like(channels["R"]))
-    return np.stack([channels["R"], channels["G"], channels["B"], alpha], -1)
-
-
-def _read_png(path: Path) -> np.ndarray:
-    from PIL import Image
-
-    with Image.open(path) as image:
-        if image.mode not in ("L", "LA", "P", "RGB", "RGBA"):
-            raise MiNtfError(f"{path}: PNG of mode '{image.mode}'; write it with 8 bits a channel, or as EXR")
-        srgb = np.asarray(image.convert("RGBA"), dtype=np.float32) / 255.0
-    rgb, alpha = srgb[..., :3], srgb[..., 3:]
-    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
-    return np.concatenate([linear * alpha, alpha], -1).astype(np.float32)
-
-
-def write_exr(path: Path, rgba: np.ndarray) -> None:
-    """Write linear premultiplied RGBA (H, W, 4) as a half-float EXR, through a temporary name in the same folder."""
-    import OpenEXR
-
-    temporary = path.with_suffix(".tmp.exr")
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with OpenEXR.File(header, {"RGBA": np.ascontiguousarray(rgba, dtype=np.float16)}) as file:
-        file.write(str(temporary))
-    os.replace(temporary, path)
-
-
-def load_split(folder: Path, split: str) -> Split:
-    """Load one split of a data set with all its images. Raises MiNtfError."""
-    transforms = read_transforms(folder, split)
-    images = np.empty((len(transforms.frames), transforms.h, transforms.w, 4), np.float32)
-    for i, frame in enumerate(transforms.frames):
-        pixels = read_image(Path(folder) / frame.file)
-        if pixels.shape[:2] != images.shape[1:3]:
-            raise MiNtfError(f"{Path(folder) / frame.file}: is {pixels.shape[1]}x{pixels.shape[0]}, "
-                             f"transforms_{split}.json says {transforms.w}x{transforms.h}; all images of a split "
-                             "have the size 'w' x 'h'")
-        images[i] = pixels
-    return Split(
-        images=images,
-        c2w=np.stack([f.c2w for f in transforms.frames]),
-        focal=focal_length(transforms.angle_x, transforms.w),
-        light_pos=np.stack([f.light_pos for f in transforms.frames]).astype(np.float32),
-        light_intensity=np.stack([f.light_intensity for f in transforms.frames]).astype(np.float32),
-        center=transforms.center,
-        radius=transforms.radius,
-    )
-
-
 def focal_length(angle_x: float, w: int) -> float:
     """Focal length in pixels of a camera `w` pixels wide with horizontal field of view `angle_x` (radians)."""
     return float(0.5 * w / np.tan(0.5 * angle_x))
 
 
-def pixel_rays(c2w: np.ndarray, focal: float, w: int, h: int) -> tuple[np.ndarray, np.ndarray]:
+def pixel_rays(c2w: np.ndarray, focal, w: int, h: int, principal=None) -> tuple[np.ndarray, np.ndarray]:
     """Rays through the pixel centres: origins and unit directions, both (..., h, w, 3), world.
 
-    c2w (..., 4, 4) OpenGL camera-to-world; focal in pixels. Row 0 is the top row, column 0 the left one; the principal
-    point is the middle of the image and pixels are square. Source: the pinhole model of NeRF's `get_rays`.
+    c2w (..., 4, 4) OpenGL camera-to-world; focal in pixels, one number or (..., 2) for x and y; principal point
+    (..., 2) in pixels from the top left corner, the middle of the image unless given. Row 0 is the top row, column 0
+    the left one. Source: the pinhole model of NeRF's `get_rays`.
     """
+    focal = np.asarray(focal, dtype=np.float64)
+    focal = np.stack([focal, focal], -1) if focal.ndim == 0 else focal
+    principal = np.array([0.5 * w, 0.5 * h]) if principal is None else np.asarray(principal, dtype=np.float64)
     y, x = np.meshgrid(np.arange(h) + 0.5, np.arange(w) + 0.5, indexing="ij")
-    local = np.stack([(x - 0.5 * w) / focal, -(y - 0.5 * h) / focal, -np.ones_like(x)], -1)
-    directions = np.einsum("...ij,hwj->...hwi", c2w[..., :3, :3], local)
+    plane = (np.stack([x, y], -1) - principal[..., None, None, :]) / focal[..., None, None, :]
+    local = np.concatenate([plane * (1.0, -1.0), -np.ones_like(plane[..., :1])], -1)
+    directions = np.einsum("...ij,...hwj->...hwi", c2w[..., :3, :3], local)
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
     return np.broadcast_to(c2w[..., None, None, :3, 3], directions.shape), directions
 
@@ -244,3 +145,10 @@ def mitsuba_to_opengl(to_world: np.ndarray) -> np.ndarray:
     Flips the camera's X and Z axes, (..., 4, 4) -> (..., 4, 4); the flip is its own inverse, so it also leads back.
     """
     return np.asarray(to_world, dtype=np.float64) * np.array([-1.0, 1.0, -1.0, 1.0])
+
+
+def load_split(folder: Path, split: str) -> Split:
+    """One split of :func:`mi_ntf.data.readers.load_dataset`, which reads all of them: prefer that."""
+    from mi_ntf.data.readers import load_dataset
+
+    return load_dataset(folder, print if split == "train" else lambda _: None)[split]

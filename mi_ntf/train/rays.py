@@ -39,7 +39,7 @@ def from_split(split: Split, name: str) -> Rays:
     if away.max() > 0.02:
         raise MiNtfError(f"split '{name}', frame {away.argmax()}: the light is {away.max():.3g} object radii from the "
                          "camera; training needs photographs with a flash at the lens, as `mi-ntf capture` makes them")
-    origins, directions = pixel_rays(split.c2w, split.focal, width, height)
+    origins, directions = pixel_rays(split.c2w, split.focal, width, height, split.principal)
     origins = (origins - split.center) / split.radius
     intensity = np.broadcast_to((split.light_intensity / split.radius**2)[:, None, None], (n, height, width, 3))
     o, d, light = (torch.from_numpy(np.array(a, np.float32).reshape(-1, 3)) for a in
@@ -66,17 +66,18 @@ def visual_hull(split: Split, cells: int) -> torch.Tensor:
     inside = (x.norm(dim=1) < 1 + 2 / cells).nonzero()[:, 0]
     x = x[inside]
     height, width = split.images.shape[1:3]
-    for image, c2w in zip(split.images, split.c2w, strict=True):
+    for image, c2w, focal, principal in zip(split.images, split.c2w, split.focal, split.principal, strict=True):
+        (fx, fy), (cx, cy) = focal.tolist(), principal.tolist()
         rotation = torch.tensor(c2w[:3, :3], dtype=torch.float32)
         origin = torch.tensor((c2w[:3, 3] - split.center) / split.radius, dtype=torch.float32)
         local = (x - origin) @ rotation
         depth = (-local[:, 2]).clamp(min=1e-3)
         nearest = max(float(depth.min()), 2 / cells)
-        reach = math.ceil(math.sqrt(3) / cells * split.focal / nearest) + 1
+        reach = math.ceil(math.sqrt(3) / cells * max(fx, fy) / nearest) + 1
         alpha = torch.tensor(image[None, None, :, :, 3])
         alpha = F.max_pool2d(alpha, 2 * reach + 1, 1, reach)[0, 0]
-        u = (width / 2 + split.focal * local[:, 0] / depth).floor().long()
-        v = (height / 2 - split.focal * local[:, 1] / depth).floor().long()
+        u = (cx + fx * local[:, 0] / depth).floor().long()
+        v = (cy - fy * local[:, 1] / depth).floor().long()
         seen = (u >= 0) & (u < width) & (v >= 0) & (v < height) & (local[:, 2] < 0)
         empty = seen & (alpha[v.clamp(0, height - 1), u.clamp(0, width - 1)] < 1e-3)
         x, inside = x[~empty], inside[~empty]

@@ -9,6 +9,7 @@ import pytest
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.data import capture as cap
 from mi_ntf.data import schema
+from mi_ntf.data.readers import load_dataset
 
 SPHERE = """<scene version="3.9.0">
     <integrator type="path"/>
@@ -53,16 +54,16 @@ def sphere_set(tmp_path_factory):
 
 def test_similarity_leaves_out_the_emitter_and_keeps_the_margin(sphere_set):
     summary, out = sphere_set
-    split = schema.load_split(out, "train")
+    split = load_dataset(out)["train"]
     # a sphere is known by its bounding box alone, whose corners lie sqrt(3) r out; 1e-6: float32 bounds
     np.testing.assert_allclose(split.center, [2, -1, 0.5], atol=1e-6)
     assert split.radius == pytest.approx(0.7 * np.sqrt(3) * cap.MARGIN, rel=1e-6)
     assert summary["rendered"] == 3 + 4 + 1 and summary["kept"] == 0
-    assert [len(schema.read_transforms(out, s).frames) for s in schema.SPLITS] == [3, 4, 1]
+    assert [len(split.images) for split in load_dataset(out).values()] == [3, 4, 1]
 
 
 def test_collocated_radiance_of_a_diffuse_sphere_is_the_closed_form(sphere_set):
-    split = schema.load_split(sphere_set[1], "train")
+    split = load_dataset(sphere_set[1])["train"]
     for i in range(3):
         distance = np.linalg.norm(split.light_pos[i] - split.center) - 0.7
         expected = np.array([0.8, 0.4, 0.2]) / np.pi * split.light_intensity[i] / distance**2
@@ -72,7 +73,7 @@ def test_collocated_radiance_of_a_diffuse_sphere_is_the_closed_form(sphere_set):
 
 
 def test_white_surface_at_the_centre_has_radiance_one(sphere_set):
-    split = schema.load_split(sphere_set[1], "test")
+    split = load_dataset(sphere_set[1])["test"]
     distance = np.linalg.norm(split.light_pos[0] - split.center)
     np.testing.assert_allclose(split.light_intensity[0] / (np.pi * distance**2), 1.0, rtol=1e-6)  # float32
     np.testing.assert_allclose(split.light_pos[0], split.c2w[0, :3, 3], rtol=1e-6)
@@ -114,7 +115,7 @@ def test_meshes_lie_inside_the_unit_ball_and_inside_the_picture(tmp_path):
     reach = np.linalg.norm((points - summary["center"]) / summary["radius"], axis=1).max()
     assert reach == pytest.approx(1 / cap.MARGIN, rel=1e-6)
     assert summary["radius"] / cap.MARGIN < np.linalg.norm(np.ptp(points, axis=0)) / 2  # tighter than the box's ball
-    alpha = schema.load_split(tmp_path / "out", "train").images[..., 3]
+    alpha = load_dataset(tmp_path / "out")["train"].images[..., 3]
     assert alpha[:, 16, 16].any() and alpha.max() == 1
     assert not alpha[:, [0, -1]].any() and not alpha[:, :, [0, -1]].any()
 

@@ -1,0 +1,142 @@
+"""The sphere around the object: from masks, else from reconstructed points, else from the cameras alone.
+
+The similarity field = (world - center) / radius moves the object into the unit sphere.
+"""
+
+import numpy as np
+
+from mi_ntf.core.errors import MiNtfError
+from mi_ntf.data.poses import nearest_point
+
+MARGIN = 1.02   # room for a soft surface; the hull's cells leave some already
+COVERED = 0.1   # alpha from which a pixel shows the object: below it lie compression noise and the rim of one pixel
+
+
+def bounding_sphere(points: np.ndarray) -> tuple[np.ndarray, float]:
+    """Centre (3,) and radius of a sphere around `points` (P, 3), near the smallest, without margin.
+
+    Source: Badoiu and Clarkson 2003, "Smaller core-sets for balls": step by 1/(i+1) towards the farthest point.
+    """
+    points = np.asarray(points, dtype=np.float64)
+    center = 0.5 * (points.min(0) + points.max(0))
+    best, radius = center, float(np.linalg.norm(points - center, axis=1).max())
+    for i in range(1, 200):
+        distance = np.linalg.norm(points - center, axis=1)
+        if distance.max() < radius:
+            best, radius = center, float(distance.max())
+        center = center + (points[distance.argmax()] - center) / (i + 1)
+    return best, radius
+
+
+def find(alpha: np.ndarray, c2w: np.ndarray, focal: np.ndarray, principal: np.ndarray,
+         points: np.ndarray | None) -> tuple[np.ndarray, float, str]:
+    """``(center (3,), radius, how)`` of the object's sphere in world units.
+
+    alpha (N, H, W) · c2w (N, 4, 4) · focal, principal (N, 2) pixels · points (P, 3) or None. Raises MiNtfError.
+    """
+    if (alpha < COVERED).mean() > 0.01:
+        return *from_masks(alpha >= COVERED, c2w, focal, principal), "from the masks' visual hull"
+    size = np.array(alpha.shape[:0:-1])
+    if points is not None and len(points) >= 10:
+        sphere = from_points(points, size, c2w, focal, principal)
+        if sphere is not None:
+            return *sphere, "from the reconstructed points"
+    return *from_cameras(size, c2w, focal), "from the cameras alone, as the masks cover everything"
+
+
+def from_masks(covered: np.ndarray, c2w: np.ndarray, focal: np.ndarray, principal: np.ndarray):
+    """Sphere around the visual hull of masks (N, H, W) bool. The hull holds the object, and so does the sphere."""
+    center, reach = _first_guess(covered, c2w, focal, principal)
+    counts = np.zeros((len(covered), covered.shape[1] + 1, covered.shape[2] + 1), np.int32)
+    for count, mask in zip(counts, covered, strict=True):  # summed-area tables: any window's pixels in four look-ups
+        count[1:, 1:] = mask.astype(np.int32).cumsum(0).cumsum(1)
+    low, high = center - reach, center + reach
+    for cells in (32, 64):  # once to find the box, once inside it
+        edge = float((high - low).max()) / cells
+        shape = np.ceil((high - low) / edge - 1e-9).astype(int)
+        kept = _carve(low, edge, shape, counts, c2w, focal, principal)
+        low, high = kept.min(0) - edge, kept.max(0) + edge
+    center, radius = bounding_sphere(_shell(kept))
+    return center, MARGIN * (radius + 0.5 * np.sqrt(3) * edge)
+
+
+def _first_guess(covered: np.ndarray, c2w: np.ndarray, focal: np.ndarray, principal: np.ndarray):
+    """Centre of a cube that holds the object, and half its edge: where rays through the masks' middles meet."""
+    middles, slopes = [], []
+    for i, mask in enumerate(covered):
+        rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+        box = np.array([[columns[0], rows[0]], [columns[-1] + 1, rows[-1] + 1]])
+        plane = (box - principal[i]) / focal[i] * (1, -1)
+        slopes.append(0.5 * np.linalg.norm(plane[1] - plane[0]))
+        middle = c2w[i, :3, :3] @ (*plane.mean(0), -1.0)
+        middles.append(middle / np.linalg.norm(middle))
+    center = nearest_point(c2w[:, :3, 3], np.array(middles))
+    if center is None:
+        raise MiNtfError(f"all {len(c2w)} cameras look in one direction, so the object's place in space is not known; "
+                         "photograph it from more sides, or write 'unit_sphere' into transforms_train.json")
+    distance = np.linalg.norm(c2w[:, :3, 3] - center, axis=1)
+    return center, 1.5 * float(np.quantile(distance * slopes, 0.9))
+
+
+def _carve(low: np.ndarray, edge: float, shape: np.ndarray, counts: np.ndarray, c2w, focal, principal) -> np.ndarray:
+    """Centres (K, 3) of the cells that no photograph shows empty and that at least half of them show at all."""
+    axes = [low[k] + edge * (np.arange(shape[k]) + 0.5) for k in range(3)]
+    x = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    seen = np.zeros(len(x), np.int32)
+    height, width = counts.shape[1] - 1, counts.shape[2] - 1
+    for count, pose, f, c in zip(counts, c2w, focal, principal, strict=True):
+        local = (x - pose[:3, 3]) @ pose[:3, :3]
+        depth = -local[:, 2]
+        front = depth > edge
+        safe = np.where(front, depth, 1.0)
+        u = c[0] + f[0] * local[:, 0] / safe
+        v = c[1] - f[1] * local[:, 1] / safe
+        reach = np.sqrt(3) / 2 * edge * f.max() / np.maximum(safe - edge, edge)  # a cell's half diagonal, in pixels
+        inside = front & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+        u0, u1 = (np.clip(np.floor(u + s * reach) + (s > 0), 0, width).astype(int) for s in (-1, 1))
+        v0, v1 = (np.clip(np.floor(v + s * reach) + (s > 0), 0, height).astype(int) for s in (-1, 1))
+        pixels = count[v1, u1] - count[v0, u1] - count[v1, u0] + count[v0, u0]
+        kept = ~(inside & (pixels == 0))
+        x, seen = x[kept], (seen + inside)[kept]
+    x = x[2 * seen >= len(c2w)]
+    if not len(x):
+        raise MiNtfError("no point in space is covered by the object in all photographs, so poses and masks do not "
+                         "belong together; check that poses are camera-to-world with OpenGL axes, the field of view, "
+                         "and that no mask is inverted")
+    return x
+
+
+def _shell(x: np.ndarray) -> np.ndarray:
+    """The lowest and highest of the cell centres `x` (K, 3), in lexicographic order, in every column along z."""
+    new = np.flatnonzero((x[1:, :2] != x[:-1, :2]).any(1)) + 1
+    return x[np.unique(np.concatenate([[0], new, new - 1, [len(x) - 1]]))]
+
+
+def from_points(points: np.ndarray, size: np.ndarray, c2w: np.ndarray, focal: np.ndarray, principal: np.ndarray):
+    """Sphere around the points (P, 3) that most cameras see, or None where these are too few.
+
+    Robust: the middle is their median, the radius 1.1 times the 95th percentile of their distances, at most 0.9 of the
+    nearest camera's. `size` (width, height) pixels.
+    """
+    views = np.zeros(len(points), int)
+    for pose, f, c in zip(c2w, focal, principal, strict=True):
+        local = (points - pose[:3, 3]) @ pose[:3, :3]
+        depth = -local[:, 2]
+        pixel = c + f * local[:, :2] * (1, -1) / np.where(depth > 0, depth, 1.0)[:, None]
+        views += (depth > 0) & (pixel >= 0).all(1) & (pixel < size).all(1)
+    points = points[views >= 0.8 * len(c2w)]
+    if len(points) < 10:
+        return None
+    center = np.median(points, axis=0)
+    radius = 1.1 * float(np.quantile(np.linalg.norm(points - center, axis=1), 0.95))
+    return center, min(radius, 0.9 * float(np.linalg.norm(c2w[:, :3, 3] - center, axis=1).min()))
+
+
+def from_cameras(size: np.ndarray, c2w: np.ndarray, focal: np.ndarray):
+    """Sphere at the point nearest to all optical axes, the largest that fits into every field of view."""
+    center = nearest_point(c2w[:, :3, 3], c2w[:, :3, 2])
+    if center is None:
+        raise MiNtfError(f"all {len(c2w)} cameras look in one direction, so the object's place in space is not known; "
+                         "photograph it from more sides, or write 'unit_sphere' into transforms_train.json")
+    half = np.arctan(0.5 * size / focal).min(1)
+    return center, float((np.linalg.norm(c2w[:, :3, 3] - center, axis=1) * np.sin(half)).min())
