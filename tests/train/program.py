@@ -1,0 +1,53 @@
+"""A training run as a program of its own, which writes what tests compare: losses of every step and final tensors.
+
+    program.py DATASET OUT STEPS [DEATH]
+
+DEATH is `step N` (dies before that step) or `write N` (dies inside the N-th write of a checkpoint), by SIGKILL.
+"""
+
+import functools
+import json
+import os
+import signal
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from mi_ntf.train import checkpoint, evaluate, networks, parallel, train, trainer
+
+trainer.KEEP, trainer.INTERVAL = 4, 0.0
+
+
+def main(dataset: str, out: str, steps: str, death: str = "") -> None:
+    losses, writes = {}, []
+    advance, finish, replace = trainer._Run.advance, trainer._Run.finish, os.replace
+
+    def die_if(event: str) -> None:
+        if event == death:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    def recorded(run):
+        die_if(f"step {run.step}")
+        losses[run.step] = advance(run)
+        return losses[run.step]
+
+    def replaced(source, target):
+        writes.append(target)
+        die_if(f"write {len(writes)}")
+        replace(source, target)
+
+    def finished(run):
+        np.savez(f"{out}.npz", **networks.to_tensors(run.nets))
+        Path(f"{out}.json").write_text(json.dumps({"losses": losses, "history": run.history}))
+        return finish(run)
+
+    trainer._Run.advance, trainer._Run.finish, checkpoint.os.replace = recorded, finished, replaced
+    trainer._Run.carve = functools.partialmethod(trainer._Run.carve, steps=20)
+    evaluate.score = lambda *_: {"srgb": 0.0}  # seconds, and no matter here
+    report = train(Path(dataset), Path(out), steps=int(steps))
+    assert bool(report) == (parallel.first() and os.environ.get("RANK", "0") == "0")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,161 @@
+"""Faults rolled back, the best field kept, TensorBoard: on runs of a few steps whose losses are tampered with."""
+
+import functools
+import sys
+
+import pytest
+
+torch = pytest.importorskip("torch", reason="training needs PyTorch: pip install 'mi-ntf[train]'")
+
+from train import two_spheres  # noqa: E402
+
+from mi_ntf.core import field_file  # noqa: E402
+from mi_ntf.core.errors import MiNtfError  # noqa: E402
+from mi_ntf.train import evaluate, monitor, train, trainer  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory):
+    return two_spheres.write(tmp_path_factory.mktemp("spheres"), {"train": 8, "val": 1, "test": 1}, size=16)
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    monkeypatch.setattr(trainer, "KEEP", 4)
+    monkeypatch.setattr(trainer._Run, "carve", functools.partialmethod(trainer._Run.carve, steps=5))
+    monkeypatch.setattr(evaluate, "score", lambda *_: {"srgb": 0.0})  # seconds, and no matter here
+
+
+def tamper(monkeypatch, name, change):
+    """Have ``change(run, loss)`` replace the loss `name`, "field" or "ntf", before every descent."""
+    descend = trainer._Run._descend
+
+    def changed(self, which, loss, rate):
+        return descend(self, which, change(self, loss) if which == name else loss, rate)
+
+    monkeypatch.setattr(trainer._Run, "_descend", changed)
+
+
+@pytest.mark.parametrize(("name", "step"), [("field", 6), ("ntf", 10)])
+def test_a_nan_is_rolled_back_and_reported(photographs, tmp_path, monkeypatch, capsys, name, step):
+    def once(run, loss):
+        return loss * float("nan") if run.step == step and not run.faults else loss
+
+    tamper(monkeypatch, name, once)
+    out = tmp_path / "f"
+    report = train(photographs, out, steps=16)
+    back = step - step % 4
+    assert [f["step"] for f in report["faults"]] == [step]
+    assert report["faults"][0]["reason"].startswith(f"the {name} loss is nan")
+    assert f"back to step {back}, learning rates × 0.5" in capsys.readouterr().err
+    assert report["steps_done"] == 16
+    header, _ = field_file.load(out)  # refuses values that are not finite
+    assert header.provenance["faults"] == report["faults"]
+
+
+def test_rolling_back_restores_the_state_and_halves_the_rate(photographs, tmp_path):
+    run = trainer._Run(photographs, tmp_path / "f", trainer.PRESETS["fast"], "fast", minutes=None, steps=40, seed=3)
+    run.advance()
+    run.step = 1
+    run.keep()
+    before, drawn = run.state(), torch.rand(1, generator=run.generator)
+    run.generator.set_state(before["random"])
+    rates = []
+    for _ in range(2):
+        run.advance()
+        run.step += 1
+        rates.append(run.optimizers["field"].param_groups[0]["lr"])
+    random = run.generator.get_state()
+    run.roll_back(monitor.Fault("a test"))
+    after = run.state()
+    assert run.step == 1 and run.rate == 0.5
+    for name, value in before["tensors"].items():
+        assert torch.equal(value, after["tensors"][name]), name
+    for name in ("field", "ntf"):
+        for index, moments in before["optimizers"][name]["state"].items():
+            for key, value in moments.items():
+                assert torch.equal(value, after["optimizers"][name]["state"][index][key]), (name, index, key)
+    assert torch.equal(random, after["random"]), "the batch that failed does not come again"
+    assert not torch.equal(drawn, torch.rand(1, generator=run.generator))
+    run.advance()
+    assert run.optimizers["field"].param_groups[0]["lr"] == rates[0] / 2
+
+
+def test_four_faults_end_the_run_without_a_file(photographs, tmp_path, monkeypatch):
+    tamper(monkeypatch, "field", lambda run, loss: loss * (float("inf") if run.step == 5 else 1))
+    with pytest.raises(MiNtfError, match=r"diverged 4 times.*the field loss is inf.*nothing was written.*--seed"):
+        train(photographs, tmp_path / "f", steps=16)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_gradient_that_is_not_finite_changes_no_parameter(photographs, tmp_path, monkeypatch):
+    """A finite loss with an infinite slope: the square root at 0."""
+    run = trainer._Run(photographs, tmp_path / "f", trainer.PRESETS["fast"], "fast", minutes=None, steps=40, seed=3)
+    before = {k: v.detach().clone() for k, v in run.nets.tensors.items()}
+    tamper(monkeypatch, "field", lambda run, loss: loss + (loss - loss.detach()).sqrt())
+    with pytest.raises(monitor.Fault, match=r"the field loss is \d\.\d+ and its gradient's length (nan|inf) at step 0"):
+        run.advance()
+    assert all(torch.equal(v, before[k]) for k, v in run.nets.tensors.items())
+
+
+def test_watch_finds_a_loss_that_runs_away_and_forgives_outliers():
+    watch = monitor.Watch()
+    for step in range(100):
+        watch.check("field", 50.0 if step % 10 == 0 and step else 0.5, step)
+    watch.check("ntf", 1e-9, 100)
+    for step in range(200):  # far above its average, but small for a loss of colours or transmittances
+        watch.check("ntf", 0.01, step)
+    for step in range(9):
+        watch.check("field", 50.0, step)
+    with pytest.raises(monitor.Fault, match=r"field loss is 50 at step 9, over 20 times its running average 0\.5 "):
+        watch.check("field", 50.0, 9)
+    with pytest.raises(monitor.Fault, match="the ntf loss is inf at step 7"):
+        watch.check("ntf", float("inf"), 7)
+
+
+def test_the_best_field_is_the_one_that_is_written(photographs, tmp_path, monkeypatch):
+    """The field is spoilt after step 30 of 40, by a loss that is no error of photographs; the one before is kept."""
+    def spoil(run, loss):
+        return loss if run.step < 30 else run.nets.tensors["reflectance.layers.1.bias"].square().sum() * -1.0
+
+    tamper(monkeypatch, "field", spoil)
+    fields = {}
+    validate = trainer._Run.validate
+
+    def validated(run):
+        fields[run.step] = {k: v.detach().clone() for k, v in run.nets.tensors.items()}
+        return validate(run)
+
+    monkeypatch.setattr(trainer._Run, "validate", validated)
+    report = train(photographs, tmp_path / "f", steps=40)
+    best = max(report["history"], key=lambda entry: entry["psnr"])
+    assert report["kept"] == best and best["step"] <= 30 and report["history"][-1]["psnr"] < best["psnr"] - 0.02
+    _, written = field_file.load(tmp_path / "f")
+    for name, value in fields[best["step"]].items():
+        if name.split(".")[0] != "transmittance":  # that one has learnt from the field since
+            expected = value.half().float() if ".planes." in name else value
+            assert torch.equal(torch.tensor(written[name]), expected), name
+
+
+def test_tensorboard_gets_scalars_and_previews(photographs, tmp_path, monkeypatch):
+    pytest.importorskip("tensorboard", reason="pip install 'mi-ntf[train]'")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    report = train(photographs, tmp_path / "f", steps=60, log=tmp_path / "f.tb")
+    events = EventAccumulator(str(tmp_path / "f.tb"))
+    events.Reload()
+    names = {"loss/colour", "loss/alpha", "loss/transmittance", "learning rate/field", "learning rate/ntf",
+             "speed/rays per second", "speed/samples per second", "memory GiB", "validation/PSNR dB"}
+    assert names <= set(events.Tags()["scalars"])
+    assert [e.step for e in events.Scalars("learning rate/field")] == [20, 40, 60]
+    psnr = {e.step: e.value for e in events.Scalars("validation/PSNR dB")}
+    assert psnr == pytest.approx({e["step"]: e["psnr"] for e in report["history"]}, rel=1e-6)  # stored as float32
+    assert 1e2 < events.Scalars("speed/rays per second")[-1].value < 1e7
+    picture = events.Images(events.Tags()["images"][0])[-1]
+    assert (picture.width, picture.height) == (3 * 16, 16)
+
+
+def test_no_tensorboard_is_a_clear_error(photographs, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    with pytest.raises(MiNtfError, match=r"--log .*tb needs TensorBoard .*pip install 'mi-ntf\[train\]'"):
+        train(photographs, tmp_path / "f", steps=1, log=tmp_path / "tb")
