@@ -79,24 +79,30 @@ def _first_guess(covered: np.ndarray, c2w: np.ndarray, focal: np.ndarray, princi
 
 
 def _carve(low: np.ndarray, edge: float, shape: np.ndarray, counts: np.ndarray, c2w, focal, principal) -> np.ndarray:
-    """Centres (K, 3) of the cells that no photograph shows empty and that at least half of them show at all."""
+    """Centres (K, 3) of the cells that no photograph shows empty and that at least half of them show at all.
+
+    A mask that keeps clear of its image's border shows the whole object: outside of such an image all is empty.
+    """
     axes = [low[k] + edge * (np.arange(shape[k]) + 0.5) for k in range(3)]
     x = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     seen = np.zeros(len(x), np.int32)
     height, width = counts.shape[1] - 1, counts.shape[2] - 1
-    for count, pose, f, c in zip(counts, c2w, focal, principal, strict=True):
+    within = counts[:, -2, -2] - counts[:, 1, -2] - counts[:, -2, 1] + counts[:, 1, 1]
+    whole = within == counts[:, -1, -1]
+    for count, clear, pose, f, c in zip(counts, whole, c2w, focal, principal, strict=True):
         local = (x - pose[:3, 3]) @ pose[:3, :3]
         depth = -local[:, 2]
         front = depth > edge
         safe = np.where(front, depth, 1.0)
         u = c[0] + f[0] * local[:, 0] / safe
         v = c[1] - f[1] * local[:, 1] / safe
-        reach = np.sqrt(3) / 2 * edge * f.max() / np.maximum(safe - edge, edge)  # a cell's half diagonal, in pixels
+        slant = np.linalg.norm(local, axis=1) / safe  # lengths along the ray move the pixel too, off the axis
+        reach = slant * np.sqrt(3) / 2 * edge * f.max() / np.maximum(safe - edge, edge)  # half a cell's diagonal, pixels
         inside = front & (u >= 0) & (u < width) & (v >= 0) & (v < height)
         u0, u1 = (np.clip(np.floor(u + s * reach) + (s > 0), 0, width).astype(int) for s in (-1, 1))
         v0, v1 = (np.clip(np.floor(v + s * reach) + (s > 0), 0, height).astype(int) for s in (-1, 1))
-        pixels = count[v1, u1] - count[v0, u1] - count[v1, u0] + count[v0, u0]
-        kept = ~(inside & (pixels == 0))
+        pixels = np.where(front, count[v1, u1] - count[v0, u1] - count[v1, u0] + count[v0, u0], 0)
+        kept = pixels > 0 if clear else ~inside | (pixels > 0)
         x, seen = x[kept], (seen + inside)[kept]
     x = x[2 * seen >= len(c2w)]
     if not len(x):

@@ -21,17 +21,17 @@ def test_nearest_point_of_lines_is_their_common_point():
 
 
 def test_masks_that_are_off_centre_and_cut(tmp_path):
-    """The hull needs no camera that looks at the object: the scene moved, the principal points moved along."""
+    """The scene moved, a third of each picture cut off together with a part of the object in 15 of 16."""
     move = np.array([30.0, -7.0, 4.0])
     c2w = forms.C2W.copy()
     c2w[:, :3, 3] += move
-    there = bounds.find(ALPHA[:, :, 3:], c2w, FOCAL, MIDDLE - (3, 0), None)
+    there = bounds.find(ALPHA[:, :, 7:], c2w, FOCAL, MIDDLE - (7, 0), None)
     here = bounds.find(ALPHA, forms.C2W, FOCAL, MIDDLE, None)
     assert here[2] == there[2] == "from the masks' visual hull"
     for (center, radius, _), offset in ((here, 0), (there, move)):
         for c, r in forms.SPHERES:
             assert np.linalg.norm(c + offset - center) + r <= radius
-        assert radius < 1.3 * forms.true_bounds()[1]  # 24 pixels and 16 views leave that much
+        assert radius < 1.2 * forms.true_bounds()[1]  # 24 pixels and 16 views leave that much
 
 
 def test_points_without_masks():
