@@ -97,7 +97,7 @@ def _carve(low: np.ndarray, edge: float, shape: np.ndarray, counts: np.ndarray, 
         u = c[0] + f[0] * local[:, 0] / safe
         v = c[1] - f[1] * local[:, 1] / safe
         slant = np.linalg.norm(local, axis=1) / safe  # lengths along the ray move the pixel too, off the axis
-        reach = slant * np.sqrt(3) / 2 * edge * f.max() / np.maximum(safe - edge, edge)  # half a cell's diagonal, pixels
+        reach = slant * np.sqrt(3) / 2 * edge * f.max() / np.maximum(safe - edge, edge)  # half a cell's diagonal
         inside = front & (u >= 0) & (u < width) & (v >= 0) & (v < height)
         u0, u1 = (np.clip(np.floor(u + s * reach) + (s > 0), 0, width).astype(int) for s in (-1, 1))
         v0, v1 = (np.clip(np.floor(v + s * reach) + (s > 0), 0, height).astype(int) for s in (-1, 1))

@@ -15,6 +15,9 @@ import numpy as np
 from mi_ntf.core.errors import MiNtfError
 
 SUFFIXES = (".png", ".exr", ".jpg", ".jpeg")
+_LEVELS = np.arange(256) / 255.0
+LINEAR = np.where(_LEVELS <= 0.04045, _LEVELS / 12.92, ((_LEVELS + 0.055) / 1.055) ** 2.4).astype(np.float32)
+"""sRGB's 256 levels in linear light (IEC 61966-2-1)."""
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -92,9 +95,8 @@ def _read_srgb(path: Path):
         if image.mode not in ("L", "LA", "P", "RGB", "RGBA"):
             raise MiNtfError(f"{path}: image of mode '{image.mode}'; write it with 8 bits a channel, or as EXR")
         has_alpha = image.mode in ("LA", "RGBA") or "transparency" in image.info
-        stored = np.asarray(image.convert("RGBA"), dtype=np.float32) / 255.0
-    rgb, alpha = stored[..., :3], stored[..., 3]
-    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+        stored = np.asarray(image.convert("RGBA"))
+    linear, alpha = LINEAR[stored[..., :3]], stored[..., 3] / np.float32(255)
     return (linear * alpha[..., None], alpha) if has_alpha else (linear, None)
 
 

@@ -74,7 +74,7 @@ def _camera(data: dict, where: str) -> tuple[float, ...]:
 
 
 def _view(entry: dict, where: str, folder: Path, camera: tuple[float, ...], size) -> View:
-    if "file_path" not in entry:
+    if not isinstance(entry, dict) or "file_path" not in entry:
         raise MiNtfError(f"{where}: 'file_path' is missing; name the image relative to the folder")
     c2w = _numbers(entry, "transform_matrix", (4, 4), where)
     check_rigid(c2w, where, "'transform_matrix'")
