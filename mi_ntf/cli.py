@@ -72,13 +72,20 @@ class Train:
     """Stop after so many steps."""
     seed: int = 0
     """Seed of weights and samples."""
+    tensorboard: Path | None = None
+    """Folder for TensorBoard events: losses, validation, speed, preview pictures."""
+    json: bool = False
+    """Print the whole report as JSON in place of a summary."""
 
     def run(self) -> None:
         if self.minutes is not None and self.steps is not None:
             raise UsageError("give --minutes or --steps, not both")
         from mi_ntf.train import train
 
-        train(self.dataset, self.output, preset=self.preset, minutes=self.minutes, steps=self.steps, seed=self.seed)
+        report = train(self.dataset, self.output, preset=self.preset, minutes=self.minutes, steps=self.steps,
+                       seed=self.seed, tensorboard=self.tensorboard)
+        if report:  # under torchrun, only the first process has one
+            _report(report, self.json, _print_training)
 
 
 @dataclass
@@ -230,6 +237,12 @@ def _report(result: Any, as_json: bool, print_table: Any) -> None:
         print(json.dumps(result, indent=2, default=str))
     else:
         print_table(result)
+
+
+def _print_training(report: dict[str, Any]) -> None:
+    """How long a training run took and how good the field is, of the report in the field's provenance."""
+    wanted = ("steps_done", "seconds", "kept", "faults", "val", "test")
+    _print_pairs({key: report[key] for key in wanted if report.get(key)})
 
 
 def _print_pairs(values: dict[str, Any], indent: str = "") -> None:

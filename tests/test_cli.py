@@ -29,7 +29,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list:
 
     table = {"psnr": 30.5, "inner": {"a": 1}}
     stand_in("mi_ntf.data.capture", capture=note())
-    stand_in("mi_ntf.train", train=note())
+    stand_in("mi_ntf.train", train=note(table))
     stand_in("mi_ntf.render.swap", swap=note())
     stand_in("mi_ntf.evaluate.compare", compare=note(table), print_table=lambda values: print("table", values["psnr"]))
     stand_in("mi_ntf.render.explain", explain=note(table), print_table=lambda values: print("table", values["psnr"]))
@@ -48,7 +48,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list:
         (
             "train data -o f.safetensors --minutes 2.5",
             (Path("data"), Path("f.safetensors")),
-            {"preset": "fast", "minutes": 2.5, "steps": None, "seed": 0},
+            {"preset": "fast", "minutes": 2.5, "steps": None, "seed": 0, "tensorboard": None},
         ),
         ("swap s.xml f.safetensors -o out.xml", (Path("s.xml"), Path("f.safetensors"), Path("out.xml")), {}),
         ("compare a.exr b.exr", (Path("a.exr"), Path("b.exr")), {}),
@@ -61,7 +61,7 @@ def test_commands_pass_their_arguments_on(calls: list, line: str, args: tuple, k
     assert calls == [(args, kwargs)]
 
 
-@pytest.mark.parametrize("line", ["compare a b --json", "explain s.xml --json", "info f --json"])
+@pytest.mark.parametrize("line", ["compare a b --json", "train d -o f --json", "explain s.xml --json", "info f --json"])
 def test_json(calls: list, line: str, capsys: pytest.CaptureFixture[str]):
     assert cli.main(line.split()) == 0
     assert json.loads(capsys.readouterr().out) == {"psnr": 30.5, "inner": {"a": 1}}

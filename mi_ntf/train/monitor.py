@@ -86,7 +86,8 @@ class Log:
             try:
                 from torch.utils.tensorboard import SummaryWriter
             except ImportError as error:
-                raise MiNtfError(f"--log {folder} needs TensorBoard ({error}); pip install 'mi-ntf[train]'") from None
+                raise MiNtfError(f"--tensorboard {folder} needs the package tensorboard ({error}); "
+                                 "pip install 'mi-ntf[train]'") from None
             self.writer_class = SummaryWriter
 
     def start(self, step: int) -> None:
@@ -120,6 +121,11 @@ class Log:
     def close(self) -> None:
         if self.writer is not None:
             self.writer.close()
+
+
+def note(text: str) -> None:
+    """Tell the user `text`, on standard error as all that is said while a run lasts."""
+    print(text, file=sys.stderr)
 
 
 def memory() -> float:

@@ -6,11 +6,10 @@ from pathlib import Path
 import torch
 
 from ..core.architecture import MAX_LOG_DENSITY
-from ..data.schema import load_split
-from . import losses, networks, parallel, rays, render
+from ..data.readers import load_dataset
+from . import losses, monitor, networks, parallel, rays, render
 from .baked import Baked
 from .config import TrainConfig
-from .monitor import Fault, Watch
 from .occupancy import LOG_EMPTY, Occupancy
 
 REFRESH = 32
@@ -24,7 +23,7 @@ class Stepper:
 
     def __init__(self, dataset: Path, config: TrainConfig, minutes: float | None, steps: int | None, seed: int):
         self.config, self.minutes, self.steps = config, minutes, steps
-        self.splits = {name: load_split(dataset, name) for name in ("train", "val", "test")}
+        self.splits = load_dataset(dataset, monitor.note if parallel.first() else lambda _: None)
         self.rays = {name: rays.from_split(split, name) for name, split in self.splits.items()}
         self.generator = torch.Generator().manual_seed(seed)
         self.nets = parallel.share(networks.initial(config.architecture, config.log_density, self.generator))
@@ -40,7 +39,7 @@ class Stepper:
         self.samples_per_ray, self.last_bake = 30.0, 0
         self.rate = 1.0
         """Factor of the learning rates, halved by every fault."""
-        self.watch = Watch()
+        self.watch = monitor.Watch()
         self.terms: dict[str, torch.Tensor] = {}
         """The last step's weighted terms of the losses."""
         self.trained = [0, 0]
@@ -151,7 +150,7 @@ class Stepper:
         parallel.average_gradients(parameters)
         size = float(torch.nn.utils.get_total_norm([p.grad for p in parameters if p.grad is not None]))
         if not (math.isfinite(value) and math.isfinite(size)):
-            raise Fault(f"the {name} loss is {value} and its gradient's length {size} at step {self.step}")
+            raise monitor.Fault(f"the {name} loss is {value} and its gradient's length {size} at step {self.step}")
         for group in optimizer.param_groups:
             group["lr"] = group["base"] * rate * self.rate
         optimizer.step()

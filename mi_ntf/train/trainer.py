@@ -29,13 +29,13 @@ BETTER = 0.02
 
 
 def train(dataset: Path, out: Path, *, preset: str = "fast", minutes: float | None = None, steps: int | None = None,
-          seed: int = 0, log: Path | None = None) -> dict:
+          seed: int = 0, tensorboard: Path | None = None) -> dict:
     """Train a field on the photographs in `dataset` and write it to `out`. Returns the report (JSON types).
 
     The run lasts `minutes` (10 unless told) or `steps`; runs given in steps are reproducible, bit for bit on one
     machine. A checkpoint ``OUT.ckpt`` is written every minute, taken up by the same command, deleted at the end.
     Faults (see :class:`mi_ntf.train.monitor.Fault`) are rolled back, listed in the report, and end the run when they
-    keep coming. `log`: a folder for TensorBoard.
+    keep coming. `tensorboard`: a folder for its events.
 
     Under ``torchrun --nproc-per-node=N -m mi_ntf train DATASET -o FIELD …`` (or any launcher that sets RANK,
     WORLD_SIZE, MASTER_ADDR and MASTER_PORT) N processes share the work of every step and average their gradients; see
@@ -52,7 +52,7 @@ def train(dataset: Path, out: Path, *, preset: str = "fast", minutes: float | No
     with parallel.processes():
         torch.set_num_threads(_threads() if steps is None and parallel.count() == 1 else 1)
         run = _Run(Path(dataset), Path(out), PRESETS[preset], preset,
-                   minutes=None if steps is not None else float(limit), steps=steps, seed=seed, log=log)
+                   minutes=None if steps is not None else float(limit), steps=steps, seed=seed, tensorboard=tensorboard)
         run.resume()
         if not run.step:
             run.carve()
@@ -67,8 +67,9 @@ class _Run(Stepper):
     """Attributes that, with generator, networks, optimisers, grids and loss averages, decide how the run goes on."""
     GRIDS = (("occupancy", ("sigma", "level", "stray")), ("baked", ("sigma", "slope", "reach")))
 
-    def __init__(self, dataset: Path, out: Path, config: TrainConfig, preset: str, *, minutes, steps, seed, log=None):
-        self.log = Log(log if parallel.first() else None)
+    def __init__(self, dataset: Path, out: Path, config: TrainConfig, preset: str, *, minutes, steps, seed,
+                 tensorboard=None):
+        self.log = Log(tensorboard if parallel.first() else None)
         super().__init__(dataset, config, minutes, steps, seed)
         self.out, self.checkpoint = out, Path(f"{out}.ckpt")
         self.identity = json.dumps({"preset": preset, "minutes": minutes, "steps": steps, "seed": seed,
