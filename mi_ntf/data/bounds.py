@@ -89,7 +89,7 @@ def _carve(low: np.ndarray, edge: float, shape: np.ndarray, counts: np.ndarray, 
     height, width = counts.shape[1] - 1, counts.shape[2] - 1
     within = counts[:, -2, -2] - counts[:, 1, -2] - counts[:, -2, 1] + counts[:, 1, 1]
     whole = within == counts[:, -1, -1]
-    for count, clear, pose, f, c in zip(counts, whole, c2w, focal, principal, strict=True):
+    for i, (count, clear, pose, f, c) in enumerate(zip(counts, whole, c2w, focal, principal, strict=True)):
         local = (x - pose[:3, 3]) @ pose[:3, :3]
         depth = -local[:, 2]
         front = depth > edge
@@ -104,12 +104,19 @@ def _carve(low: np.ndarray, edge: float, shape: np.ndarray, counts: np.ndarray, 
         pixels = np.where(front, count[v1, u1] - count[v0, u1] - count[v1, u0] + count[v0, u0], 0)
         kept = pixels > 0 if clear else ~inside | (pixels > 0)
         x, seen = x[kept], (seen + inside)[kept]
+        if not len(x):
+            raise _nothing_left(i, len(c2w))
     x = x[2 * seen >= len(c2w)]
     if not len(x):
-        raise MiNtfError("no point in space is covered by the object in all photographs, so poses and masks do not "
-                         "belong together; check that poses are camera-to-world with OpenGL axes, the field of view, "
-                         "and that no mask is inverted")
+        raise _nothing_left(len(c2w) - 1, len(c2w))
     return x
+
+
+def _nothing_left(photograph: int, count: int) -> MiNtfError:
+    return MiNtfError(f"no point in space is covered by the object in all photographs (photograph {photograph} of 0 to "
+                      f"{count - 1} for training takes the last one away), so poses and masks do not belong together; "
+                      "check that poses are camera-to-world with OpenGL axes, the field of view, and that no mask is "
+                      "inverted (white: object)")
 
 
 def _shell(x: np.ndarray) -> np.ndarray:

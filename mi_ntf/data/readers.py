@@ -94,14 +94,14 @@ def split_off(views: dict[str, list[View]], say: Callable[[str], None]) -> dict[
 
 def _load(views: list[View]) -> np.ndarray:
     """The photographs of a split, (N, H, W, 4) float32, all of one size."""
-    images = None
+    images = np.empty((0, 0, 0, 4), np.float32)
     for i, view in enumerate(views):
         pixels = read_photograph(view.image, view.masks)
         size = pixels.shape[1], pixels.shape[0]
         if view.size is not None and size != view.size:
             raise MiNtfError(f"{view.image}: is {size[0]}x{size[1]}, {view.where} says {view.size[0]}x{view.size[1]}; "
                              "photograph and camera must belong together: scale one of them")
-        if images is None:
+        if i == 0:
             images = np.empty((len(views), *pixels.shape), np.float32)
         if pixels.shape != images.shape[1:]:
             raise MiNtfError(f"{view.image}: is {size[0]}x{size[1]}, {views[0].image} is {images.shape[2]}x"
@@ -130,8 +130,8 @@ def _cameras(views: list[View], images: np.ndarray):
             raise MiNtfError(f"{view.where}: its principal point is ({camera[2]:g}, {camera[3]:g}), outside the image "
                              f"of {width}x{height} pixels; scale the camera's intrinsics with the image")
         full.append(camera)
-    full = np.array(full, dtype=np.float64)
-    return np.stack([view.c2w for view in views]), full[:, :2], full[:, 2:]
+    intrinsics = np.array(full, dtype=np.float64)
+    return np.stack([view.c2w for view in views]), intrinsics[:, :2], intrinsics[:, 2:]
 
 
 def _light_positions(views: list[View]) -> np.ndarray:

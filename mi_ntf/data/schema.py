@@ -24,8 +24,8 @@ import numpy as np
 
 from mi_ntf.data.images import read_image, write_exr
 
-__all__ = ["SPLITS", "Found", "Frame", "Split", "Transforms", "View", "focal_length", "load_split",
-           "mitsuba_to_opengl", "pixel_rays", "read_image", "write_exr", "write_transforms"]
+__all__ = ["SPLITS", "Found", "Frame", "Split", "Transforms", "View", "focal_length", "mitsuba_to_opengl",
+           "pixel_rays", "read_image", "write_exr", "write_transforms"]
 
 SPLITS = ("train", "val", "test")
 
@@ -145,10 +145,3 @@ def mitsuba_to_opengl(to_world: np.ndarray) -> np.ndarray:
     Flips the camera's X and Z axes, (..., 4, 4) -> (..., 4, 4); the flip is its own inverse, so it also leads back.
     """
     return np.asarray(to_world, dtype=np.float64) * np.array([-1.0, 1.0, -1.0, 1.0])
-
-
-def load_split(folder: Path, split: str) -> Split:
-    """One split of :func:`mi_ntf.data.readers.load_dataset`, which reads all of them: prefer that."""
-    from mi_ntf.data.readers import load_dataset
-
-    return load_dataset(folder, print if split == "train" else lambda _: None)[split]
