@@ -5,6 +5,7 @@ import resource
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import torch
 from rich.console import Console
@@ -80,7 +81,8 @@ class Log:
     """TensorBoard events in `folder`; nothing happens where it is None."""
 
     def __init__(self, folder: Path | None):
-        self.folder, self.writer = folder, None
+        self.folder = folder
+        self.writer: Any = None
         self.last = (time.monotonic(), 0, 0)
         if folder is not None:
             try:

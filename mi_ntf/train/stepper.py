@@ -1,5 +1,6 @@
 """One step of training: a batch of photographs' rays, the losses, the optimisers."""
 
+import functools
 import math
 from pathlib import Path
 
@@ -22,7 +23,7 @@ class Stepper:
     """The photographs in `dataset`, the networks, and what a step needs of both. The run lasts `minutes` or `steps`."""
 
     def __init__(self, dataset: Path, config: TrainConfig, minutes: float | None, steps: int | None, seed: int):
-        self.config, self.minutes, self.steps = config, minutes, steps
+        self.config, self.minutes, self.steps = config, minutes or math.inf, steps or math.inf
         self.splits = load_dataset(dataset, monitor.note if parallel.first() else lambda _: None)
         self.rays = {name: rays.from_split(split, name) for name, split in self.splits.items()}
         self.generator = torch.Generator().manual_seed(seed)
@@ -53,7 +54,7 @@ class Stepper:
 
     def progress(self) -> float:
         """Share of the run that is done, in [0, 1]."""
-        return self.step / self.steps if self.steps else self.spent / (60 * self.minutes)
+        return max(self.step / self.steps, self.spent / (60 * self.minutes))
 
     def carve(self, steps: int = 300, points: int = 4096) -> None:
         """Give the density the shape of the visual hull, ln σ by regression: seconds that save minutes."""
@@ -132,10 +133,10 @@ class Stepper:
             # Of all terms these two are positive and of a known size.
             self.watch.check("field", float((self.terms["colour"] + self.terms["alpha"]).detach()), self.step)
             rate = c.lr_end ** (done / c.ntf_alone) * min(1.0, (self.step + 1) / 50)
-            total += self._descend("field", sum(self.terms.values()), rate)
+            total += self._descend("field", _sum(self.terms), rate)
         if done >= c.ntf_from:
             terms = self.ntf_loss(image, batch, alone)
-            loss = sum(terms.values())
+            loss = _sum(terms)
             self.watch.check("ntf", float(loss.detach()), self.step)
             total += self._descend("ntf", loss, c.lr_end ** ((done - c.ntf_from) / (1 - c.ntf_from)))
             self.terms |= terms
@@ -155,3 +156,8 @@ class Stepper:
             group["lr"] = group["base"] * rate * self.rate
         optimizer.step()
         return value
+
+
+def _sum(terms: dict[str, torch.Tensor]) -> torch.Tensor:
+    """The sum of `terms`, from the first to the last: its last bit is part of what makes a run reproducible."""
+    return functools.reduce(torch.add, terms.values())

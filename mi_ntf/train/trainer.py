@@ -128,7 +128,7 @@ class _Run(Stepper):
         if self.step % 20 == 0:
             self.log_scalars()
         self.spent += time.monotonic() - start
-        if self.minutes:
+        if self.minutes < math.inf:
             self.spent = parallel.agreed(self.spent)
         if self.step % KEEP == 0 or self.progress() >= 1:
             self.keep()
@@ -160,18 +160,18 @@ class _Run(Stepper):
 
     def choose(self) -> str:
         """The field is finished: go back to the best one in validation if that is not the last; says what was done."""
-        self.kept, best = self.history[-1], self.best
-        self.best = None
-        if best["psnr"] - self.last <= BETTER:
+        self.kept = self.history[-1]
+        best, self.best = self.best, None
+        if best is None or best["psnr"] - self.last <= BETTER:
             return f"step {self.step}: the field is finished; its transmittance from here on"
-        self.kept = best["entry"]
+        kept = self.kept = best["entry"]
         with torch.no_grad():
             for name, value in best["tensors"].items():
                 self.nets.tensors[name].copy_(value)
         for name, value in best["occupancy"].items():
             setattr(self.occupancy, name, value)
         self.bake()
-        return (f"step {self.step}: the field is finished; the one of step {self.kept['step']} is kept, since it is "
+        return (f"step {self.step}: the field is finished; the one of step {kept['step']} is kept, since it is "
                 f"better by {best['psnr'] - self.last:.2f} dB in validation")
 
     # --- state ----------------------------------------------------------------------------------------------------

@@ -62,8 +62,9 @@ def test_a_run_killed_twice_ends_where_an_undisturbed_one_ends(photographs, undi
 def test_two_processes_are_one(photographs, undisturbed, tmp_path):
     """torchrun with two processes: the losses of one process with the same seed.
 
-    Only the order of sums differs, which is float32 rounding: 1e-7 of a loss was measured in these steps. Where a
-    gradient is nothing but rounding, Adam makes a step of its sign, so the tolerance leaves room for some growth.
+    Only the order of sums differs, which is float32 rounding: 1e-7 of a loss was measured in these steps, 6e-7 in 120.
+    Where a gradient is nothing but rounding, Adam makes a whole step of its sign: single texels that no loss depends
+    on may differ by a learning rate, so tensors are compared in the mean square. The tolerances leave room for growth.
     """
     out = tmp_path / "f"
     launcher = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2")
@@ -72,6 +73,6 @@ def test_two_processes_are_one(photographs, undisturbed, tmp_path):
     (expected, tensors), (found, values) = undisturbed, result(out)
     relative = {k: abs(found["losses"][k] / v - 1) for k, v in expected["losses"].items()}
     assert len(relative) == STEPS and max(relative.values()) < 1e-5, relative
-    for name, value in tensors.items():  # 3e-5 was measured, of features and weights of order 1
-        np.testing.assert_allclose(values[name], value, atol=1e-3, err_msg=name)
+    for name, value in tensors.items():  # of order 1
+        assert np.sqrt(np.mean((values[name] - value) ** 2)) < 1e-4, name
     assert {p.name for p in tmp_path.iterdir()} == {"f", "f.npz", "f.json"}
