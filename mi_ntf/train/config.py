@@ -33,7 +33,10 @@ class TrainConfig:
     """Weight of an even density along surfaces."""
     sharp: float = 1e-3
     """Weight of thin skins: −ln σ where pictures see matter."""
-    smooth: float = 2e-4
+    gloss: float = 0.01
+    """Weight of the specular share: a rough lobe can stand in for the diffuse one in flash photographs, and then sends
+    half as much again into all other directions."""
+    smooth: float = 1e-3
     """Weight of total variation of the planes."""
     ntf_from: float = 0.4
     """Transmittance training starts here, the field has formed."""

@@ -37,6 +37,7 @@ class Image:
     index: torch.Tensor
     weight: torch.Tensor
     normal: torch.Tensor
+    specular: torch.Tensor
     radiance: torch.Tensor
     raw: torch.Tensor
 
@@ -61,12 +62,12 @@ def scatter_sum(value: torch.Tensor, ray: torch.Tensor, count: int) -> torch.Ten
 
 
 def shade(networks: Networks, x: torch.Tensor, d: torch.Tensor, t: torch.Tensor, light: torch.Tensor):
-    """``(radiance, normal)``: what the points `x` scatter back along −d per unit of light weight v."""
+    """``(radiance, normal, specular)``: what the points `x` scatter back along −d per unit of light weight v."""
     normal, albedo, roughness, specular = networks.reflectance(x)
     cos = -(normal * d).sum(1)
     diffuse, glossy = microfacet.lobes_collocated(ops, cos, roughness)
     lobe = (1 - specular)[:, None] * albedo * diffuse[:, None] + (specular * glossy)[:, None]
-    return SURFACE * lobe * light / (t * t)[:, None], normal
+    return SURFACE * lobe * light / (t * t)[:, None], normal, specular
 
 
 def render(networks: Networks, rays: Rays, samples, step: float) -> Image:
@@ -78,6 +79,6 @@ def render(networks: Networks, rays: Rays, samples, step: float) -> Image:
     alpha = scatter_sum(w, ray, len(rays))
     near = (w.detach() > MIN_WEIGHT).nonzero()[:, 0]
     ray, t, x = ray[near], t[near], x[near]
-    radiance, normal = shade(networks, x, rays.d[ray], t, rays.light[ray])
+    radiance, normal, specular = shade(networks, x, rays.d[ray], t, rays.light[ray])
     color = scatter_sum(v[near, None] * radiance, ray, len(rays))
-    return Image(color, alpha, x, ray, near, w[near], normal, radiance, raw)
+    return Image(color, alpha, x, ray, near, w[near], normal, specular, radiance, raw)
