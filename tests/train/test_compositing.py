@@ -149,7 +149,7 @@ def test_evenness_sees_slopes_along_the_surface_alone():
     def image(normal):
         n = 500
         return render.Image(color=None, alpha=None, x=torch.zeros(n, 3), shaded=None, index=None, weight=torch.ones(n),
-                            normal=torch.tensor(normal).expand(n, 3), radiance=None, raw=None)
+                            specular=None, normal=torch.tensor(normal).expand(n, 3), radiance=None, raw=None)
 
     generator = torch.Generator().manual_seed(0)
     # float32 rounding of offsets of 0.02
