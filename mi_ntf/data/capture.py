@@ -1,8 +1,9 @@
-"""A virtual camera with a flash: photographs any ordinary Mitsuba scene of surfaces into a data set (`schema`).
+"""A virtual camera with a flash: photographs any ordinary Mitsuba scene, surfaces or media, into a data set (`schema`).
 
 Every view has a point light exactly at the camera (collocated capture, method of Bi et al. 2020), so that the light's
-transmittance is the view's. The scene's own sensors and emitters are left out; its shapes, materials and, where it is
-a surface path tracer, its integrator are kept. The one file of `data` that uses Mitsuba.
+transmittance is the view's: a medium of density σ dims it twice, L = ∫ σ_s f T² I/t² dt. Alpha is the opacity: the
+share of paths that meet matter. The scene's own sensors and emitters are left out; its shapes, media, materials and,
+where it suits them, its integrator are kept. The one file of `data` that uses Mitsuba.
 """
 
 import hashlib
@@ -20,7 +21,8 @@ from mi_ntf.data.bounds import bounding_sphere
 
 DISTANCE = 3.2  # camera to object's centre, in radii of the bounding sphere
 MARGIN = 1.04   # bounding sphere over the object's extent: room for a soft surface in the field
-SURFACE_INTEGRATORS = ("PathIntegrator", "DirectIntegrator")
+SURFACE_INTEGRATORS = {"PathIntegrator", "DirectIntegrator"}
+VOLUME_INTEGRATORS = {"VolumetricPathIntegrator", "VolpathMisIntegratorImpl"}  # class names of volpath and volpathmis
 
 
 def view_directions(count: int, rng: np.random.Generator) -> np.ndarray:
@@ -43,7 +45,8 @@ def camera_to_world(position: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def _load(path: Path):
-    """The scene's shapes that emit no light, and its integrator (or None where it is no surface path tracer)."""
+    """The scene's shapes that emit no light, and an integrator that sees them: its own where it is a path tracer, for
+    media a volumetric one, else `path` or `volpath` of depth 6."""
     import mitsuba as mi
 
     if mi.variant() is None:
@@ -60,15 +63,21 @@ def _load(path: Path):
     if not shapes:
         raise MiNtfError(f"{path}: no shapes that reflect light ({len(scene.shapes())} emitters); "
                          "add the object to photograph")
-    media = [shape.id() for shape in shapes if shape.interior_medium() or shape.exterior_medium()]
-    if media:
-        raise MiNtfError(f"{path}: shape '{media[0]}' holds a medium; only surfaces are photographed, remove it")
+    around = [shape.id() for shape in shapes if shape.exterior_medium()]
+    if around:
+        raise MiNtfError(f"{path}: shape '{around[0]}' has an exterior medium, in which the cameras would stand; give "
+                         "the medium to a bounding shape as its interior")
+    media = any(shape.interior_medium() for shape in shapes)
     integrator = scene.integrator()
-    return shapes, integrator if type(integrator).__name__ in SURFACE_INTEGRATORS else None
+    if integrator is None or integrator.class_name() not in VOLUME_INTEGRATORS | (set() if media else
+                                                                                   SURFACE_INTEGRATORS):
+        integrator = mi.load_dict({"type": "volpath" if media else "path", "max_depth": 6, "hide_emitters": True})
+    return shapes, integrator
 
 
 def _outline(shapes: list) -> np.ndarray:
-    """Points (P, 3) whose hull holds every shape: the vertices of meshes, the box corners of everything else."""
+    """Points (P, 3) whose hull holds every shape: the vertices of meshes, points all over spheres (within 0.5 %), the
+    box corners of everything else. Media count by the shapes that bound them."""
     import mitsuba as mi
 
     points = []
@@ -76,6 +85,10 @@ def _outline(shapes: list) -> np.ndarray:
         params = mi.traverse(shape)
         if "vertex_positions" in params:  # a rectangle calls itself a mesh and has none
             points.append(np.array(params["vertex_positions"]).reshape(-1, 3))
+        elif shape.shape_type() == int(mi.ShapeType.Sphere):
+            to_world = np.array(params["to_world"].matrix).reshape(4, 4)
+            lattice = view_directions(1000, np.random.default_rng(0))
+            points.append(lattice @ to_world[:3, :3].T + to_world[:3, 3])
         else:
             points.append(np.array([np.array(shape.bbox().corner(i)).ravel() for i in range(8)]))
     return np.concatenate(points).astype(np.float64)
@@ -101,7 +114,7 @@ def _studio(shapes: list, integrator, angle: float, size: int):
     contents = {f"shape_{i:04d}": shape for i, shape in enumerate(shapes)}
     return mi.load_dict({
         "type": "scene",
-        "integrator": integrator or {"type": "path", "max_depth": 6, "hide_emitters": True},
+        "integrator": integrator,
         "sensor": {"type": "perspective", "fov": float(np.degrees(angle)), "near_clip": 1e-4, "far_clip": 1e6,
                    "film": film, "sampler": {"type": "independent"}},
         "light": {"type": "point", "position": [0, 0, 0], "intensity": {"type": "rgb", "value": [1.0, 1.0, 1.0]}},
@@ -138,7 +151,7 @@ def _plan(counts: dict[str, int], center: np.ndarray, radius: float, seed: int) 
 
 def capture(scene: Path, out: Path, *, views: int = 100, size: int = 128, test_views: int = 20, spp: int = 64,
             seed: int = 0) -> dict:
-    """Photograph `scene` (Mitsuba XML of surfaces) into the data set `out`; resumes what an earlier run began.
+    """Photograph `scene` (Mitsuba XML: surfaces, media) into the data set `out`; resumes what an earlier run began.
 
     `views` train, max(4, views // 20) val and `test_views` test photographs of size x size pixels, `spp` paths a pixel.
     Returns center, radius, the number of images rendered and kept, and the seconds taken. Raises MiNtfError for a scene
