@@ -8,12 +8,16 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
+from scipy.ndimage import map_coordinates
 
 from mi_ntf.data import capture as cap
+from mi_ntf.data import schema
+from mi_ntf.data.readers import load_dataset
 from mi_ntf.data.schema import read_image
 
 SCENES = Path(__file__).parents[2] / "scenes"
-NAMES = ("statue", "globe", "knot")
+MESHES, NAMES = ("statue", "globe", "knot"), ("statue", "globe", "knot", "cloud")
+CLOUD = SCENES / "cloud"
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -26,6 +30,14 @@ def sphere_of(path: Path) -> tuple[np.ndarray, float]:
     shape = ET.parse(path).getroot().find("shape")
     center = shape.find("point[@name='center']")
     return np.array([float(center.get(k)) for k in "xyz"]), float(shape.find("float[@name='radius']").get("value"))
+
+
+def script(path: Path):
+    """One of the scenes' scripts as a module."""
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -59,7 +71,7 @@ def test_point_light_stands_outside_the_field(name):
 
 
 def test_materials_stay_inside_the_fields_model():
-    for name in NAMES:
+    for name in MESHES:
         text = (SCENES / name / "mesh.xml").read_text()
         assert set(re.findall(r'bsdf type="(\w+)"', text)) <= {"diffuse", "blendbsdf", "roughconductor"}
         for value in re.findall(r'name="reflectance" value="([^"]+)"', text):
@@ -67,10 +79,62 @@ def test_materials_stay_inside_the_fields_model():
         assert sum(p.stat().st_size for p in (SCENES / name / "meshes").glob("*.ply")) < 2e6
 
 
+@pytest.fixture(scope="module")
+def volumes():
+    """Density (z, y, x) and albedo (z, y, x, 3) of the cloud, as stored."""
+    return [np.array(mi.VolumeGrid(str(CLOUD / "volumes" / f"{name}.vol"))).squeeze() for name in ("density", "albedo")]
+
+
+def test_cloud_is_the_script_s_and_lets_light_through(volumes):
+    module = script(CLOUD / "make_cloud.py")
+    for stored, made in zip(volumes, (module.density(), module.albedo()), strict=True):
+        np.testing.assert_allclose(stored, made, rtol=1e-6, atol=1e-6)  # stored as float32
+    density, albedo = volumes
+    depth = density.sum(0) * 2 * module.RADIUS / module.CELLS
+    assert 3 < depth.max() < 6
+    thin = depth[depth > 0.05]
+    assert ((thin > 0.2) & (thin < 2)).mean() > 0.3  # much of what is seen is neither clear nor opaque
+    assert 0.1 <= albedo.min() and albedo.max() <= 0.95
+    assert sum(p.stat().st_size for p in (CLOUD / "volumes").iterdir()) < 1.5e6
+    text = (CLOUD / "mesh.xml").read_text()
+    assert re.findall(r'(?:bsdf|phase|medium) type="(\w+)"', text) == ["null", "heterogeneous", "isotropic"]
+    assert density[np.linalg.norm(module.centres(module.CELLS), axis=-1) > 0.97].max() == 0
+
+
+def march(volumes, o: np.ndarray, d: np.ndarray, intensity: np.ndarray, steps: int = 128) -> np.ndarray:
+    """RGBA (..., 4) that a flash at `o` (..., 3) with radiant `intensity` (3,) shows in the cloud along `d`."""
+    center, radius = np.array([0.4, 0.6, -0.3]), 0.9
+    middle = ((center - o) * d).sum(-1, keepdims=True)
+    t = middle + np.linspace(-1, 1, 2 * steps + 1)[1::2] * radius
+    unit = (o[..., None, :] + t[..., None] * d[..., None, :] - center) / radius
+
+    def look_up(grid):
+        return map_coordinates(grid, [(unit[..., k] + 1) / 2 * len(grid) - 0.5 for k in (2, 1, 0)], order=1,
+                               mode="nearest")
+
+    depth = np.where((unit**2).sum(-1) < 1, look_up(volumes[0]), 0) * 2 * radius / steps
+    front = depth.cumsum(-1) - depth
+    light = np.exp(-2 * front) * (1 - np.exp(-2 * depth)) / 2 / t**2 / (4 * np.pi)
+    radiance = [intensity[c] * (light * look_up(volumes[1][..., c])).sum(-1) for c in range(3)]
+    return np.stack([*radiance, 1 - np.exp(-depth.sum(-1))], -1)
+
+
+def test_photograph_of_the_cloud_is_the_march_through_its_volumes(volumes, tmp_path):
+    size = 24
+    cap.capture(CLOUD / "mesh.xml", tmp_path, views=1, test_views=1, size=size, spp=64)
+    split = load_dataset(tmp_path)["val"]
+    for i, image in enumerate(split.images):
+        # 2 x 2 rays a pixel stand for its area
+        rays = schema.pixel_rays(split.c2w[i], 2 * split.focal[i], 2 * size, 2 * size, 2 * split.principal[i])
+        expected = march(volumes, *rays, split.light_intensity[i]).reshape(size, 2, size, 2, 4).mean((1, 3))
+        blocks = [v.reshape(6, 4, 6, 4, 4).mean((1, 3)) for v in (image, expected)]
+        # A block is 16 pixels of 64 paths, each with a deviation of about the mean: 3 % of the brightest block at most.
+        assert (np.abs(blocks[0] - blocks[1]) < 0.12 * blocks[1].max((0, 1))).all()
+        np.testing.assert_allclose(image.mean((0, 1)), expected.mean((0, 1)), rtol=0.05)  # 13 000 paths in it: 1 %
+
+
 def test_environment_is_the_script_s_and_its_sun_stands_where_it_says():
-    spec = importlib.util.spec_from_file_location("make_env", SCENES / "common" / "make_env.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    module = script(SCENES / "common" / "make_env.py")
     stored = read_image(SCENES / "common" / "env.exr")[..., :3]
     np.testing.assert_allclose(stored, module.environment(), rtol=1e-6)  # last digit of exp differs by machine
     emitter = mi.load_dict({"type": "envmap", "filename": str(SCENES / "common" / "env.exr")})
