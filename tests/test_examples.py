@@ -27,7 +27,7 @@ def _run(script, *words):
 def _blob() -> tuple[Header, dict[str, np.ndarray]]:
     """A soft ball: every plane holds a Gaussian, whose product over the three planes is a Gaussian of |x|."""
     planes, small = Encoding("planes", (32,), 1), Encoding("frequency", octaves=0)
-    arch = Architecture(Network(planes, (2,)), Network(small, (2,)), Network(small, (2,), points=2))
+    arch = Architecture(Network(planes, (2,)), Network(small, (2,)), Network(small, (2,)))
     tensors = {k: np.zeros(s, np.float32) for k, s in arch.skeleton().items()}
     c = 2 * (np.arange(32) + 0.5) / 32 - 1
     tensors["density.planes.0"][:] = np.exp(-2 * (c[:, None] ** 2 + c[None, :] ** 2))[None, ..., None]  # e^(−4 r²)

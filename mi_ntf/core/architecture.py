@@ -4,48 +4,59 @@ A field has three networks, each an encoding followed by a ReLU multilayer perce
 
     density        x → 1        raw; σ = exp(raw), see :data:`MAX_LOG_DENSITY`; 1/(unit-sphere radius)
     reflectance    x → 8        raw normal (3), albedo (3), roughness (1), specular weight (1)
-    transmittance  ray → 2      raw (a, b) of :func:`mi_ntf.core.logistic.parameters`
+    transmittance  ray → 3K−1   raw (a, b) of K logistics, then K−1 weights; :mod:`mi_ntf.core.mixture`
 
-The third sees the ray (p1, p2) as the encodings of `points` equidistant points on its chord, from p1 to p2, followed by
-the six coordinates of p1 and p2.
+The third sees a ray as its optical depths (encoding `depth`, :mod:`mi_ntf.core.depth_profile`) or, as in the paper, as
+its end points p1 and p2 (encoding `frequency` of the six coordinates).
 """
 
 import math
 from dataclasses import asdict, dataclass, field
 from itertools import pairwise
 
+from .depth_profile import FEATURES
 from .errors import MiNtfError
 
-FORMAT = 1
+FORMAT = 2
 MAX_LOG_DENSITY = 6.5
 """ln σ is clipped from above: σ ≤ 665 per unit-sphere radius, a skin of 0.0015 radii."""
 MIN_LOG_DENSITY = -12.0
-WIDTHS = {"density": 1, "reflectance": 8, "transmittance": 2}
+MEAN_FLOOR = -6.0
+"""Where ln σ is averaged over space, lower values count as this: they are empty all the same, and must not thin out a
+skin beside them."""
+NAMES = ("density", "reflectance", "transmittance")
 
 
 @dataclass(frozen=True)
 class Encoding:
     """`planes`: per resolution three feature planes (x,y), (x,z), (y,z) of `channels` features, multiplied elementwise.
-    `frequency`: x, sin(2^k π x), cos(2^k π x) for k < octaves."""
+    `frequency`: x, sin(2^k π x), cos(2^k π x) for k < octaves. `depth`: of rays, ``depth_profile.features``."""
 
     kind: str
     resolutions: tuple[int, ...] = ()
     channels: int = 0
     octaves: int = 0
 
-    @property
-    def width(self) -> int:
-        return len(self.resolutions) * self.channels if self.kind == "planes" else 3 + 6 * self.octaves
+    def width(self, coordinates: int = 3) -> int:
+        """Features of `coordinates` numbers."""
+        if self.kind == "depth":
+            return FEATURES
+        planes = len(self.resolutions) * self.channels
+        return planes if self.kind == "planes" else coordinates * (1 + 2 * self.octaves)
 
 
 @dataclass(frozen=True)
 class Network:
     encoding: Encoding
     hidden: tuple[int, ...]
-    points: int = 1
+    components: int = 1
+    """Logistics of a ray; 1 for the other networks."""
 
     def inputs(self, name: str) -> int:
-        return self.points * self.encoding.width + (6 if name == "transmittance" else 0)
+        return self.encoding.width(6 if name == "transmittance" else 3)
+
+    def outputs(self, name: str) -> int:
+        return {"density": 1, "reflectance": 8, "transmittance": 3 * self.components - 1}[name]
 
 
 @dataclass(frozen=True)
@@ -55,7 +66,7 @@ class Architecture:
     transmittance: Network
 
     def networks(self) -> dict[str, Network]:
-        return {name: getattr(self, name) for name in WIDTHS}
+        return {name: getattr(self, name) for name in NAMES}
 
     def skeleton(self) -> dict[str, tuple[int, ...]]:
         """Name → shape of every tensor of the file. Layers are (outputs, inputs), planes (3, v, u, channels)."""
@@ -64,7 +75,7 @@ class Architecture:
             if net.encoding.kind == "planes":
                 for i, r in enumerate(net.encoding.resolutions):
                     shapes[f"{name}.planes.{i}"] = (3, r, r, net.encoding.channels)
-            sizes = [net.inputs(name), *net.hidden, WIDTHS[name]]
+            sizes = [net.inputs(name), *net.hidden, net.outputs(name)]
             for i, (n_in, n_out) in enumerate(pairwise(sizes)):
                 shapes[f"{name}.layers.{i}.weight"] = (n_out, n_in)
                 shapes[f"{name}.layers.{i}.bias"] = (n_out,)
@@ -98,7 +109,7 @@ def header_from_json(data: dict, source: str) -> Header:
         raise MiNtfError(
             f"{source}: field format {version!r}, this build reads {FORMAT}; train or export the field anew")
     try:
-        nets = {name: _network(data["architecture"][name]) for name in WIDTHS}
+        nets = {name: _network(data["architecture"][name], name) for name in NAMES}
         center = [float(c) for c in data["similarity"]["center"]]
         if len(center) != 3:
             raise ValueError(f"similarity center {center}, expected 3 numbers")
@@ -111,13 +122,14 @@ def header_from_json(data: dict, source: str) -> Header:
                          "was it written by `mi-ntf train`?") from None
 
 
-def _network(data: dict) -> Network:
+def _network(data: dict, name: str) -> Network:
     e = data["encoding"]
     encoding = Encoding(e["kind"], tuple(e["resolutions"]), e["channels"], e["octaves"])
-    if encoding.kind not in ("planes", "frequency"):
-        raise ValueError(f"encoding kind {encoding.kind!r}, expected 'planes' or 'frequency'")
-    network = Network(encoding, tuple(data["hidden"]), data["points"])
-    sizes = (*encoding.resolutions, *network.hidden, network.points)
+    legal = ("frequency", "depth") if name == "transmittance" else ("planes", "frequency")
+    if encoding.kind not in legal:
+        raise ValueError(f"encoding kind {encoding.kind!r} of {name}, expected one of {', '.join(legal)}")
+    network = Network(encoding, tuple(data["hidden"]), data["components"])
+    sizes = (*encoding.resolutions, *network.hidden, network.components)
     if not all(isinstance(n, int) and n > 0 for n in sizes) or any(r < 2 for r in encoding.resolutions):
         raise ValueError(f"sizes {sizes}, expected positive integers and resolutions of at least 2")
     return network
@@ -126,6 +138,6 @@ def _network(data: dict) -> Network:
 FAST = Architecture(
     density=Network(Encoding("planes", (64, 128), 8), (32,)),
     reflectance=Network(Encoding("planes", (48, 128), 10), (64,)),
-    transmittance=Network(Encoding("planes", (64,), 8), (64, 64), points=16),
+    transmittance=Network(Encoding("depth"), (32, 32), components=2),
 )
 """Trains in minutes on two CPU cores: 12 bilinear fetches per sample and small perceptrons."""

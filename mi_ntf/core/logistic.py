@@ -10,6 +10,7 @@ light is gone. All forms have finite values and gradients in float32 for every f
 MAX_LOG_SLOPE = 6.5
 """ln of the largest slope, a ≤ 665: a step of width 0.007 of the unit sphere's radius. Learned skins are no sharper,
 and above it float32 products a·(t − b) lose the fourth digit of τ."""
+MAX_SLOPE = 665.0
 MAX_CENTRE = 1.2
 """|b| stays below this many half chords. Beyond 1, so that an empty central chord can reach τ = 1 at its far end."""
 _CLIP = 80.0  # e^80 is finite in float32; S differs from 0 or 1 by less than any float32 can tell.
@@ -92,4 +93,4 @@ def through_quantiles(ops, t75, t50, t25):
     camera's own weights then lies 0.35 of the quartiles' asymmetry closer to the light.
     """
     slope = 2.1972245773362196 / ops.maximum(t75 - t25, 1e-6)
-    return ops.minimum(slope, 665.0), t50 + 0.35 * ((t75 - t50) - (t50 - t25))
+    return ops.minimum(slope, MAX_SLOPE), t50 + 0.35 * ((t75 - t50) - (t50 - t25))

@@ -8,7 +8,7 @@ by ReLU.
 
 import numpy as np
 
-from . import logistic, ops, spheres
+from . import depth_profile, logistic, mixture, ops, spheres
 from .architecture import MAX_LOG_DENSITY, MIN_LOG_DENSITY, Architecture, Encoding
 from .microfacet import MIN_ROUGHNESS
 
@@ -65,13 +65,20 @@ def reflectance(arch: Architecture, tensors: dict, x: np.ndarray) -> np.ndarray:
     return np.concatenate([normal, rest], axis=1)
 
 
-def transmittance_parameters(arch: Architecture, tensors: dict, o: np.ndarray, d: np.ndarray):
-    """``(hit, a, b)``, each (n,), of the rays through `o` (n, 3) along the unit directions `d` towards the light."""
+def ray_mixture(arch: Architecture, tensors: dict, o: np.ndarray, d: np.ndarray, places=None, total=None):
+    """``(hit, mixture)`` of the rays through `o` (n, 3) along the unit directions `d` towards the light.
+
+    `places` (levels, n), `total` (n,): what the encoding `depth` reads, see :func:`depth_profile.frame`. `mixture`:
+    tuple of ``(w, a, b)``, each (n,).
+    """
     net = arch.transmittance
     hit, m, h = spheres.chord(ops, tuple(o.T), tuple(d.T))
-    p1, p2 = (np.stack(p, axis=1) for p in spheres.end_points(m, tuple(d.T), h))
-    share = (np.arange(net.points) + 0.5) / net.points
-    features = [encode(net.encoding, tensors, "transmittance", p1 + s * (p2 - p1)) for s in share]
-    raw = perceptron(tensors, "transmittance", np.concatenate([*features, p1, p2], axis=1))
-    a, b = logistic.parameters(ops, raw[:, 0], raw[:, 1], h)
-    return hit, a, b
+    count = 2 * net.components
+    if net.encoding.kind == "depth":
+        raw = perceptron(tensors, "transmittance", np.stack(depth_profile.features(ops, places, total, h), axis=1)).T
+        pairs = depth_profile.components(ops, raw[:count], places, total, h)
+    else:
+        ends = np.concatenate([np.stack(p, axis=1) for p in spheres.end_points(m, tuple(d.T), h)], axis=1)
+        raw = perceptron(tensors, "transmittance", encode(net.encoding, tensors, "transmittance", ends)).T
+        pairs = [logistic.parameters(ops, raw[i], raw[i + 1], h) for i in range(0, count, 2)]
+    return hit, mixture.from_outputs(ops, pairs, list(raw[count:]), h)

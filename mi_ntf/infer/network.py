@@ -6,7 +6,7 @@ import drjit as dr
 import numpy as np
 from drjit import nn
 
-from ..core import logistic, spheres
+from ..core import depth_profile, logistic, mixture, spheres
 from ..core.architecture import MAX_LOG_DENSITY, MIN_LOG_DENSITY, Encoding, Header
 from ..core.microfacet import MIN_ROUGHNESS
 from ..core.ops import normalize
@@ -16,6 +16,9 @@ from . import ops
 MIN_DENSITY = 0.1
 """σ below this counts as empty, 1/(unit-sphere radius): an optical depth of 0.2 at most across the whole sphere.
 Training drives empty space below it; every renderer of the field (also stock `volpath`) sees the same zero."""
+
+CLEAR_DEPTH = 1e-3
+"""Rays with less optical depth than this count as clear: τ = 1."""
 
 
 def cut_density(sigma, p):
@@ -33,7 +36,7 @@ class NetworkField:
 
     def __init__(self, header: Header, tensors: dict[str, np.ndarray], dj: ModuleType):
         arch = header.architecture
-        self.points = arch.transmittance.points
+        self.components = arch.transmittance.components
         self._density = _Network(arch.density.encoding, "density", tensors, dj)
         self._reflectance = _Network(arch.reflectance.encoding, "reflectance", tensors, dj)
         self._transmittance = _Network(arch.transmittance.encoding, "transmittance", tensors, dj)
@@ -54,18 +57,24 @@ class NetworkField:
         r, g, b, rough, spec = (logistic.sigmoid(ops, v) for v in raw[3:])
         return normal, (r, g, b), MIN_ROUGHNESS + (1 - MIN_ROUGHNESS) * rough, spec
 
-    def transmittance_parameters(self, o, d):
-        """``(hit, m, h, a, b)`` of the rays through `o` along unit directions `d` towards the light: one query a
-        ray."""
+    def ray_mixture(self, o, d, profile):
+        """``(hit, h, mixture)`` of the rays through `o` along unit directions `d` towards the light: one query a ray.
+
+        `profile(o, d)`: see :class:`mi_ntf.infer.profile.DepthProfile`; read by the encoding ``depth`` alone. `mixture`
+        is a tuple of ``(w, a, b)``, see :mod:`mi_ntf.core.mixture`.
+        """
         hit, m, h = spheres.chord(ops, o, d)
-        p1, p2 = spheres.end_points(m, d, h)
-        features = []
-        for i in range(self.points):
-            s = (i + 0.5) / self.points
-            features += self._transmittance.encode(tuple(q1 + s * (q2 - q1) for q1, q2 in zip(p1, p2, strict=True)))
-        raw_a, raw_b = self._transmittance.layers([*features, *p1, *p2])
-        a, b = logistic.parameters(ops, raw_a, raw_b, h)
-        return hit, m, h, a, b
+        net, count = self._transmittance, 2 * self.components
+        if net.encoding.kind == "depth":
+            places, total = profile(o, d)
+            raw = net.layers(depth_profile.features(ops, places, total, h))
+            pairs = depth_profile.components(ops, raw[:count], places, total, h)
+            hit &= total > CLEAR_DEPTH
+        else:
+            p1, p2 = spheres.end_points(m, d, h)
+            raw = net.layers(net.encode((*p1, *p2)))
+            pairs = [logistic.parameters(ops, raw[i], raw[i + 1], h) for i in range(0, count, 2)]
+        return hit, h, mixture.from_outputs(ops, pairs, raw[count:], h)
 
 
 class _Network:
@@ -103,7 +112,7 @@ class _Network:
         self.packed = nn.pack(net, layout="inference")
 
     def encode(self, p) -> list:
-        """Features of the points `p`, a list of scalars arrays."""
+        """Features of the points `p`, a list of scalar arrays."""
         if self.encoding.kind == "frequency":
             features = list(p)
             for k in range(self.encoding.octaves):

@@ -4,6 +4,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.errors import MiNtfError
+from ..infer import profile
 from ..infer.visibility import neural_transmittance, raymarch
 
 METHODS = ("neural_transmittance", "raymarch", "none")
@@ -68,10 +69,12 @@ def emitter_class() -> type:
         def _method(self):
             if self.visibility == "none":
                 return None
+            source, field = self.medium.source, self.medium.field
             if self.visibility == "neural_transmittance":
-                return neural_transmittance.NeuralTransmittance(self.medium.field.network)
+                reader = profile.DepthProfile(source.density, field.grid, dr.opaque(mi.Float, STEP))
+                return neural_transmittance.NeuralTransmittance(field.network, reader)
             steps = tuple(dr.opaque(mi.Float, s) for s in raymarch.default_steps(STEP))
-            return raymarch.RayMarch(self.medium.source.density, self.medium.field.grid, steps)
+            return raymarch.RayMarch(source.density, field.grid, steps)
 
         def pdf_direction(self, it, ds, active=True):
             return mi.Float(0)

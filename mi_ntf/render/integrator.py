@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.errors import MiNtfError
-from ..infer import march, shade
+from ..infer import march, profile, shade
 from ..infer.visibility import METHODS, neural_transmittance, raymarch, transmittance_map
 from . import effects, lights
 
@@ -159,14 +159,13 @@ class SceneLight:
             )
         frame, field = self.medium.frame, self.medium.field
         self.table = lights.table(scene, frame, integrator.environment_lights) if self.effects.exhaustive else None
+        self.profile = profile.DepthProfile(self.medium.source.density, field.grid, dr.opaque(mi.Float, self.step))
         self.map = None
         if self.effects.visibility == "transmittance_map":
             source = (
-                transmittance_map.network_source(field.network)
+                transmittance_map.network_source(field.network, self.profile)
                 if integrator.map_source == "network"
-                else transmittance_map.field_source(
-                    self.medium.source.density, field.grid, dr.opaque(mi.Float, self.step)
-                )
+                else transmittance_map.field_source(self.profile)
             )
             self.map = transmittance_map.TransmittanceMap(
                 self.table, integrator.map_resolution, field.grid.hull, source, mi
@@ -210,7 +209,7 @@ class SceneLight:
         if method == "transmittance_map":
             return self.map
         if method == "neural_transmittance":
-            return neural_transmittance.NeuralTransmittance(self.medium.field.network)
+            return neural_transmittance.NeuralTransmittance(self.medium.field.network, self.profile)
         if method == "none":
             return None
         steps = tuple(dr.opaque(mi.Float, s) for s in raymarch.default_steps(self.step))

@@ -17,7 +17,7 @@ class TrainConfig:
     cells: int = 96
     """Occupancy grid, cells along an edge."""
     bake: int = 128
-    """Density grid for normals and transmittance targets, cells along an edge."""
+    """Density grid for normals, cells along an edge."""
     lr_planes: float = 0.1
     lr_layers: float = 3e-3
     lr_end: float = 0.03
@@ -38,12 +38,16 @@ class TrainConfig:
     half as much again into all other directions."""
     smooth: float = 1e-3
     """Weight of total variation of the planes."""
-    ntf_from: float = 0.4
+    ntf_from: float = 0.8
     """Transmittance training starts here, the field has formed."""
-    ntf_alone: float = 0.85
+    ntf_alone: float = 0.9
     """From here the field is finished and only its transmittance is trained."""
-    ntf_rays: int = 1024
+    ntf_rays: int = 384
     """Fresh transmittance rays a step."""
+    augmentation: bool = True
+    """Learn transmittance on rays of all directions, not those of the cameras alone."""
+    colour_loss: bool = True
+    """Also compare pixels lit by the learned transmittance with the photographs."""
 
 
 PRESETS = {"fast": TrainConfig()}

@@ -3,11 +3,12 @@
 import torch
 import torch.nn.functional as F
 
-from ..core import logistic, spheres
+from ..core import mixture, spheres
 from ..core.architecture import MAX_LOG_DENSITY
 from . import ops
-from .baked import Baked, chords, random_chords, uniform_directions
-from .networks import Networks
+from .baked import Baked
+from .marched import Marched, chords, random_chords, uniform_directions
+from .networks import Networks, crossings
 from .occupancy import LOG_EMPTY
 from .rays import Rays
 from .render import Image, scatter_sum
@@ -71,41 +72,68 @@ def total_variation(networks: Networks) -> torch.Tensor:
     return torch.stack(terms).sum()
 
 
-def transmittance(networks: Networks, baked: Baked, surface: torch.Tensor, count: int, generator: torch.Generator,
-                  steps: int = 160) -> torch.Tensor:
-    """Σ (τ_nrf − τ_nt)² on fresh rays: half of them random (method.md, section 5, AG), half through points of `surface`
-    (n, 3) in random directions, where τ at that point counts once more, since shading happens there.
+STEPS = 640
+"""Steps of the marches that transmittance is learned from: skins are 0.005 wide, and the shape of the light's decay
+inside them decides how bright the surface is (with 256 steps relit images were 3 % too dark)."""
 
+
+def tau(mix: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
+    """τ (n, k) at places `t` (n, k) of the rays' mixtures (n, K, 3)."""
+    return mixture.transmittance(ops, t, tuple(part[:, :, None].unbind(1) for part in mix.unbind(1)))
+
+
+def transmittance(networks: Networks, marched: Marched, o: torch.Tensor, d: torch.Tensor,
+                  generator: torch.Generator) -> torch.Tensor:
+    """Σ (τ_nrf − τ_nt)² on rays through the points `o` (n, 3) along `d` towards the light (method.md, section 5).
+
+    Along each ray at 16 uniform places, and at 16 where free flight from the light would end: lit surfaces are seen
+    there, and a fit that is right on average over the chord is dark in the first half of the skin. At `o` once more.
     Targets are marched through the baked density and carry no gradient.
     """
-    o, d = random_chords(count, baked.reach, generator)
-    if len(surface):
-        pick = torch.randint(len(surface), (count // 2,), generator=generator)
-        o = torch.cat([o[:count - len(pick)], surface[pick]])
-        d = torch.cat([d[:count - len(pick)], uniform_directions(len(pick), generator)])
     m, h = chords(o, d)
-    depth = baked.march(m, d, h, steps, generator)
-    stride = 4
-    first = int(torch.randint(stride, (1,), generator=generator))
-    at = torch.arange(first, steps + 1, stride)
-    t = (at * (2 / steps) - 1) * h[:, None]
-    hit, a, b = networks.transmittance_parameters(o, d)
-    t_own = spheres.coordinate(o.unbind(1), d.unbind(1))
-    place = ((t_own / h + 1) * (steps / 2)).clamp(0, steps - 1e-3)
+    depth = marched.march(m, d, h, STEPS)
+    hit, mix = networks.ray_mixture(o, d, depth)
+    t = (2 * torch.rand(len(o), 16, generator=generator) - 1) * h[:, None]
+    lost = torch.rand(len(o), 16, generator=generator) * -torch.expm1(-depth[:, :1])
+    own = spheres.coordinate(o.unbind(1), d.unbind(1))
+    t = torch.cat([t, crossings(depth, h, -torch.log1p(-lost)), own[:, None]], 1)
+    place = ((t / h[:, None] + 1) * (STEPS / 2)).clamp(0, STEPS - 1e-3)
     lower = place.floor().long()
     share = place - lower
-    own = depth.gather(1, lower[:, None])[:, 0] * (1 - share) + depth.gather(1, lower[:, None] + 1)[:, 0] * share
-    along = logistic.transmittance(ops, t, a[:, None], b[:, None]) - torch.exp(-depth[:, at])
-    point = logistic.transmittance(ops, t_own, a, b) - torch.exp(-own)
-    return (hit[:, None] * along**2).mean() + 0.5 * (hit * point**2).mean()
+    target = torch.exp(-(depth.gather(1, lower) * (1 - share) + depth.gather(1, lower + 1) * share))
+    error = hit[:, None] * (tau(mix, t) - target) ** 2
+    return error[:, :16].mean() + error[:, 16:32].mean() + error[:, 32].mean()
 
 
-def transmittance_color(networks: Networks, image: Image, rays: Rays, exposure: float, count: int) -> torch.Tensor:
+def training_rays(marched: Marched, rays: Rays, count: int, augment: bool, generator: torch.Generator):
+    """``(o, d)`` of about `count` rays to learn transmittance on, towards the light.
+
+    With augmentation (method.md, section 5, "AG") a half are random chords and a half leave shading points in random
+    directions; without, all are camera rays, backwards, through shading points. Shading points lie along camera rays
+    where free flight ends, as the renderer's do.
+    """
+    some = rays[torch.randint(len(rays), (count // 2 if augment else count,), generator=generator)]
+    m, h = chords(some.o, some.d)
+    toward = -some.d
+    profile = marched.march(m, toward, h, STEPS)
+    meets = profile[:, 0] > 0.05
+    m, h, toward, profile = (v[meets] for v in (m, h, toward, profile))
+    lost = torch.rand(len(m), 1, generator=generator) * -torch.expm1(-profile[:, :1])
+    x = m + crossings(profile, h, -torch.log1p(-lost)) * toward
+    if not augment:
+        return x, toward
+    o, d = random_chords(count - len(x), marched.reach, generator)
+    return torch.cat([o, x]), torch.cat([d, uniform_directions(len(x), generator)])
+
+
+def transmittance_color(networks: Networks, marched: Marched, image: Image, rays: Rays, exposure: float,
+                        count: int) -> torch.Tensor:
     """‖I_nt − I‖² of the first `count` rays: pixels lit by τ_nt instead of the marched light (method.md, section 5)."""
     near = (image.shaded < count).nonzero()[:, 0]
     ray, x = image.shaded[near], image.x[near]
-    toward = -rays.d[:count]
-    _, a, b = networks.transmittance_parameters(rays.o[:count], toward)
-    tau = logistic.transmittance(ops, (x * toward[ray]).sum(1), a[ray], b[ray])
-    pixel = scatter_sum((image.weight[near].detach() * tau)[:, None] * image.radiance[near].detach(), ray, count)
+    o, toward = rays.o[:count], -rays.d[:count]
+    m, h = chords(o, toward)
+    _, mix = networks.ray_mixture(o, toward, marched.march(m, toward, h, STEPS))
+    lit = tau(mix[ray], (x * toward[ray]).sum(1, keepdim=True))
+    pixel = scatter_sum(image.weight[near, None].detach() * lit * image.radiance[near].detach(), ray, count)
     return color(pixel, rays.target[:count, :3], exposure)

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from ..core import logistic, spheres
+from ..core import depth_profile, logistic, mixture, spheres
 from ..core.architecture import MAX_LOG_DENSITY, MIN_LOG_DENSITY, Architecture, Encoding
 from ..core.microfacet import MIN_ROUGHNESS
 from ..core.reference import PLANES
@@ -42,16 +42,40 @@ class Networks:
         roughness = MIN_ROUGHNESS + (1 - MIN_ROUGHNESS) * rest[:, 3]
         return F.normalize(raw[:, :3], dim=1, eps=1e-10), rest[:, :3], roughness, rest[:, 4]
 
-    def transmittance_parameters(self, o: torch.Tensor, d: torch.Tensor):
-        """``(hit, a, b)``, each (n,), of rays through `o` (n, 3) along unit directions `d` towards the light."""
+    def ray_mixture(self, o: torch.Tensor, d: torch.Tensor, profile: torch.Tensor):
+        """``(hit (n,), mixture (n, K, 3))`` of rays through `o` along unit directions `d` towards the light.
+
+        `profile` (n, k): optical depths from equidistant points of the chords, far ends first, to the light-side ends
+        (``Baked.march``), read by the encoding ``depth``. The last axis is (w, a, b), see :mod:`mi_ntf.core.mixture`.
+        """
         net = self.architecture.transmittance
         hit, m, h = spheres.chord(ops, o.unbind(1), d.unbind(1))
-        p1, p2 = (torch.stack(p, dim=1) for p in spheres.end_points(m, d.unbind(1), h))
-        share = (torch.arange(net.points, dtype=o.dtype) + 0.5) / net.points
-        x = p1[:, None] + share[:, None] * (p2 - p1)[:, None]
-        features = encode(net.encoding, self.tensors, "transmittance", x.reshape(-1, 3)).reshape(len(o), -1)
-        raw = perceptron(self.tensors, "transmittance", torch.cat([features, p1, p2], dim=1))
-        return hit, *logistic.parameters(ops, raw[:, 0], raw[:, 1], h)
+        count = 2 * net.components
+        if net.encoding.kind == "depth":
+            places = crossings(profile, h, profile.new_tensor(depth_profile.LEVELS)).unbind(1)
+            total = profile[:, 0]
+            features = torch.stack(depth_profile.features(ops, places, total, h), 1)
+            raw = perceptron(self.tensors, "transmittance", features).unbind(1)
+            pairs = depth_profile.components(ops, raw[:count], places, total, h)
+        else:
+            ends = torch.cat([torch.stack(p, 1) for p in spheres.end_points(m, d.unbind(1), h)], 1)
+            raw = perceptron(self.tensors, "transmittance", encode(net.encoding, self.tensors, "transmittance", ends))
+            raw = raw.unbind(1)
+            pairs = [logistic.parameters(ops, raw[i], raw[i + 1], h) for i in range(0, count, 2)]
+        mix = mixture.from_outputs(ops, pairs, list(raw[count:]), h)
+        return hit, torch.stack([torch.stack(part, 1) for part in mix], 1)
+
+
+def crossings(profile: torch.Tensor, h: torch.Tensor, levels: torch.Tensor) -> torch.Tensor:
+    """Where the profiles (n, k) of half chords `h` pass the depths `levels`, (l,) or (n, l): places (n, l), linear
+    between their points."""
+    steps = profile.shape[1] - 1
+    falling = profile.flip(1).contiguous()  # from the light, ascending
+    levels = levels.expand(len(profile), -1).contiguous()
+    after = torch.searchsorted(falling, levels).clamp(1, steps)
+    d0, d1 = falling.gather(1, after - 1), falling.gather(1, after)
+    share = ((levels - d0) / (d1 - d0).clamp(min=1e-9)).clamp(0, 1)
+    return h[:, None] * (1 - (after - 1 + share) * (2 / steps))
 
 
 def density_from_log(raw: torch.Tensor) -> torch.Tensor:
@@ -61,7 +85,7 @@ def density_from_log(raw: torch.Tensor) -> torch.Tensor:
 
 
 def encode(encoding: Encoding, tensors: dict, name: str, x: torch.Tensor) -> torch.Tensor:
-    """Features (n, encoding.width) of the points `x` (n, 3). Planes give no gradient to `x`."""
+    """Features (n, ``encoding.width``) of the points `x` (n, 3), or of rays (n, 6). Planes give no gradient to `x`."""
     if encoding.kind == "frequency":
         angles = [math.pi * 2.0**k * x for k in range(encoding.octaves)]
         return torch.cat([x, *(f(a) for a in angles for f in (torch.sin, torch.cos))], dim=1)

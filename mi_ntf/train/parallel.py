@@ -75,8 +75,8 @@ class Shared(Networks):
     def reflectance(self, x):
         return divided(Networks(**vars(self)).reflectance, x)
 
-    def transmittance_parameters(self, o, d):
-        return divided(Networks(**vars(self)).transmittance_parameters, o, d)
+    def ray_mixture(self, o, d, profile):
+        return divided(Networks(**vars(self)).ray_mixture, o, d, profile)
 
 
 def divided(function: Callable, *arguments: torch.Tensor):

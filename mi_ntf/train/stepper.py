@@ -11,6 +11,7 @@ from ..data.readers import load_dataset
 from . import losses, monitor, networks, parallel, rays, render
 from .baked import Baked
 from .config import TrainConfig
+from .marched import Marched
 from .occupancy import LOG_EMPTY, Occupancy
 
 REFRESH = 32
@@ -32,7 +33,7 @@ class Stepper:
         self.occupancy = Occupancy(rays.visual_hull(self.splits["train"], config.cells))
         # Rays that miss the hull have nothing to teach. All others stay for good: matter may grow into any of them.
         _, self.seen = self.occupancy.tighten(self.rays["train"])
-        self.baked = Baked(config.bake)
+        self.baked, self.marched = Baked(config.bake), Marched()
         bright = self.rays["train"].target
         bright = bright[bright[:, 3] > 0.99][:, :3].mean(1)
         self.exposure = 1 / max(float(bright.quantile(0.95)) if 0 < len(bright) else 1.0, 1e-6)
@@ -73,11 +74,14 @@ class Stepper:
         done = self.progress() >= self.config.ntf_alone
         if self.step % REFRESH == 0 and not done:
             self.occupancy.update(self.nets, self.generator)
-        if self.step % (4 * REFRESH) == 0 and not (done and self.step > self.last_bake + 8 * REFRESH):
+        due = self.step % (4 * REFRESH) == 0 and not (done and self.step > self.last_bake + 8 * REFRESH)
+        if due or (self.progress() >= self.config.ntf_from and not hasattr(self.marched, "log_sigma")):
             self.bake()
 
     def bake(self) -> None:
         self.baked.update(self.nets, self.occupancy)
+        if self.progress() >= self.config.ntf_from:
+            self.marched.update(self.nets, self.occupancy)
         self.last_bake = self.step
 
     def batch(self):
@@ -110,13 +114,16 @@ class Stepper:
             terms["smooth"] = 4 * c.smooth * losses.total_variation(self.nets)
         return terms, image
 
-    def ntf_loss(self, image: render.Image, batch: rays.Rays, alone: bool) -> dict[str, torch.Tensor]:
+    def ntf_loss(self, image: render.Image, batch: rays.Rays) -> dict[str, torch.Tensor]:
         """Name → weighted term of the transmittance network."""
-        surface = image.x[image.weight > 0.05].detach()
-        count = self.config.ntf_rays * (3 if alone else 1)
-        near = min(512, len(batch))
-        return {"transmittance": losses.transmittance(self.nets, self.baked, surface, count, self.generator),
-                "lit colour": 0.1 * losses.transmittance_color(self.nets, image, batch, self.exposure, near)}
+        c, g = self.config, self.generator
+        o, d = losses.training_rays(self.marched, batch, c.ntf_rays, c.augmentation, g)
+        terms = {"transmittance": losses.transmittance(self.nets, self.marched, o, d, g)}
+        if c.colour_loss:
+            near = min(96, len(batch))
+            lit = losses.transmittance_color(self.nets, self.marched, image, batch, self.exposure, near)
+            terms["lit colour"] = 0.1 * lit
+        return terms
 
     def advance(self) -> float:
         """One optimiser step of whatever the schedule trains now; returns the loss. Raises Fault."""
@@ -136,7 +143,7 @@ class Stepper:
             rate = c.lr_end ** (done / c.ntf_alone) * min(1.0, (self.step + 1) / 50)
             total += self._descend("field", _sum(self.terms), rate)
         if done >= c.ntf_from:
-            terms = self.ntf_loss(image, batch, alone)
+            terms = self.ntf_loss(image, batch)
             loss = _sum(terms)
             self.watch.check("ntf", float(loss.detach()), self.step)
             total += self._descend("ntf", loss, c.lr_end ** ((done - c.ntf_from) / (1 - c.ntf_from)))

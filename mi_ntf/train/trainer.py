@@ -65,7 +65,8 @@ class _Run(Stepper):
 
     HELD = ("step", "spent", "samples_per_ray", "last_bake", "rate", "history", "validated", "best", "kept", "faults")
     """Attributes that, with generator, networks, optimisers, grids and loss averages, decide how the run goes on."""
-    GRIDS = (("occupancy", ("sigma", "level", "stray")), ("baked", ("sigma", "slope", "reach")))
+    GRIDS = (("occupancy", ("sigma", "level", "stray")), ("baked", ("slope",)),
+             ("marched", ("log_sigma", "reach")))
 
     def __init__(self, dataset: Path, out: Path, config: TrainConfig, preset: str, *, minutes, steps, seed,
                  tensorboard=None):

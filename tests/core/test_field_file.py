@@ -13,7 +13,7 @@ from mi_ntf.core.errors import MiNtfError
 SMALL = Architecture(
     density=Network(Encoding("planes", (4, 6), 2), (5,)),
     reflectance=Network(Encoding("frequency", octaves=2), (4, 3)),
-    transmittance=Network(Encoding("planes", (4,), 2), (7,), points=3),
+    transmittance=Network(Encoding("frequency", octaves=2), (7,), components=2),
 )
 
 
@@ -38,9 +38,9 @@ def test_skeleton_by_hand():
     assert shapes["density.layers.1.bias"] == (1,)
     assert shapes["reflectance.layers.0.weight"] == (4, 15)  # 3 + 2 octaves · (sin, cos) · 3
     assert shapes["reflectance.layers.2.weight"] == (8, 3)
-    assert shapes["transmittance.layers.0.weight"] == (7, 3 * 2 + 6)
-    assert shapes["transmittance.layers.1.weight"] == (2, 7)
-    assert len(shapes) == 2 + 4 + 6 + 1 + 4
+    assert shapes["transmittance.layers.0.weight"] == (7, 30)  # the same of the six coordinates of a ray
+    assert shapes["transmittance.layers.1.weight"] == (5, 7)  # two (a, b), one weight
+    assert len(shapes) == 2 + 4 + 6 + 4
 
 
 def test_round_trip(saved):
@@ -137,11 +137,13 @@ def test_foreign_and_absent_files(tmp_path):
 
 
 @pytest.mark.parametrize(("change", "text"), [
-    (lambda d: d.update(format=2), "field format 2, this build reads 1; train or export the field anew"),
+    (lambda d: d.update(format=1), "field format 1, this build reads 2; train or export the field anew"),
     (lambda d: d.pop("architecture"), "incomplete .*architecture"),
     (lambda d: d["architecture"].pop("transmittance"), "incomplete .*transmittance"),
     (lambda d: d["architecture"]["density"]["encoding"].update(kind="hash"),
-     "'hash', expected 'planes' or 'frequency'"),
+     "'hash' of density, expected one of planes, frequency"),
+    (lambda d: d["architecture"]["transmittance"]["encoding"].update(kind="planes"),
+     "'planes' of transmittance, expected one of frequency, depth"),
     (lambda d: d["architecture"]["density"]["encoding"].update(resolutions=[1]), "resolutions of at least 2"),
     (lambda d: d["architecture"]["density"].update(hidden=[0]), "expected positive integers"),
     (lambda d: d["similarity"].update(radius=0), "incomplete .*similarity"),

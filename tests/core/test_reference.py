@@ -5,14 +5,14 @@ import math
 import numpy as np
 import pytest
 
-from mi_ntf.core import logistic, reference, spheres
+from mi_ntf.core import logistic, mixture, ops, reference, spheres
 from mi_ntf.core.architecture import MAX_LOG_DENSITY, MIN_LOG_DENSITY, Architecture, Encoding, Network
 from mi_ntf.core.microfacet import MIN_ROUGHNESS
 
 ARCH = Architecture(
     density=Network(Encoding("planes", (5, 8), 3), (6,)),
     reflectance=Network(Encoding("frequency", octaves=3), (7, 5)),
-    transmittance=Network(Encoding("planes", (6,), 2), (8,), points=4),
+    transmittance=Network(Encoding("frequency", octaves=2), (8,), components=2),
 )
 
 
@@ -84,20 +84,30 @@ def test_reflectance(tensors, points):
         np.testing.assert_allclose(found, [v / length for v in raw[:3]] + rest, rtol=1e-11)
 
 
-def test_transmittance_parameters(tensors):
+def test_ray_mixture(tensors):
     rng = np.random.default_rng(10)
     o, d = rng.uniform(-0.5, 0.5, (12, 3)), rng.normal(size=(12, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     o[0] = 5 * np.cross(d[0], [1, 0, 0])  # a miss
-    hit, a, b = reference.transmittance_parameters(ARCH, tensors, o, d)
+    hit, found = reference.ray_mixture(ARCH, tensors, o, d)
     assert hit.tolist() == [False] + [True] * 11
     for i in range(1, 12):
         m = o[i] - (o[i] @ d[i]) * d[i]
         h = math.sqrt(1 - m @ m)
-        p1, p2 = m - h * d[i], m + h * d[i]
-        features = [f for k in range(4) for f in _planes(tensors, "transmittance", p1 + (k + 0.5) / 4 * (p2 - p1))]
-        raw_a, raw_b = _layers(tensors, "transmittance", [*features, *p1, *p2])
-        log_a = logistic.MAX_LOG_SLOPE * math.tanh(raw_a / logistic.MAX_LOG_SLOPE)
-        assert a[i] == pytest.approx(math.exp(log_a), rel=1e-10)
-        assert b[i] == pytest.approx(logistic.MAX_CENTRE * h * math.tanh(raw_b), rel=1e-10, abs=1e-14)
-    assert np.isfinite([a[0], b[0]]).all() and abs(b[0]) <= logistic.MAX_CENTRE * spheres.MIN_HALF_CHORD
+        ends = [*(m - h * d[i]), *(m + h * d[i])]
+        features = list(ends)
+        for k in range(2):
+            features += [f(2**k * math.pi * c) for f in (math.sin, math.cos) for c in ends]
+        *raw, logit = _layers(tensors, "transmittance", features)
+        a = [math.exp(logistic.MAX_LOG_SLOPE * math.tanh(r / logistic.MAX_LOG_SLOPE)) for r in raw[::2]]
+        b = [logistic.MAX_CENTRE * h * math.tanh(r) for r in raw[1::2]]
+        w = [1, math.exp(6 * math.tanh(logit / 6))]
+        top = sum(wk / (1 + math.exp(-ak * (h - bk))) for wk, ak, bk in zip(w, a, b, strict=True))
+        lit = top > 1e-6
+        top = max(top, 1e-6)
+        for k in range(2):
+            np.testing.assert_allclose([v[i] for v in found[k]], [w[k] / top, a[k], b[k]], rtol=1e-10, atol=1e-14)
+        own = tuple(tuple(v[i] for v in part) for part in found)
+        assert not lit or mixture.transmittance(ops, h, own) == pytest.approx(1)
+    assert np.isfinite([v[0] for part in found for v in part]).all()
+    assert abs(found[0][2][0]) <= logistic.MAX_CENTRE * spheres.MIN_HALF_CHORD

@@ -12,7 +12,7 @@ def architecture() -> Architecture:
     return Architecture(
         Network(Encoding("planes", (RESOLUTION,), 8), (16,)),
         Network(Encoding("planes", (RESOLUTION,), 4), (16,)),
-        Network(Encoding("planes", (16,), 4), (16,), points=4),
+        Network(Encoding("depth"), (16,), components=2),
     )
 
 

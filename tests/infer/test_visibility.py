@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from helpers import fields
 
-from mi_ntf.core import logistic, ops
+from mi_ntf.core import logistic, mixture, ops
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.infer.grid import GridField
 from mi_ntf.infer.lights import LightTable
 from mi_ntf.infer.march import optical_depth
 from mi_ntf.infer.network import NetworkField
+from mi_ntf.infer.profile import DepthProfile
 from mi_ntf.infer.visibility import raymarch
 from mi_ntf.infer.visibility.neural_transmittance import NeuralTransmittance
 from mi_ntf.infer.visibility.transmittance_map import CLEAR, TransmittanceMap, field_source, network_source
@@ -36,6 +37,11 @@ def grid(network):
     return GridField(network, 96, mi)
 
 
+@pytest.fixture(scope="module")
+def reader(grid):
+    return DepthProfile(grid.density, grid, mi.Float(1 / 256))
+
+
 def table(point: bool):
     return LightTable([LAMP if point else SUN], [[1, 1, 1]], [point], 1.0, mi)
 
@@ -51,24 +57,25 @@ def analytic_source(a, b_of):
     """Rays whose (a, b) are a known smooth function of the ray, to test the map without any fit."""
 
     def fit(o, d):
-        return dr.full(mi.Float, a, dr.width(d[0])), b_of(o, d)
+        return ((1.0, dr.full(mi.Float, a, dr.width(d[0])), b_of(o, d)),)
 
-    return fit
+    return fit, 1
 
 
 @pytest.mark.parametrize("point", [False, True], ids=["directional", "point"])
-def test_texel_centre_returns_its_own_ray(grid, network, point, rng):
+def test_texel_centre_returns_its_own_ray(grid, network, reader, point, rng):
     """A point on a texel's ray sees that ray's own logistic, exactly."""
     lights = table(point)
-    tmap = TransmittanceMap(lights, 32, grid.hull, network_source(network), mi)
+    tmap = TransmittanceMap(lights, 32, grid.hull, network_source(network, reader), mi)
     light = tmap._light(mi.UInt32(0), True)
     texel = rng.integers(4, 28, (300, 2))
     origin, d = tmap._ray(light, *(mi.Float(c.astype(np.float32)) for c in texel.T))
     origin, d = (np.array(v, np.float64) for v in ([np.broadcast_to(np.array(c), 300) for c in w] for w in (origin, d)))
     where = rng.uniform(-0.4, 0.4, 300)
     x = (origin + (where - (origin * d).sum(0)) * d).T
-    hit, _, _, a, b = network.transmittance_parameters(arrays(x), arrays(d.T))
-    truth = np.where(np.array(hit), logistic.transmittance(ops, where, np.array(a), np.array(b)), 1)
+    hit, _, mix = network.ray_mixture(arrays(x), arrays(d.T), reader)
+    mix = [[np.array(v, np.float64) for v in part] for part in mix]
+    truth = np.where(np.array(hit), mixture.transmittance(ops, where, mix), 1)
     wi, distance = towards(x, point)
     ours = np.array(tmap.tau(arrays(x), arrays(wi), mi.Float(distance), mi.UInt32(0), True))
     # float32 texel coordinates: 1e-5 of a texel, times neighbours that differ by at most 1; slopes of a·1e-6.
@@ -95,10 +102,10 @@ def test_interpolation_reproduces_a_smooth_map(grid, point, rng):
 
 
 @pytest.mark.parametrize("point", [False, True], ids=["directional", "point"])
-def test_field_source_matches_the_march(grid, point, rng):
+def test_field_source_matches_the_march(grid, reader, point, rng):
     """Maps of the field at points in the open and in shadow: opaque matter, so that one logistic suffices."""
     lights = table(point)
-    tmap = TransmittanceMap(lights, 256, grid.hull, field_source(grid.density, grid, mi.Float(1 / 256)), mi)
+    tmap = TransmittanceMap(lights, 256, grid.hull, field_source(reader), mi)
     x = rng.uniform(-0.6, 0.6, (4000, 3))
     wi, distance = towards(x, point)
     depth = optical_depth(
@@ -141,42 +148,42 @@ def test_texels_are_square_and_no_more_than_asked_for(grid):
         assert window[2] / window[3] > 1.5 or window[3] / window[2] > 1.5
 
 
-def test_outside_and_clear_rays_are_lit(grid):
-    tmap = TransmittanceMap(table(False), 16, grid.hull, field_source(grid.density, grid, mi.Float(0.01)), mi)
+def test_outside_and_clear_rays_are_lit(grid, reader):
+    tmap = TransmittanceMap(table(False), 16, grid.hull, field_source(reader), mi)
     b = np.array(tmap.texture.tensor())[..., 1]
     assert (b == CLEAR).any() and (b > -1.5).any()
     far = arrays([[0.0, 0.9, -0.9]])
     assert np.array(tmap.tau(far, arrays([SUN]), mi.Float(np.inf), mi.UInt32(0), True)) == 1
 
 
-def test_many_lights_each_get_their_own_map(grid, network, rng):
+def test_many_lights_each_get_their_own_map(grid, network, reader, rng):
     """Light k of a table of many equals the same light alone."""
     where = rng.normal(size=(7, 3))
     where /= np.linalg.norm(where, axis=1, keepdims=True)
     where[3:] *= 2.5
     is_point = np.arange(7) >= 3
     together = TransmittanceMap(
-        LightTable(where, np.ones((7, 3)), is_point, 1.0, mi), 24, grid.hull, network_source(network), mi
+        LightTable(where, np.ones((7, 3)), is_point, 1.0, mi), 24, grid.hull, network_source(network, reader), mi
     )
     x = arrays(rng.uniform(-0.4, 0.4, (100, 3)))
     for k in range(7):
         single = LightTable(where[k : k + 1], np.ones((1, 3)), is_point[k : k + 1], 1.0, mi)
-        alone = TransmittanceMap(single, 24, grid.hull, network_source(network), mi)
+        alone = TransmittanceMap(single, 24, grid.hull, network_source(network, reader), mi)
         wi, _, distance = single.sample(mi.UInt32(0), x, True)
         a = together.tau(x, wi, distance, mi.UInt32(k), True)
         b = alone.tau(x, wi, distance, mi.UInt32(0), True)
         np.testing.assert_allclose(np.array(a), np.array(b), atol=1e-6)
 
 
-def test_light_inside_the_object_is_refused(grid, network):
+def test_light_inside_the_object_is_refused(grid, network, reader):
     lights = LightTable([[0.2, 0.1, 0.0]], [[1, 1, 1]], [True], 1.0, mi)
     with pytest.raises(MiNtfError, match=r"point light 0 lies inside the captured object's bounding sphere \(0.224 of"):
-        TransmittanceMap(lights, 16, grid.hull, network_source(network), mi)
+        TransmittanceMap(lights, 16, grid.hull, network_source(network, reader), mi)
 
 
-def test_neural_transmittance_is_a_transmittance(network, rng):
+def test_neural_transmittance_is_a_transmittance(network, reader, rng):
     """In [0, 1], growing towards the light; for a light inside the sphere 1 at the light."""
-    visibility = NeuralTransmittance(network)
+    visibility = NeuralTransmittance(network, reader)
     o, d = rng.uniform(-0.3, 0.3, (200, 3)), rng.normal(size=(200, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     t = np.linspace(-0.6, 0.6, 30)

@@ -1,5 +1,8 @@
 """Compositing against double loops and closed forms."""
 
+import dataclasses
+import math
+
 import numpy as np
 import pytest
 
@@ -7,9 +10,11 @@ torch = pytest.importorskip("torch", reason="training needs PyTorch: pip install
 
 from mi_ntf.core import microfacet  # noqa: E402
 from mi_ntf.core import ops as numpy_ops  # noqa: E402
+from mi_ntf.core.architecture import Encoding, Network  # noqa: E402
 from mi_ntf.train import evaluate, losses, networks, render  # noqa: E402
 from mi_ntf.train.baked import Baked  # noqa: E402
 from mi_ntf.train.config import PRESETS  # noqa: E402
+from mi_ntf.train.marched import Marched, chords, uniform_directions  # noqa: E402
 from mi_ntf.train.occupancy import Occupancy  # noqa: E402
 from mi_ntf.train.rays import Rays, sphere_span  # noqa: E402
 
@@ -114,25 +119,57 @@ def test_normals_of_a_ball_point_outwards():
     assert float((normal * x).sum(1).clamp(-1, 1).acos().rad2deg().mean()) < 4
 
 
+def marched_ball(sigma=40.0):
+    class Field:
+        def log_density(self, x):
+            return torch.where(x.norm(dim=1) < 0.5, math.log(sigma), -12.0)
+
+    marched = Marched()
+    marched.update(Field(), Occupancy(torch.ones((64,) * 3, dtype=torch.bool)))
+    return marched
+
+
 def test_marched_depth_of_a_ball_is_its_chord():
-    baked = ball(sigma=4.0)
+    marched = marched_ball(sigma=4.0)
+    assert 0.5 < marched.reach < 0.55
     m, d, h = torch.tensor([[0.0, 0.3, 0.0]]), torch.tensor([[1.0, 0.0, 0.0]]), torch.tensor([0.9539])
-    depth = baked.march(m, d, h, 200, torch.Generator().manual_seed(0))
+    depth = marched.march(m, d, h, 400)
     assert float(depth[0, -1]) == 0.0
     assert (depth[0, :-1] >= depth[0, 1:]).all()
-    # chord 2·0.4 of σ 4; a grid of 1/24 misplaces either end by half a cell at most
-    assert abs(float(depth[0, 0]) - 3.2) < 4 / 24
+    # chord 2·0.4 of σ 4; ln σ, not σ, rises across two voxels of 1/64: either end loses at most one and a half
+    assert 3.2 - 3 * 4 / 64 < float(depth[0, 0]) < 3.2
 
 
-def test_transmittance_loss_leaves_the_field_alone():
-    nets = networks.initial(PRESETS["fast"].architecture, 1.0, torch.Generator().manual_seed(0))
-    surface = torch.rand(100, 3) - 0.5
+@pytest.mark.parametrize("augment", [True, False])
+def test_training_rays(augment):
+    """Shading points of camera rays lie where free flight ends: on average 1/σ behind the surface."""
+    sigma, n = 40.0, 4000
+    batch = rays()[torch.zeros(50, dtype=torch.long)]
+    o, d = losses.training_rays(marched_ball(sigma), batch, n, augment, torch.Generator().manual_seed(0))
+    assert o.shape == d.shape == (n, 3)
+    np.testing.assert_allclose(d.norm(dim=1), 1, rtol=1e-5)
+    x, toward = o[-n // 2:], -batch.d[0]
+    m, _ = chords(batch.o[:1], batch.d[:1])
+    front = (0.25 - (m[0] @ m[0])).sqrt()  # the ball's half chord
+    depth = front - (x - m) @ toward
+    assert float((x - m - ((x - m) @ toward)[:, None] * toward).norm(dim=1).max()) < 1e-4
+    # Exponential flight of mean and deviation 1/σ; the grid (1/64) smears the surface by a voxel.
+    assert abs(float(depth.mean()) - 1 / sigma) < 1 / 64 and float(depth.std()) < 1.5 / sigma
+    assert torch.equal(d[-1], toward) is not augment
+
+
+@pytest.mark.parametrize("kind", ["depth", "frequency"])
+def test_transmittance_loss_leaves_the_field_alone(kind):
+    ray = Network(Encoding(kind, octaves=2 if kind == "frequency" else 0), (16,), components=2)
+    arch = dataclasses.replace(PRESETS["fast"].architecture, transmittance=ray)
+    nets = networks.initial(arch, 1.0, torch.Generator().manual_seed(0))
     generator = torch.Generator().manual_seed(0)
-    loss = losses.transmittance(nets, ball(), surface, 64, generator)
+    marched = marched_ball()
+    loss = losses.transmittance(nets, marched, torch.rand(64, 3) - 0.5, uniform_directions(64, generator), generator)
     batch = rays()
     samples = torch.arange(4).repeat_interleave(5), torch.linspace(2.8, 3.2, 5).repeat(4)
     image = render.render(nets, batch, samples, 0.1)
-    (loss + losses.transmittance_color(nets, image, batch, 1.0, 4)).backward()
+    (loss + losses.transmittance_color(nets, marched, image, batch, 1.0, 4)).backward()
     for name, value in nets.tensors.items():
         if name.startswith("transmittance"):
             assert value.grad is not None and value.grad.abs().sum() > 0, name

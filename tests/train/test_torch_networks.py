@@ -1,18 +1,20 @@
 """The PyTorch twin against the NumPy oracle, in value and gradient."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch", reason="training needs PyTorch: pip install 'mi-ntf[train]'")
 
-from mi_ntf.core import logistic, microfacet, reference, spheres  # noqa: E402
+from mi_ntf.core import depth_profile, logistic, microfacet, reference, spheres  # noqa: E402
 from mi_ntf.core import ops as numpy_ops  # noqa: E402
 from mi_ntf.core.architecture import Architecture, Encoding, Network  # noqa: E402
 from mi_ntf.train import networks, ops  # noqa: E402
 
 SMALL = Architecture(density=Network(Encoding("planes", (5, 9), 3), (7,)),
                      reflectance=Network(Encoding("frequency", octaves=3), (8,)),
-                     transmittance=Network(Encoding("planes", (6,), 2), (9, 5), points=4))
+                     transmittance=Network(Encoding("frequency", octaves=2), (9, 5), components=2))
 
 
 def field(dtype, seed=0):
@@ -37,12 +39,34 @@ def test_networks_agree_with_the_oracle(dtype, tolerance):
     x, d = points(200)
     tx, td = torch.tensor(x, dtype=dtype), torch.tensor(d, dtype=dtype)
     matter = np.split(reference.reflectance(SMALL, tensors, x), (3, 6, 7), axis=1)
-    expected = [reference.density(SMALL, tensors, x), *matter,
-                *reference.transmittance_parameters(SMALL, tensors, x * 0.5, d)[1:]]
-    actual = [nets.density(tx), *nets.reflectance(tx), *nets.transmittance_parameters(tx * 0.5, td)[1:]]
+    mixture = reference.ray_mixture(SMALL, tensors, x * 0.5, d)[1]
+    expected = [reference.density(SMALL, tensors, x), *matter, np.stack(mixture).transpose(2, 0, 1)]
+    actual = [nets.density(tx), *nets.reflectance(tx), nets.ray_mixture(tx * 0.5, td, None)[1]]
     for want, have in zip(expected, actual, strict=True):
         want = want.reshape(tuple(have.shape))
         assert np.abs(have.detach().numpy() - want).max() <= tolerance * np.abs(want).max()
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 2e-5)])
+def test_mixture_read_from_optical_depths(dtype, tolerance):
+    """The encoding `depth`, from crossings found by interpolation; float32 rounds ratios of small differences."""
+    arch = dataclasses.replace(SMALL, transmittance=Network(Encoding("depth"), (9,), components=2))
+    tensors = networks.to_tensors(networks.initial(arch, 1.0, torch.Generator().manual_seed(0)))
+    nets = networks.from_tensors(arch, tensors, dtype)
+    x, d = points(300)
+    x = 0.4 * x
+    rng = np.random.default_rng(2)
+    rise = rng.gamma(0.3, 0.1, (300, 64)) * np.exp(rng.normal(0.5, 1.5, (300, 1)))
+    profile = np.concatenate([np.cumsum(rise, 1)[:, ::-1], np.zeros((300, 1))], 1)
+    h = np.sqrt(1 - (x * x).sum(1) + (x * d).sum(1) ** 2)
+    t = np.linspace(-1, 1, 65) * h[:, None]
+    places = [np.array([np.interp(level, p[::-1], s[::-1]) for p, s in zip(profile, t, strict=True)])
+              for level in depth_profile.LEVELS]
+    expected = np.stack(reference.ray_mixture(arch, tensors, x, d, places, profile[:, 0])[1]).transpose(2, 0, 1)
+    with torch.no_grad():
+        _, found = nets.ray_mixture(*(torch.tensor(v, dtype=dtype) for v in (x, d, profile.copy())))
+    assert (np.abs(found.numpy() - expected) / np.abs(expected).max((0, 1))).max() <= tolerance
+    assert 0.2 < (profile[:, 0] > 4).mean() < 0.9, "opaque and translucent rays"
 
 
 def test_gradient_of_the_planes_is_that_of_finite_differences():

@@ -36,7 +36,7 @@ def tamper(monkeypatch, name, change):
     monkeypatch.setattr(trainer._Run, "_descend", changed)
 
 
-@pytest.mark.parametrize(("name", "step"), [("field", 6), ("ntf", 10)])
+@pytest.mark.parametrize(("name", "step"), [("field", 6), ("ntf", 14)])
 def test_a_nan_is_rolled_back_and_reported(photographs, tmp_path, monkeypatch, capsys, name, step):
     def once(run, loss):
         return loss * float("nan") if run.step == step and not run.faults else loss

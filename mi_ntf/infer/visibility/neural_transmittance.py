@@ -3,22 +3,23 @@
 
 import drjit as dr
 
-from ...core import logistic, spheres
+from ...core import mixture, spheres
 from .. import ops
 
 
 class NeuralTransmittance:
-    """`field`: a :class:`mi_ntf.infer.network.NetworkField`."""
+    """`field`: a :class:`mi_ntf.infer.network.NetworkField`; `profile`: a
+    :class:`mi_ntf.infer.profile.DepthProfile` of the same field."""
 
-    def __init__(self, field):
-        self.field = field
+    def __init__(self, field, profile):
+        self.field, self.profile = field, profile
 
     def tau(self, x, wi, distance, index, active):
-        """S(a (t' − b)); for a light inside the sphere, over its value at the light, which is where τ is 1."""
-        hit, _m, h, a, b = self.field.transmittance_parameters(x, wi)
+        """The ray's τ at x; for a light inside the sphere, over its value at the light, which is where τ is 1."""
+        hit, h, mix = self.field.ray_mixture(x, wi, self.profile)
         t = dr.maximum(spheres.coordinate(x, wi), -h)
-        depth = logistic.optical_depth(ops, t, a, b)
+        depth = mixture.optical_depth(ops, t, mix)
         inside = t + distance < h
-        beyond = logistic.optical_depth(ops, dr.select(inside, t + distance, t), a, b)
-        depth = dr.select(inside, dr.maximum(depth - beyond, 0), depth)
+        beyond = mixture.optical_depth(ops, dr.select(inside, t + distance, t), mix)
+        depth = dr.select(inside, dr.maximum(depth - beyond, 0), dr.maximum(depth, 0))
         return dr.select(hit, dr.exp(-depth), 1)

@@ -1,5 +1,5 @@
-"""The transmittance map: per light, a 2-D table of the logistic's (a, b) (method.md, section 6; Shafiei et al. 2021,
-section 3.3, with the slips of its algorithms corrected).
+"""The transmittance map: per light, a 2-D table of the logistic's (a, b), or of a mixture of logistics (method.md,
+section 6; Shafiei et al. 2021, section 3.3, with the slips of its algorithms corrected).
 
 A light's rays: parallel (directional) or through a pinhole at the light (point). The map is the smallest of a few
 rectangles around the object as the light sees it, cut into at most m² square texels: as many as a map of m × m, where
@@ -7,29 +7,31 @@ they serve best. A texel holds (a, b) of the ray through its centre, towards the
 nearest rays and interpolates the four τ bilinearly, never (a, b).
 """
 
+import math
 from types import ModuleType
 
 import drjit as dr
 import numpy as np
 
-from ...core import logistic, spheres
+from ...core import logistic, mixture, spheres
 from ...core.errors import MiNtfError
 from ...core.ops import dot
 from .. import ops
 from ..lights import LightTable
-from ..march import clear_distance, safe_inverse
 
 _ROW = 18
 
 
 class TransmittanceMap:
-    """Maps of all lights of a table, m² texels each, in one Dr.Jit texture of (a, b), layer upon layer.
+    """Maps of all lights of a table, m² texels each, in one Dr.Jit texture of mixtures, layer upon layer.
 
-    `fit(o, d) → (a, b)` solves the logistic of rays through `o` towards the light along `d`. `hull` (k, 3): points
-    whose convex hull holds all density, inside a ball of `radius`. Memory: 8 m² bytes a light.
+    `source`: ``(fit, K)``; `fit(o, d)` solves the mixture of K logistics of rays through `o` towards the light along
+    `d`. `hull` (k, 3): points whose convex hull holds all density. Memory: 8 m² bytes a light for one logistic, whose
+    weight is 1 and not stored, 16 K m² for mixtures.
     """
 
-    def __init__(self, lights: LightTable, resolution: int, hull: np.ndarray, fit, dj: ModuleType):
+    def __init__(self, lights: LightTable, resolution: int, hull: np.ndarray, source, dj: ModuleType):
+        fit, self.components = source
         self.dj, self.m, self.count = dj, resolution, lights.count
         self._rows = dj.Float(_frames(lights, hull, resolution).astype(np.float32).ravel())
         self.texture = self._build(fit)
@@ -50,10 +52,10 @@ class TransmittanceMap:
         result = 0
         for du, dv in ((0, 0), (1, 0), (0, 1), (1, 1)):
             tu, tv = dr.clip(iu + du, 0, columns - 1), dr.clip(iv + dv, 0, lines - 1)
-            a, b = self._fetch(index, columns, tu, tv, inside)
+            mix = self._fetch(index, columns, tu, tv, inside)
             t = self._coordinate(light, x, wi, tu, tv)
             weight = (wu if du else 1 - wu) * (wv if dv else 1 - wv)
-            result += weight * logistic.transmittance(ops, t, a, b)
+            result += weight * mixture.transmittance(ops, t, mix)
         return dr.select(inside, result, 1)
 
     def _lines(self, columns):
@@ -62,8 +64,18 @@ class TransmittanceMap:
     def _fetch(self, index, columns, tu, tv, active):
         uint = self.dj.UInt32
         texel = uint(index) * (self.m * self.m) + uint(tv) * uint(columns) + uint(tu)
-        pair = dr.gather(self.dj.Array2f, self.texture.tensor().array, texel, active)
-        return pair[0], pair[1]
+        values = self.texture.tensor().array
+        if self.components == 1:
+            return ((1.0, *dr.gather(self.dj.Array2f, values, texel, active)),)
+        first = texel * self.components
+        rows = [dr.gather(self.dj.Array4f, values, first + k, active) for k in range(self.components)]
+        return tuple((row[0], row[1], row[2]) for row in rows)
+
+    def _store(self, values, texel, mix):
+        if self.components == 1:
+            return dr.scatter(values, self.dj.Array2f(*mix[0][1:]), texel)
+        for k, part in enumerate(mix):
+            dr.scatter(values, self.dj.Array4f(*part, 0), texel * self.components + k)
 
     def _light(self, index, active):
         """Axis away from the light, two vectors across, position, window (centre u, v; half width u, v), point flag,
@@ -91,7 +103,8 @@ class TransmittanceMap:
 
     def _build(self, fit):
         texels = self.m * self.m
-        values = dr.zeros(self.dj.Float, 2 * texels * self.count)
+        channels = 2 if self.components == 1 else 4 * self.components
+        values = dr.zeros(self.dj.Float, channels * texels * self.count)
         # A chunk of lights at a time bounds what a map source holds per ray.
         chunk = max(1, (1 << 22) // texels)
         for first in range(0, self.count, chunk):
@@ -100,10 +113,9 @@ class TransmittanceMap:
             light = self._light(i // texels, True)
             rest, columns = i % texels, self.dj.UInt32(light[6])
             origin, d = self._ray(light, self.dj.Float(rest % columns), self.dj.Float(rest // columns))
-            a, b = fit(origin, d)
-            dr.scatter(values, self.dj.Array2f(a, b), i)
+            self._store(values, i, fit(origin, d))
             dr.eval(values)
-        tensor = self.dj.TensorXf(values, (self.count * self.m, self.m, 2))
+        tensor = self.dj.TensorXf(values, (self.count * self.m, self.m, channels))
         return self.dj.Texture2f(tensor, use_accel=False, filter_mode=dr.FilterMode.Nearest)
 
 
@@ -150,65 +162,45 @@ def _window(lights: LightTable, axis, u, v, hull) -> np.ndarray:
     return np.stack([rows[0][0], rows[1][0], rows[0][1], rows[1][1]], axis=1)
 
 
-def network_source(field):
-    """`map_source=network`: (a, b) by one query of the ray network; τ = 1 where the ray misses the sphere."""
-
-    def fit(o, d):
-        hit, _m, _h, a, b = field.transmittance_parameters(o, d)
-        return dr.select(hit, a, 1), dr.select(hit, b, CLEAR)
-
-    return fit
-
-
 CLEAR = -100.0
 """b of a ray that nothing blocks: S(1·(t + 100)) = 1 in float32 for every t of the sphere."""
 
 
-def field_source(density, grid, step):
-    """`map_source=field`: march the field once per ray, from the light inwards, and solve (a, b) in closed form."""
+def network_source(field, profile):
+    """`map_source=network`: the mixture by one query of the ray network; τ = 1 where the ray meets nothing."""
 
     def fit(o, d):
-        hit, m, h = spheres.chord(ops, o, d)
-        back = tuple(-c for c in d)
-        inverse = safe_inverse(back)
-        floats = type(o[0])
-        n = dr.width(h)
-        levels = [dr.log(4 / 3), dr.log(2.0), dr.log(4.0)]
+        hit, _h, mix = field.ray_mixture(o, d, profile)
+        share = 1 / len(mix)
+        return tuple((dr.select(hit, w, share), dr.select(hit, a, 1), dr.select(hit, b, CLEAR)) for w, a, b in mix)
 
-        def body(s, depth, first, c0, c1, c2, active):
-            p = tuple(mi + (h - s - 0.5 * step) * di for mi, di in zip(m, d, strict=True))
-            skip = clear_distance(grid, p, inverse)
-            empty = skip > 0
-            sigma = dr.select(active & ~empty, density(p), 0)
-            after = depth + sigma * step
-            rate = dr.rcp(dr.maximum(sigma, 1e-6))
-            crossings = [
-                dr.select((depth < q) & (after >= q), s + (q - depth) * rate, c)
-                for c, q in zip((c0, c1, c2), levels, strict=True)
-            ]
-            first = dr.select((depth == 0) & (after > 0), s, first)
-            s = s + dr.select(empty, skip + 1e-4, step)
-            return s, after, first, *crossings, active & (s < 2 * h) & (after < levels[2])
+    return fit, field.components
 
-        zero = dr.zeros(floats, n)
-        state = (zero, floats(zero), floats(zero), floats(zero), floats(zero), floats(zero), dr.mask_t(floats)(hit))
-        _s, depth, first, c0, c1, c2, _ = dr.while_loop(
-            state=state, cond=lambda s, depth, first, c0, c1, c2, active: active, body=body, label="map march"
-        )
-        a, b = logistic.through_quantiles(ops, h - c0, h - c1, h - c2)
+
+LEVELS = (1e-3, math.log(4 / 3), math.log(2), math.log(4))
+"""Optical depths where matter begins and where τ is 3/4, 1/2 and 1/4."""
+
+
+def field_source(profile):
+    """`map_source=field`: march the field once per ray, from the light inwards, and solve one logistic in closed
+    form."""
+
+    def fit(o, d):
+        hit, _m, h = spheres.chord(ops, o, d)
+        (first, *places), depth = profile(o, d, LEVELS)
+        a, b = logistic.through_quantiles(ops, *places)
         a_part, b_part = _partial(h, first, depth)
-        blocked, clear = depth >= levels[2], ~hit | (depth < 1e-3)
+        blocked, clear = depth >= LEVELS[-1], ~hit | (depth < LEVELS[0])
         a, b = dr.select(blocked, a, a_part), dr.select(blocked, b, b_part)
-        return dr.select(clear, 1, a), dr.select(clear, CLEAR, b)
+        return ((1.0, dr.select(clear, 1, a), dr.select(clear, CLEAR, b)),)
 
-    return fit
+    return fit, 1
 
 
-def _partial(h, first, depth):
+def _partial(h, begin, depth):
     """(a, b) of a ray that keeps p = e^−depth > 1/4 of the light: a logistic cannot rest at p, so it passes (1 + p)/2
     where the matter begins and p halfway from there to the far end."""
     p = dr.exp(-depth)
     top, low = dr.log((1 + p) / dr.maximum(1 - p, 1e-4)), dr.log(p / dr.maximum(1 - p, 1e-4))
-    begin = h - first
     a = (top - low) / dr.maximum(0.5 * (begin + h), 1e-2)
     return a, begin - top / a

@@ -1,0 +1,61 @@
+"""What the transmittance network reads of a ray: where along the chord the light is used up.
+
+Seen from the light-side end of the chord, the optical depth D(t) = ∫_t^h σ grows from 0. A ray is described by the
+places t_j where D passes the `LEVELS`, and by its depth at the far end. A network that sees them has the profile's
+shape before it; one that sees the end points of the ray alone would have to know the whole object by heart (measured
+on the scene `statue` after two minutes of training: RMS error of τ 0.04 against 0.2 and more).
+
+All lengths enter relative to a centre c (half of the light is gone) and a width s (between 90 and 10 % of the light),
+so one network serves skins of every width, at every place. Arguments are scalar arrays or tuples of them; `ops` is the
+namespace of elementary functions.
+"""
+
+from . import logistic
+
+LEVELS = (0.03, 0.1, 0.29, 0.69, 1.39, 2.3, 4.0)
+"""Optical depths; τ = 0.97, 0.9, 0.75, 0.5, 0.25, 0.1, 0.02."""
+FEATURES = 2 * len(LEVELS) + 4
+MIN_WIDTH = 2e-3
+"""Half of the thinnest skin that the field can hold (σ ≤ 665)."""
+_STEEP = 2.5
+
+
+def frame(ops, places, total, h):
+    """``(c, s, t, crossed)`` of a ray.
+
+    places  per level, where D passes it (arbitrary where it does not)
+    total   D at the far end (exact up to the last level, beyond that at least that level)
+    h       half chord
+
+    `t`: the places, −1.2 h where D does not get that far; `crossed`: 1 or 0 per level.
+    """
+    reached = [total >= level for level in LEVELS]
+    far = -logistic.MAX_CENTRE * h
+    t = [ops.where(r, p, far) for r, p in zip(reached, places, strict=True)]
+    crossed = [ops.where(r, 0 * h + 1, 0 * h) for r in reached]
+    begin = ops.where(reached[1], t[1], ops.where(reached[0], t[0], h))
+    c = ops.where(reached[3], t[3], -h)
+    return c, ops.maximum(begin - t[5], MIN_WIDTH), t, crossed
+
+
+def features(ops, places, total, h):
+    """The network's ``FEATURES`` inputs, all of order 1; arguments as in :func:`frame`."""
+    c, s, t, crossed = frame(ops, places, total, h)
+    relative = [ops.minimum(ops.maximum((p - c) / s, -4.0), 4.0) for p in t]
+    rest = ops.exp(-ops.minimum(total, LEVELS[-1]))
+    return [*relative, *crossed, ops.log(s), rest, c / h, ops.minimum((h - c) / s, 20.0) / 10]
+
+
+def components(ops, raw, places, total, h):
+    """Slopes and centres of the ray's logistics from the network's outputs `raw` (a then b for each component).
+
+    a = (2/s) exp(±2.5), at most e^6.5; b = c ± 4 s: a component far behind the chord is what remains of the light at
+    its far end. Zero outputs are the logistic through the middle of the profile.
+    """
+    c, s, _, _ = frame(ops, places, total, h)
+    result = []
+    for k in range(len(raw) // 2):
+        a = 2 / s * ops.exp(_STEEP * logistic.tanh(ops, raw[2 * k] / _STEEP))
+        b = c + 4 * s * logistic.tanh(ops, raw[2 * k + 1] / 4)
+        result.append((ops.minimum(a, logistic.MAX_SLOPE), b))
+    return result
