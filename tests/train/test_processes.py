@@ -69,7 +69,7 @@ def test_two_processes_are_one(photographs, undisturbed, tmp_path):
     out = tmp_path / "f"
     launcher = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2")
     text = execute(photographs, out, launcher=launcher)
-    assert text.count("step 17: the field is finished") == 1, "one process prints"
+    assert text.count("step 18: the field is finished") == 1, "one process prints"
     (expected, tensors), (found, values) = undisturbed, result(out)
     relative = {k: abs(found["losses"][k] / v - 1) for k, v in expected["losses"].items()}
     assert len(relative) == STEPS and max(relative.values()) < 1e-5, relative
