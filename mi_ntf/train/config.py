@@ -33,7 +33,7 @@ class TrainConfig:
     """Weight of an even density along surfaces."""
     sharp: float = 1e-3
     """Weight of thin skins: −ln σ where pictures see matter."""
-    gloss: float = 0.01
+    gloss: float = 2e-3
     """Weight of the specular share: a rough lobe can stand in for the diffuse one in flash photographs, and then sends
     half as much again into all other directions."""
     smooth: float = 1e-3
