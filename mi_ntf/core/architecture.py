@@ -1,13 +1,15 @@
 """What a field file holds: the networks' shapes, the similarity transform, the provenance.
 
-A field has three networks, each an encoding followed by a ReLU multilayer perceptron:
+A field has three or four networks, each an encoding followed by a ReLU multilayer perceptron:
 
     density        x → 1        raw; σ = exp(raw), see :data:`MAX_LOG_DENSITY`; 1/(unit-sphere radius)
     reflectance    x → 8        raw normal (3), albedo (3), roughness (1), specular weight (1)
     transmittance  ray → 3K−1   raw (a, b) of K logistics, then K−1 weights; :mod:`mi_ntf.core.mixture`
+    visibility     x, ω → 1     raw τ, through a sigmoid, of the way from x towards the light; only where asked for
 
 The third sees a ray as its optical depths (encoding `depth`, :mod:`mi_ntf.core.depth_profile`) or, as in the paper, as
-its end points p1 and p2 (encoding `frequency` of the six coordinates).
+its end points p1 and p2 (encoding `frequency` of the six coordinates). The fourth is the baseline, NeRV's
+(Srinivasan et al. 2021): one query for each point and direction, and nothing makes τ monotone.
 """
 
 import math
@@ -25,6 +27,9 @@ MEAN_FLOOR = -6.0
 """Where ln σ is averaged over space, lower values count as this: they are empty all the same, and must not thin out a
 skin beside them."""
 NAMES = ("density", "reflectance", "transmittance")
+"""Networks of every field."""
+
+NO_VISIBILITY = "the field has no visibility network; train it with `mi-ntf train --visibility-mlp`"
 
 
 @dataclass(frozen=True)
@@ -53,10 +58,11 @@ class Network:
     """Logistics of a ray; 1 for the other networks."""
 
     def inputs(self, name: str) -> int:
-        return self.encoding.width(6 if name == "transmittance" else 3)
+        return self.encoding.width(6 if name in ("transmittance", "visibility") else 3)
 
     def outputs(self, name: str) -> int:
-        return {"density": 1, "reflectance": 8, "transmittance": 3 * self.components - 1}[name]
+        return {"density": 1, "reflectance": 8, "transmittance": 3 * self.components - 1,
+                "visibility": 1}[name]
 
 
 @dataclass(frozen=True)
@@ -64,9 +70,12 @@ class Architecture:
     density: Network
     reflectance: Network
     transmittance: Network
+    visibility: Network | None = None
 
     def networks(self) -> dict[str, Network]:
-        return {name: getattr(self, name) for name in NAMES}
+        """Name → network of those that the field has."""
+        optional = {} if self.visibility is None else {"visibility": self.visibility}
+        return {name: getattr(self, name) for name in NAMES} | optional
 
     def skeleton(self) -> dict[str, tuple[int, ...]]:
         """Name → shape of every tensor of the file. Layers are (outputs, inputs), planes (3, v, u, channels)."""
@@ -110,6 +119,8 @@ def header_from_json(data: dict, source: str) -> Header:
             f"{source}: field format {version!r}, this build reads {FORMAT}; train or export the field anew")
     try:
         nets = {name: _network(data["architecture"][name], name) for name in NAMES}
+        if data["architecture"].get("visibility") is not None:  # absent from files of earlier builds
+            nets["visibility"] = _network(data["architecture"]["visibility"], "visibility")
         center = [float(c) for c in data["similarity"]["center"]]
         if len(center) != 3:
             raise ValueError(f"similarity center {center}, expected 3 numbers")
@@ -125,7 +136,7 @@ def header_from_json(data: dict, source: str) -> Header:
 def _network(data: dict, name: str) -> Network:
     e = data["encoding"]
     encoding = Encoding(e["kind"], tuple(e["resolutions"]), e["channels"], e["octaves"])
-    legal = ("frequency", "depth") if name == "transmittance" else ("planes", "frequency")
+    legal = {"transmittance": ("frequency", "depth"), "visibility": ("frequency",)}.get(name, ("planes", "frequency"))
     if encoding.kind not in legal:
         raise ValueError(f"encoding kind {encoding.kind!r} of {name}, expected one of {', '.join(legal)}")
     network = Network(encoding, tuple(data["hidden"]), data["components"])
@@ -141,3 +152,12 @@ FAST = Architecture(
     transmittance=Network(Encoding("depth"), (32, 32), components=2),
 )
 """Trains in minutes on two CPU cores: 12 bilinear fetches per sample and small perceptrons."""
+
+_PAPER = Network(Encoding("frequency", octaves=10), (256,) * 8)
+PAPER = Architecture(density=_PAPER, reflectance=_PAPER, transmittance=_PAPER)
+"""The paper's sizes (method.md, sections 1 and 4): 8 layers of 256 units on 10 octaves, one logistic from the two end
+points of a ray. Density and reflectance, which the paper reads from one network, are two, as in every field file, and
+no layer sees the encoding again."""
+
+VISIBILITY = Network(Encoding("frequency", octaves=6), (128,) * 4)
+"""The network `visibility` of fields that are trained with it."""

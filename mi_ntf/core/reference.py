@@ -9,7 +9,8 @@ by ReLU.
 import numpy as np
 
 from . import depth_profile, logistic, mixture, ops, spheres
-from .architecture import MAX_LOG_DENSITY, MIN_LOG_DENSITY, Architecture, Encoding
+from .architecture import MAX_LOG_DENSITY, MIN_LOG_DENSITY, NO_VISIBILITY, Architecture, Encoding
+from .errors import MiNtfError
 from .microfacet import MIN_ROUGHNESS
 
 PLANES = ((0, 1), (0, 2), (1, 2))
@@ -63,6 +64,14 @@ def reflectance(arch: Architecture, tensors: dict, x: np.ndarray) -> np.ndarray:
     rest = logistic.sigmoid(ops, raw[:, 3:])
     rest[:, 3] = MIN_ROUGHNESS + (1 - MIN_ROUGHNESS) * rest[:, 3]
     return np.concatenate([normal, rest], axis=1)
+
+
+def visibility(arch: Architecture, tensors: dict, x: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """τ (n,) from the points `x` (n, 3) along the unit directions `d` towards the light, by the baseline's network."""
+    if arch.visibility is None:
+        raise MiNtfError(NO_VISIBILITY)
+    features = encode(arch.visibility.encoding, tensors, "visibility", np.concatenate([x, d], axis=1))
+    return logistic.sigmoid(ops, perceptron(tensors, "visibility", features)[:, 0])
 
 
 def ray_mixture(arch: Architecture, tensors: dict, o: np.ndarray, d: np.ndarray, places=None, total=None):

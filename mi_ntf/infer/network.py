@@ -7,7 +7,8 @@ import numpy as np
 from drjit import nn
 
 from ..core import depth_profile, logistic, mixture, spheres
-from ..core.architecture import MAX_LOG_DENSITY, MIN_LOG_DENSITY, Encoding, Header
+from ..core.architecture import MAX_LOG_DENSITY, MIN_LOG_DENSITY, NO_VISIBILITY, Encoding, Header
+from ..core.errors import MiNtfError
 from ..core.microfacet import MIN_ROUGHNESS
 from ..core.ops import normalize
 from ..core.reference import PLANES
@@ -40,6 +41,8 @@ class NetworkField:
         self._density = _Network(arch.density.encoding, "density", tensors, dj)
         self._reflectance = _Network(arch.reflectance.encoding, "reflectance", tensors, dj)
         self._transmittance = _Network(arch.transmittance.encoding, "transmittance", tensors, dj)
+        baseline = arch.visibility
+        self._visibility = None if baseline is None else _Network(baseline.encoding, "visibility", tensors, dj)
 
     def log_density(self, p):
         """ln σ at `p`, clipped to the legal range; without the cuts of :meth:`density`."""
@@ -56,6 +59,13 @@ class NetworkField:
         normal = normalize(ops, tuple(raw[:3]))
         r, g, b, rough, spec = (logistic.sigmoid(ops, v) for v in raw[3:])
         return normal, (r, g, b), MIN_ROUGHNESS + (1 - MIN_ROUGHNESS) * rough, spec
+
+    def visibility(self, p, d):
+        """τ from `p` along the unit directions `d` towards the light, by the baseline's network: a query a point."""
+        if self._visibility is None:
+            raise MiNtfError(NO_VISIBILITY)
+        (raw,) = self._visibility.layers(self._visibility.encode((*p, *d)))
+        return logistic.sigmoid(ops, raw)
 
     def ray_mixture(self, o, d, profile):
         """``(hit, h, mixture)`` of the rays through `o` along unit directions `d` towards the light: one query a ray.

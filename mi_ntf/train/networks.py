@@ -1,4 +1,4 @@
-"""The three networks in PyTorch: the trainable twin of :mod:`mi_ntf.core.reference`, same conventions, same names.
+"""The networks in PyTorch: the trainable twin of :mod:`mi_ntf.core.reference`, same conventions, same names.
 
 Tensors live in the file's own layout, planes as (3, v, u, channels): seen as (3, channels, v, u) that is PyTorch's
 "channels last", the layout in which ``grid_sample`` is three times faster.
@@ -12,7 +12,8 @@ import torch
 import torch.nn.functional as F
 
 from ..core import depth_profile, logistic, mixture, spheres
-from ..core.architecture import MAX_LOG_DENSITY, MIN_LOG_DENSITY, Architecture, Encoding
+from ..core.architecture import MAX_LOG_DENSITY, MIN_LOG_DENSITY, NO_VISIBILITY, Architecture, Encoding
+from ..core.errors import MiNtfError
 from ..core.microfacet import MIN_ROUGHNESS
 from ..core.reference import PLANES
 from . import ops
@@ -64,6 +65,14 @@ class Networks:
             pairs = [logistic.parameters(ops, raw[i], raw[i + 1], h) for i in range(0, count, 2)]
         mix = mixture.from_outputs(ops, pairs, list(raw[count:]), h)
         return hit, torch.stack([torch.stack(part, 1) for part in mix], 1)
+
+    def visibility(self, x: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
+        """τ (n,) from the points `x` (n, 3) along unit directions `d` towards the light, by the baseline's network."""
+        net = self.architecture.visibility
+        if net is None:
+            raise MiNtfError(NO_VISIBILITY)
+        features = encode(net.encoding, self.tensors, "visibility", torch.cat([x, d], 1))
+        return torch.sigmoid(perceptron(self.tensors, "visibility", features)[:, 0])
 
 
 def crossings(profile: torch.Tensor, h: torch.Tensor, levels: torch.Tensor) -> torch.Tensor:

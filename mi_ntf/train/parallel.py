@@ -78,6 +78,9 @@ class Shared(Networks):
     def ray_mixture(self, o, d, profile):
         return divided(Networks(**vars(self)).ray_mixture, o, d, profile)
 
+    def visibility(self, x, d):
+        return divided(Networks(**vars(self)).visibility, x, d)
+
 
 def divided(function: Callable, *arguments: torch.Tensor):
     """``function(*arguments)``, each process computing some of the rows.

@@ -42,8 +42,8 @@ class Image:
     raw: torch.Tensor
 
 
-def weights(sigma: torch.Tensor, ray: torch.Tensor, step: float):
-    """``(w, v)``, alpha and light weights of packed samples: `ray` (s,) ascending, `sigma` (s,).
+def weights(sigma: torch.Tensor, ray: torch.Tensor, step: float | torch.Tensor):
+    """``(w, v)``, alpha and light weights of packed samples: `ray` (s,) ascending, `sigma` (s,), `step` one or (s,).
 
     Sums run over all rays at once, in float64: at the last ray the sum is 10⁵, of which float32 keeps two decimals.
     """
@@ -70,8 +70,8 @@ def shade(networks: Networks, x: torch.Tensor, d: torch.Tensor, t: torch.Tensor,
     return SURFACE * lobe * light / (t * t)[:, None], normal, specular
 
 
-def render(networks: Networks, rays: Rays, samples, step: float) -> Image:
-    """Colour and alpha of `rays` from packed ``(ray, t)`` samples."""
+def render(networks: Networks, rays: Rays, samples, step: float | torch.Tensor) -> Image:
+    """Colour and alpha of `rays` from packed ``(ray, t)`` samples in cells of `step`, one length or each its own."""
     ray, t = samples
     x = torch.addcmul(rays.o[ray], rays.d[ray], t[:, None])
     raw = networks.log_density(x)

@@ -1,5 +1,6 @@
 """Field files: what is written comes back, and every fault is named with its remedy."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -70,6 +71,20 @@ def test_describe_counts_parameters(saved):
     assert info["parameters"]["reflectance"] == 15 * 4 + 4 + 4 * 3 + 3 + 3 * 8 + 8
     assert info["bytes"] == path.stat().st_size and info["similarity"]["radius"] == 3.0
     json.dumps(info)
+
+
+def test_fields_with_a_visibility_network_and_old_ones_without(tmp_path):
+    both = dataclasses.replace(SMALL, visibility=Network(Encoding("frequency", octaves=1), (3,)))
+    assert set(both.skeleton()) - set(SMALL.skeleton()) == {
+        f"visibility.layers.{i}.{part}" for i in (0, 1) for part in ("weight", "bias")}
+    assert both.skeleton()["visibility.layers.0.weight"] == (3, 18)  # 6 + 1 octave · (sin, cos) · 6
+    tensors = make_tensors(both)
+    field_file.save(tmp_path / "f", Header(both), tensors)
+    header, found = field_file.load(tmp_path / "f")
+    assert header.architecture == both and set(found) == set(tensors)
+    old = Header(SMALL).to_json()
+    del old["architecture"]["visibility"]
+    assert header_from_json(json.loads(json.dumps(old)), "old").architecture == SMALL
 
 
 def test_fast_preset_survives_json():

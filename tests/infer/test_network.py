@@ -11,6 +11,7 @@ from helpers import fields
 from mi_ntf.core import field_file, reference
 from mi_ntf.core.architecture import MEAN_FLOOR, Architecture, Encoding, Header, Network
 from mi_ntf.core.depth_profile import LEVELS
+from mi_ntf.core.errors import MiNtfError
 from mi_ntf.infer.grid import CELLS, GridField
 from mi_ntf.infer.network import CLEAR_DEPTH, MIN_DENSITY, NetworkField
 
@@ -20,7 +21,8 @@ SCENES = Path(__file__).parents[2] / "scenes"
 def random_field(rng, encoding=None):
     encoding = encoding or Encoding("planes", (16, 32), 4)
     rays = Encoding("frequency", octaves=3)
-    arch = Architecture(*(Network(encoding, (16, 24)) for _ in range(2)), Network(rays, (16, 24), components=2))
+    arch = Architecture(*(Network(encoding, (16, 24)) for _ in range(2)), Network(rays, (16, 24), components=2),
+                        Network(rays, (24, 16)))
     return Header(arch), {k: rng.normal(size=s) * 0.4 for k, s in arch.skeleton().items()}
 
 
@@ -110,6 +112,18 @@ def test_ray_mixture(case, rng):
         for value, expected in zip(ours_k[:2], truth_k[:2], strict=True):
             close(np.log(value), np.log(expected), 1e-4)
         close(ours_k[2], truth_k[2], 1e-4)
+
+
+def test_visibility(rng):
+    header, tensors = random_field(rng)
+    x, d = rng.uniform(-0.57, 0.57, (5000, 3)), rng.normal(size=(5000, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    x, d = (v.astype(np.float32).astype(np.float64) for v in (x, d))
+    truth = reference.visibility(header.architecture, tensors, x, d)
+    close(NetworkField(header, tensors, mi).visibility(arrays(x), arrays(d)), truth)
+    assert np.ptp(truth) > 0.1
+    with pytest.raises(MiNtfError, match="no visibility network; train it with `mi-ntf train --visibility-mlp`"):
+        NetworkField(*fields.uniform(5.0), mi).visibility(arrays(x), arrays(d))
 
 
 def test_gradient_of_density_reaches_positions(rng):

@@ -14,7 +14,8 @@ from mi_ntf.train import networks, ops  # noqa: E402
 
 SMALL = Architecture(density=Network(Encoding("planes", (5, 9), 3), (7,)),
                      reflectance=Network(Encoding("frequency", octaves=3), (8,)),
-                     transmittance=Network(Encoding("frequency", octaves=2), (9, 5), components=2))
+                     transmittance=Network(Encoding("frequency", octaves=2), (9, 5), components=2),
+                     visibility=Network(Encoding("frequency", octaves=2), (7, 6)))
 
 
 def field(dtype, seed=0):
@@ -40,8 +41,10 @@ def test_networks_agree_with_the_oracle(dtype, tolerance):
     tx, td = torch.tensor(x, dtype=dtype), torch.tensor(d, dtype=dtype)
     matter = np.split(reference.reflectance(SMALL, tensors, x), (3, 6, 7), axis=1)
     mixture = reference.ray_mixture(SMALL, tensors, x * 0.5, d)[1]
-    expected = [reference.density(SMALL, tensors, x), *matter, np.stack(mixture).transpose(2, 0, 1)]
-    actual = [nets.density(tx), *nets.reflectance(tx), nets.ray_mixture(tx * 0.5, td, None)[1]]
+    expected = [reference.density(SMALL, tensors, x), *matter, np.stack(mixture).transpose(2, 0, 1),
+                reference.visibility(SMALL, tensors, x, d)]
+    actual = [nets.density(tx), *nets.reflectance(tx), nets.ray_mixture(tx * 0.5, td, None)[1],
+              nets.visibility(tx, td)]
     for want, have in zip(expected, actual, strict=True):
         want = want.reshape(tuple(have.shape))
         assert np.abs(have.detach().numpy() - want).max() <= tolerance * np.abs(want).max()
