@@ -1,8 +1,10 @@
 """What decides a training run. Times are shares of the whole run, so a schedule scales with --minutes and --steps."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
-from ..core.architecture import FAST, Architecture
+from ..core.architecture import FAST, PAPER, VISIBILITY, Architecture, Encoding, Network
+from ..core.errors import MiNtfError
 
 
 @dataclass(frozen=True)
@@ -50,4 +52,59 @@ class TrainConfig:
     """Also compare pixels lit by the learned transmittance with the photographs."""
 
 
-PRESETS = {"fast": TrainConfig()}
+@dataclass(frozen=True)
+class HierarchicalConfig:
+    """The paper's recipe (method.md, section 5), see :mod:`mi_ntf.train.hierarchical`. It trains for days."""
+
+    architecture: Architecture = PAPER
+    coarse: int = 64
+    """Stratified samples along each ray."""
+    fine: int = 128
+    """More of them, drawn from the weights of the coarse ones."""
+    images: int = 4
+    """Photographs a step …"""
+    patch: int = 16
+    """… and the edge of the square seen of each, in pixels."""
+    random_rays: int = 128
+    """Rays through two random points of the sphere a step, with augmentation."""
+    lr: float = 2e-5
+    """Adam's, to the end."""
+    log_density: float = 0.0
+    """ln σ at the start."""
+    augmentation: bool = True
+    colour_loss: bool = True
+    step: float = 1 / 100
+    """Cells of validation's quadrature, which is the renderer's and not that of training."""
+    cells: int = 64
+    """Grid of the cells that validation's rays are marched in."""
+    ntf_alone: ClassVar[float] = 1.0
+    """Field and transmittance learn together to the end."""
+
+
+PRESETS = {"fast": TrainConfig(), "paper": HierarchicalConfig()}
+
+
+NTF = {
+    "mixture2": FAST.transmittance,
+    "logistic": replace(FAST.transmittance, components=1),
+    "ray": Network(Encoding("frequency", octaves=6), (128, 128, 128, 128)),
+}
+"""Transmittance networks by name: two logistics or one, read from the ray's optical depths; and the paper's kind, one
+logistic from the ray's end points alone, of a size that CPUs can train."""
+
+
+def configured(preset: str, *, ntf: str | None = None, augmentation: bool = True,
+               colour_loss: bool = True, visibility_mlp: bool = False) -> TrainConfig | HierarchicalConfig:
+    """The recipe `preset` with another transmittance network, without parts of its training, or with the baseline's
+    network (NeRV's, of a point and a direction) trained on the same transmittance beside it."""
+    if preset not in PRESETS:
+        raise MiNtfError(f"preset '{preset}' is unknown; it is one of {', '.join(PRESETS)}")
+    if ntf is not None and ntf not in NTF:
+        raise MiNtfError(f"--ntf '{ntf}' is unknown; it is one of {', '.join(NTF)}")
+    config = replace(PRESETS[preset], augmentation=augmentation, colour_loss=colour_loss)
+    architecture = config.architecture
+    if ntf is not None:
+        architecture = replace(architecture, transmittance=NTF[ntf])
+    if visibility_mlp:
+        architecture = replace(architecture, visibility=VISIBILITY)
+    return replace(config, architecture=architecture)

@@ -1,5 +1,7 @@
 """What is minimised (method.md, section 5). Every term is a mean over rays, samples or points, a 0-d tensor."""
 
+from dataclasses import dataclass
+
 import torch
 import torch.nn.functional as F
 
@@ -82,17 +84,31 @@ def tau(mix: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
     return mixture.transmittance(ops, t, tuple(part[:, :, None].unbind(1) for part in mix.unbind(1)))
 
 
-def transmittance(networks: Networks, marched: Marched, o: torch.Tensor, d: torch.Tensor,
-                  generator: torch.Generator) -> torch.Tensor:
-    """Σ (τ_nrf − τ_nt)² on rays through the points `o` (n, 3) along `d` towards the light (method.md, section 5).
+@dataclass(frozen=True)
+class Targets:
+    """Rays through `o` (n, 3) along `d` towards the light, their marched profiles `depth` (n, STEPS + 1), and what is
+    to be learned: τ = `tau` (n, 33) at the places `t` (n, 33), without gradient.
 
-    Along each ray at 16 uniform places, and at 16 where free flight from the light would end: lit surfaces are seen
-    there, and a fit that is right on average over the chord is dark in the first half of the skin. At `o` once more.
-    Targets are marched through the baked density and carry no gradient.
+    16 places of each ray are uniform, and 16 lie where free flight from the light would end: lit surfaces are seen
+    there, and a fit that is right on average over the chord is dark in the first half of the skin. The last is `o`.
     """
+
+    o: torch.Tensor
+    d: torch.Tensor
+    depth: torch.Tensor
+    t: torch.Tensor
+    tau: torch.Tensor
+
+    def error(self, found: torch.Tensor) -> torch.Tensor:
+        """Σ (τ_nrf − τ_nt)² (method.md, section 5): squared errors of `found` (n, 33), means of the three kinds."""
+        error = (found - self.tau) ** 2
+        return error[:, :16].mean() + error[:, 16:32].mean() + error[:, 32].mean()
+
+
+def targets(marched: Marched, o: torch.Tensor, d: torch.Tensor, generator: torch.Generator) -> Targets:
+    """March the rays through the baked density."""
     m, h = chords(o, d)
     depth = marched.march(m, d, h, STEPS)
-    hit, mix = networks.ray_mixture(o, d, depth)
     t = (2 * torch.rand(len(o), 16, generator=generator) - 1) * h[:, None]
     lost = torch.rand(len(o), 16, generator=generator) * -torch.expm1(-depth[:, :1])
     own = spheres.coordinate(o.unbind(1), d.unbind(1))
@@ -100,9 +116,22 @@ def transmittance(networks: Networks, marched: Marched, o: torch.Tensor, d: torc
     place = ((t / h[:, None] + 1) * (STEPS / 2)).clamp(0, STEPS - 1e-3)
     lower = place.floor().long()
     share = place - lower
-    target = torch.exp(-(depth.gather(1, lower) * (1 - share) + depth.gather(1, lower + 1) * share))
-    error = hit[:, None] * (tau(mix, t) - target) ** 2
-    return error[:, :16].mean() + error[:, 16:32].mean() + error[:, 32].mean()
+    reached = depth.gather(1, lower) * (1 - share) + depth.gather(1, lower + 1) * share
+    return Targets(o, d, depth, t, torch.exp(-reached))
+
+
+def transmittance(networks: Networks, rays: Targets) -> torch.Tensor:
+    """The error of the transmittance network; that of rays which miss the sphere counts nothing."""
+    hit, mix = networks.ray_mixture(rays.o, rays.d, rays.depth)
+    return rays.error(torch.where(hit[:, None], tau(mix, rays.t), rays.tau))
+
+
+def visibility(networks: Networks, rays: Targets) -> torch.Tensor:
+    """The error of the baseline's network, which is asked at every place alone."""
+    along = rays.t - (rays.o * rays.d).sum(1, keepdim=True)
+    x = rays.o[:, None] + along[:, :, None] * rays.d[:, None]
+    found = networks.visibility(x.reshape(-1, 3), rays.d.repeat_interleave(rays.t.shape[1], 0))
+    return rays.error(found.view(rays.t.shape))
 
 
 def training_rays(marched: Marched, rays: Rays, count: int, augment: bool, generator: torch.Generator):

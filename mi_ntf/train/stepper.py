@@ -1,61 +1,42 @@
 """One step of training: a batch of photographs' rays, the losses, the optimisers."""
 
-import functools
-import math
 from pathlib import Path
 
 import torch
 
 from ..core.architecture import MAX_LOG_DENSITY
-from ..data.readers import load_dataset
-from . import losses, monitor, networks, parallel, rays, render
+from . import losses, rays, render
 from .baked import Baked
 from .config import TrainConfig
+from .descent import FIELD, Descent, total
 from .marched import Marched
 from .occupancy import LOG_EMPTY, Occupancy
 
 REFRESH = 32
 """Steps between two updates of the occupancy grid; the baked density is renewed at every fourth of them."""
-FIELD = ("density", "reflectance")
-"""Networks that photographs train; the others learn from the field."""
 
 
-class Stepper:
-    """The photographs in `dataset`, the networks, and what a step needs of both. The run lasts `minutes` or `steps`."""
+class Stepper(Descent):
+    """The recipe of the project's own: planes, an occupancy grid in the visual hull, transmittance after the field."""
+
+    HELD = (*Descent.HELD, "samples_per_ray", "last_bake")
+    GRIDS = (("occupancy", ("sigma", "level", "stray")), ("baked", ("slope",)), ("marched", ("log_sigma", "reach")))
+    config: TrainConfig
 
     def __init__(self, dataset: Path, config: TrainConfig, minutes: float | None, steps: int | None, seed: int):
-        self.config, self.minutes, self.steps = config, minutes or math.inf, steps or math.inf
-        self.splits = load_dataset(dataset, monitor.note if parallel.first() else lambda _: None)
-        self.rays = {name: rays.from_split(split, name) for name, split in self.splits.items()}
-        self.generator = torch.Generator().manual_seed(seed)
-        self.nets = parallel.share(networks.initial(config.architecture, config.log_density, self.generator))
-        self.optimizers = {"field": self._optimizer(*FIELD), "ntf": self._optimizer("transmittance")}
+        super().__init__(dataset, config, minutes, steps, seed)
+        self.optimizers = {"field": self._optimizer(*FIELD), "ntf": self._optimizer("transmittance", "visibility")}
         self.occupancy = Occupancy(rays.visual_hull(self.splits["train"], config.cells))
         # Rays that miss the hull have nothing to teach. All others stay for good: matter may grow into any of them.
         _, self.seen = self.occupancy.tighten(self.rays["train"])
         self.baked, self.marched = Baked(config.bake), Marched()
-        bright = self.rays["train"].target
-        bright = bright[bright[:, 3] > 0.99][:, :3].mean(1)
-        self.exposure = 1 / max(float(bright.quantile(0.95)) if 0 < len(bright) else 1.0, 1e-6)
-        self.step, self.spent = 0, 0.0
         self.samples_per_ray, self.last_bake = 30.0, 0
-        self.rate = 1.0
-        """Factor of the learning rates, halved by every fault."""
-        self.watch = monitor.Watch()
-        self.terms: dict[str, torch.Tensor] = {}
-        """The last step's weighted terms of the losses."""
-        self.trained = [0, 0]
-        """Camera rays and their samples that this process has trained on."""
 
     def _optimizer(self, *names: str) -> torch.optim.Adam:
         tensors = {k: v for k, v in self.nets.tensors.items() if k.split(".")[0] in names}
         planes = {"params": [v for k, v in tensors.items() if ".planes." in k], "base": self.config.lr_planes}
         layers = {"params": [v for k, v in tensors.items() if ".layers." in k], "base": self.config.lr_layers}
         return torch.optim.Adam([planes, layers], betas=(0.9, 0.99), eps=1e-12, fused=True)
-
-    def progress(self) -> float:
-        """Share of the run that is done, in [0, 1]."""
-        return max(self.step / self.steps, self.spent / (60 * self.minutes))
 
     def carve(self, steps: int = 300, points: int = 4096) -> None:
         """Give the density the shape of the visual hull, ln σ by regression: seconds that save minutes."""
@@ -68,6 +49,20 @@ class Stepper:
             wanted[points:] = LOG_EMPTY - 2
             self._descend("field", (raw - wanted).square().mean(), 1 - 0.9 * step / steps)
         self.optimizers["field"] = self._optimizer(*FIELD)
+
+    def occupied(self) -> Occupancy:
+        return self.occupancy
+
+    def snapshot(self) -> dict:
+        """The field, without its transmittance, which has yet to learn from it."""
+        tensors = {k: v for k, v in super().snapshot()["tensors"].items() if k.split(".")[0] in FIELD}
+        return {"tensors": tensors, "occupancy": {k: getattr(self.occupancy, k).clone() for k in self.GRIDS[0][1]}}
+
+    def adopt(self, snapshot: dict) -> None:
+        super().adopt(snapshot)
+        for name, value in snapshot["occupancy"].items():
+            setattr(self.occupancy, name, value)
+        self.bake()
 
     def refresh(self) -> None:
         """Bring the no-gradient copies of the density up to date."""
@@ -105,7 +100,7 @@ class Stepper:
         terms["bounds"] = c.empty * torch.relu(image.raw - MAX_LOG_DENSITY).mean()
         terms["even"] = c.even * losses.evenness(self.nets, image, 2048, g)
         matter = image.raw[image.index].clamp(max=MAX_LOG_DENSITY)
-        terms["sharp"] = -c.sharp * (image.weight.detach() * matter).sum() / len(batch)
+        terms["sharp"] = -c.sharp * self.opaque * (image.weight.detach() * matter).sum() / len(batch)
         terms["gloss"] = c.gloss * (image.weight.detach() * image.specular).sum() / len(batch)
         x = self.occupancy.must_be_empty(1536, g)
         if len(x):
@@ -115,10 +110,13 @@ class Stepper:
         return terms, image
 
     def ntf_loss(self, image: render.Image, batch: rays.Rays) -> dict[str, torch.Tensor]:
-        """Name → weighted term of the transmittance network."""
+        """Name → weighted term of the networks that learn transmittance."""
         c, g = self.config, self.generator
         o, d = losses.training_rays(self.marched, batch, c.ntf_rays, c.augmentation, g)
-        terms = {"transmittance": losses.transmittance(self.nets, self.marched, o, d, g)}
+        targets = losses.targets(self.marched, o, d, g)
+        terms = {"transmittance": losses.transmittance(self.nets, targets)}
+        if c.architecture.visibility is not None:
+            terms["visibility"] = losses.visibility(self.nets, targets)
         if c.colour_loss:
             near = min(96, len(batch))
             lit = losses.transmittance_color(self.nets, self.marched, image, batch, self.exposure, near)
@@ -130,7 +128,7 @@ class Stepper:
         c, done = self.config, self.progress()
         alone = done >= c.ntf_alone
         self.refresh()
-        total = 0.0
+        value = 0.0
         batch, samples = self.batch()
         if alone:
             with torch.no_grad():
@@ -141,31 +139,11 @@ class Stepper:
             # Of all terms these two are positive and of a known size.
             self.watch.check("field", float((self.terms["colour"] + self.terms["alpha"]).detach()), self.step)
             rate = c.lr_end ** (done / c.ntf_alone) * min(1.0, (self.step + 1) / 50)
-            total += self._descend("field", _sum(self.terms), rate)
+            value += self._descend("field", total(self.terms), rate)
         if done >= c.ntf_from:
             terms = self.ntf_loss(image, batch)
-            loss = _sum(terms)
+            loss = total(terms)
             self.watch.check("ntf", float(loss.detach()), self.step)
-            total += self._descend("ntf", loss, c.lr_end ** ((done - c.ntf_from) / (1 - c.ntf_from)))
+            value += self._descend("ntf", loss, c.lr_end ** ((done - c.ntf_from) / (1 - c.ntf_from)))
             self.terms |= terms
-        return total
-
-    def _descend(self, name: str, loss: torch.Tensor, rate: float) -> float:
-        optimizer = self.optimizers[name]
-        value = float(loss.detach())
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        parameters = [p for group in optimizer.param_groups for p in group["params"]]
-        parallel.average_gradients(parameters)
-        size = float(torch.nn.utils.get_total_norm([p.grad for p in parameters if p.grad is not None]))
-        if not (math.isfinite(value) and math.isfinite(size)):
-            raise monitor.Fault(f"the {name} loss is {value} and its gradient's length {size} at step {self.step}")
-        for group in optimizer.param_groups:
-            group["lr"] = group["base"] * rate * self.rate
-        optimizer.step()
         return value
-
-
-def _sum(terms: dict[str, torch.Tensor]) -> torch.Tensor:
-    """The sum of `terms`, from the first to the last: its last bit is part of what makes a run reproducible."""
-    return functools.reduce(torch.add, terms.values())

@@ -14,9 +14,11 @@ from ..core import field_file
 from ..core.architecture import Header, Similarity
 from ..core.errors import MiNtfError
 from . import checkpoint, evaluate, networks, parallel
-from .config import PRESETS, TrainConfig
+from .config import HierarchicalConfig, TrainConfig, configured
+from .descent import Descent
+from .hierarchical import Hierarchical
 from .monitor import Display, Fault, Log
-from .stepper import FIELD, Stepper
+from .stepper import Stepper
 
 KEEP = 128
 """Steps between two copies of the run's state in memory, to which a fault rolls back."""
@@ -29,21 +31,20 @@ BETTER = 0.02
 
 
 def train(dataset: Path, out: Path, *, preset: str = "fast", minutes: float | None = None, steps: int | None = None,
-          seed: int = 0, tensorboard: Path | None = None) -> dict:
+          seed: int = 0, tensorboard: Path | None = None, **variant) -> dict:
     """Train a field on the photographs in `dataset` and write it to `out`. Returns the report (JSON types).
 
     The run lasts `minutes` (10 unless told) or `steps`; runs given in steps are reproducible, bit for bit on one
     machine. A checkpoint ``OUT.ckpt`` is written every minute, taken up by the same command, deleted at the end.
     Faults (see :class:`mi_ntf.train.monitor.Fault`) are rolled back, listed in the report, and end the run when they
-    keep coming. `tensorboard`: a folder for its events.
+    keep coming. `tensorboard`: a folder for its events. `variant`: ablations, see :func:`config.configured`.
 
     Under ``torchrun --nproc-per-node=N -m mi_ntf train DATASET -o FIELD …`` (or any launcher that sets RANK,
     WORLD_SIZE, MASTER_ADDR and MASTER_PORT) N processes share the work of every step and average their gradients; see
     :mod:`mi_ntf.train.parallel`. It is the run of one process with the same seed, up to rounding. The first process
     prints and writes; the others return an empty report. All must see the same files.
     """
-    if preset not in PRESETS:
-        raise MiNtfError(f"preset '{preset}' is unknown; it is one of {', '.join(PRESETS)}")
+    config = configured(preset, **variant)
     if minutes is not None and steps is not None:
         raise MiNtfError(f"both --minutes {minutes:g} and --steps {steps} are given; a run is limited by one of them")
     limit = steps if steps is not None else 10.0 if minutes is None else minutes
@@ -51,7 +52,8 @@ def train(dataset: Path, out: Path, *, preset: str = "fast", minutes: float | No
         raise MiNtfError(f"--{'minutes' if steps is None else 'steps'} is {limit:g}; it must be positive")
     with parallel.processes():
         torch.set_num_threads(_threads() if steps is None and parallel.count() == 1 else 1)
-        run = _Run(Path(dataset), Path(out), PRESETS[preset], preset,
+        kind = _HierarchicalRun if isinstance(config, HierarchicalConfig) else _Run
+        run = kind(Path(dataset), Path(out), config, preset,
                    minutes=None if steps is not None else float(limit), steps=steps, seed=seed, tensorboard=tensorboard)
         run.resume()
         if not run.step:
@@ -60,16 +62,14 @@ def train(dataset: Path, out: Path, *, preset: str = "fast", minutes: float | No
         return run.finish() if parallel.first() else {}
 
 
-class _Run(Stepper):
-    """One training run: its loop, its validation, its files."""
+class _Loop(Descent):
+    """One training run around a stepper, which a subclass adds: its loop, its validation, its files."""
 
-    HELD = ("step", "spent", "samples_per_ray", "last_bake", "rate", "history", "validated", "best", "kept", "faults")
-    """Attributes that, with generator, networks, optimisers, grids and loss averages, decide how the run goes on."""
-    GRIDS = (("occupancy", ("sigma", "level", "stray")), ("baked", ("slope",)),
-             ("marched", ("log_sigma", "reach")))
+    OWN = ("history", "validated", "best", "kept", "faults")
+    """Attributes that, with the stepper's, generator, networks, optimisers and loss averages, decide how it goes on."""
 
-    def __init__(self, dataset: Path, out: Path, config: TrainConfig, preset: str, *, minutes, steps, seed,
-                 tensorboard=None):
+    def __init__(self, dataset: Path, out: Path, config: TrainConfig | HierarchicalConfig, preset: str, *, minutes,
+                 steps, seed, tensorboard=None):
         self.log = Log(tensorboard if parallel.first() else None)
         super().__init__(dataset, config, minutes, steps, seed)
         self.out, self.checkpoint = out, Path(f"{out}.ckpt")
@@ -109,6 +109,9 @@ class _Run(Stepper):
                     if self.step % KEEP == 0 and time.monotonic() - saved >= INTERVAL:
                         self.save()
                         saved = time.monotonic()
+                if self.kept is None:  # field and transmittance have learnt together to the end
+                    display.validated(self.validate())
+                    display.say(self.choose())
                 display.update(self.progress(), self.step, average or 0.0)
             except KeyboardInterrupt:
                 self.save()
@@ -146,16 +149,14 @@ class _Run(Stepper):
         count, shape = min(4, len(split.images)), split.images.shape[1:3]
         part = self.rays["val"][slice(0, count * shape[0] * shape[1])]
         generator = torch.Generator().manual_seed(2)
-        color, _, normal = evaluate.render_all(self.nets, part, self.occupancy, self.config.step, generator)
+        color, _, normal = evaluate.render_all(self.nets, part, self.occupied(), self.config.step, generator)
         exact = evaluate.psnr(color, part.target[:, :3], count)["srgb"]
         entry = {"step": self.step, "psnr": round(exact, 2)}
         self.history.append(entry)
         pictures = (x[:shape[0] * shape[1], :3].view(*shape, 3) for x in (part.target, color, normal))
         self.log.validated(entry, *pictures)
         if self.best is None or exact > self.best["psnr"]:
-            field = {k: v.detach().clone() for k, v in self.nets.tensors.items() if k.split(".")[0] in FIELD}
-            self.best = {"psnr": exact, "entry": entry, "tensors": field,
-                         "occupancy": {k: getattr(self.occupancy, k).clone() for k in self.GRIDS[0][1]}}
+            self.best = {"psnr": exact, "entry": entry} | self.snapshot()
         self.last = exact
         return entry
 
@@ -164,14 +165,9 @@ class _Run(Stepper):
         self.kept = self.history[-1]
         best, self.best = self.best, None
         if best is None or best["psnr"] - self.last <= BETTER:
-            return f"step {self.step}: the field is finished; its transmittance from here on"
+            return f"step {self.step}: the field is finished"
         kept = self.kept = best["entry"]
-        with torch.no_grad():
-            for name, value in best["tensors"].items():
-                self.nets.tensors[name].copy_(value)
-        for name, value in best["occupancy"].items():
-            setattr(self.occupancy, name, value)
-        self.bake()
+        self.adopt(best)
         return (f"step {self.step}: the field is finished; the one of step {kept['step']} is kept, since it is "
                 f"better by {best['psnr'] - self.last:.2f} dB in validation")
 
@@ -179,7 +175,7 @@ class _Run(Stepper):
 
     def keep(self) -> None:
         """Copy the state, to go back to. Raises Fault where a parameter is not finite."""
-        for name, value in self.nets.tensors.items():
+        for name, value in self.parameters().items():
             if not bool(value.isfinite().all()):
                 raise Fault(f"{name} is not finite at step {self.step}")
         self.good = self.state()
@@ -187,8 +183,8 @@ class _Run(Stepper):
     def state(self) -> dict:
         """A copy of all that decides the next step: a run that takes it up is the same run."""
         return copy.deepcopy({
-            "held": {k: getattr(self, k) for k in self.HELD}, "random": self.generator.get_state(),
-            "tensors": {k: v.detach() for k, v in self.nets.tensors.items()},
+            "held": {k: getattr(self, k) for k in (*self.HELD, *self.OWN)}, "random": self.generator.get_state(),
+            "tensors": {k: v.detach() for k, v in self.parameters().items()},
             "optimizers": {k: o.state_dict() for k, o in self.optimizers.items()}, "watch": self.watch.seen,
             "grids": {k: {name: getattr(getattr(self, k), name) for name in names if hasattr(getattr(self, k), name)}
                       for k, names in self.GRIDS}})
@@ -196,9 +192,7 @@ class _Run(Stepper):
     def restore(self, state: dict) -> None:
         """Take up a :meth:`state`."""
         state = copy.deepcopy(state)
-        with torch.no_grad():
-            for name, value in state["tensors"].items():
-                self.nets.tensors[name].copy_(value)
+        Descent.adopt(self, state)
         for name, optimizer in self.optimizers.items():
             optimizer.load_state_dict(state["optimizers"][name])
         for name, values in state["grids"].items():
@@ -259,6 +253,14 @@ class _Run(Stepper):
         field_file.save(self.out, Header(self.config.architecture, similarity, report), tensors)
         checkpoint.delete(self.checkpoint)
         return report
+
+
+class _Run(_Loop, Stepper):
+    """A run of the project's own recipe."""
+
+
+class _HierarchicalRun(_Loop, Hierarchical):
+    """A run of the paper's recipe."""
 
 
 def _threads() -> int:

@@ -161,17 +161,19 @@ def test_training_rays(augment):
 @pytest.mark.parametrize("kind", ["depth", "frequency"])
 def test_transmittance_loss_leaves_the_field_alone(kind):
     ray = Network(Encoding(kind, octaves=2 if kind == "frequency" else 0), (16,), components=2)
-    arch = dataclasses.replace(PRESETS["fast"].architecture, transmittance=ray)
+    arch = dataclasses.replace(PRESETS["fast"].architecture, transmittance=ray,
+                               visibility=Network(Encoding("frequency", octaves=1), (8,)))
     nets = networks.initial(arch, 1.0, torch.Generator().manual_seed(0))
     generator = torch.Generator().manual_seed(0)
     marched = marched_ball()
-    loss = losses.transmittance(nets, marched, torch.rand(64, 3) - 0.5, uniform_directions(64, generator), generator)
+    targets = losses.targets(marched, torch.rand(64, 3) - 0.5, uniform_directions(64, generator), generator)
+    loss = losses.transmittance(nets, targets) + losses.visibility(nets, targets)
     batch = rays()
     samples = torch.arange(4).repeat_interleave(5), torch.linspace(2.8, 3.2, 5).repeat(4)
     image = render.render(nets, batch, samples, 0.1)
     (loss + losses.transmittance_color(nets, marched, image, batch, 1.0, 4)).backward()
     for name, value in nets.tensors.items():
-        if name.startswith("transmittance"):
+        if name.startswith(("transmittance", "visibility")):
             assert value.grad is not None and value.grad.abs().sum() > 0, name
         else:
             assert value.grad is None, name

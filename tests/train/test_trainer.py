@@ -12,7 +12,7 @@ from train import two_spheres  # noqa: E402
 from mi_ntf.core import field_file  # noqa: E402
 from mi_ntf.core.errors import MiNtfError  # noqa: E402
 from mi_ntf.data import schema  # noqa: E402
-from mi_ntf.train import train, trainer  # noqa: E402
+from mi_ntf.train import config, train, trainer  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,7 @@ def test_short_run_learns_the_spheres(photographs, tmp_path):
 
 
 def run(photographs, out, steps):
-    return trainer._Run(photographs, out, trainer.PRESETS["fast"], "fast", minutes=None, steps=steps, seed=3)
+    return trainer._Run(photographs, out, config.PRESETS["fast"], "fast", minutes=None, steps=steps, seed=3)
 
 
 def test_same_seed_gives_the_same_losses_and_a_checkpoint_continues_them(photographs, tmp_path):
@@ -62,6 +62,7 @@ def _step(state):
 
 @pytest.mark.parametrize(("options", "text"), [
     ({"preset": "quick"}, "preset 'quick' is unknown; it is one of fast"),
+    ({"ntf": "mixture9"}, "--ntf 'mixture9' is unknown; it is one of mixture2, logistic, ray"),
     ({"minutes": 1, "steps": 10}, "both --minutes 1 and --steps 10 are given"),
     ({"steps": 0}, "--steps is 0; it must be positive"),
     ({"minutes": float("nan")}, "--minutes is nan; it must be positive"),

@@ -11,7 +11,7 @@ from train import two_spheres  # noqa: E402
 
 from mi_ntf.core import field_file  # noqa: E402
 from mi_ntf.core.errors import MiNtfError  # noqa: E402
-from mi_ntf.train import evaluate, monitor, train, trainer  # noqa: E402
+from mi_ntf.train import config, evaluate, monitor, train, trainer  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,7 @@ def test_a_nan_is_rolled_back_and_reported(photographs, tmp_path, monkeypatch, c
 
 
 def test_rolling_back_restores_the_state_and_halves_the_rate(photographs, tmp_path):
-    run = trainer._Run(photographs, tmp_path / "f", trainer.PRESETS["fast"], "fast", minutes=None, steps=40, seed=3)
+    run = trainer._Run(photographs, tmp_path / "f", config.PRESETS["fast"], "fast", minutes=None, steps=40, seed=3)
     run.advance()
     run.step = 1
     run.keep()
@@ -90,7 +90,7 @@ def test_four_faults_end_the_run_without_a_file(photographs, tmp_path, monkeypat
 
 def test_a_gradient_that_is_not_finite_changes_no_parameter(photographs, tmp_path, monkeypatch):
     """A finite loss with an infinite slope: the square root at 0."""
-    run = trainer._Run(photographs, tmp_path / "f", trainer.PRESETS["fast"], "fast", minutes=None, steps=40, seed=3)
+    run = trainer._Run(photographs, tmp_path / "f", config.PRESETS["fast"], "fast", minutes=None, steps=40, seed=3)
     before = {k: v.detach().clone() for k, v in run.nets.tensors.items()}
     tamper(monkeypatch, "field", lambda run, loss: loss + (loss - loss.detach()).sqrt())
     with pytest.raises(monitor.Fault, match=r"the field loss is \d\.\d+ and its gradient's length (nan|inf) at step 0"):

@@ -1,0 +1,98 @@
+"""What every recipe's stepper has: the photographs, the networks, and a guarded step of an optimiser."""
+
+import functools
+import math
+from pathlib import Path
+
+import torch
+
+from ..data.readers import load_dataset
+from . import monitor, networks, parallel, rays
+from .occupancy import Occupancy
+
+FIELD = ("density", "reflectance")
+"""Networks that photographs train; the others learn from the field."""
+
+
+class Descent:
+    """The photographs in `dataset` and networks to train on them. The run lasts `minutes` or `steps`.
+
+    A stepper adds `optimizers` and :meth:`advance`, and names what of it a checkpoint must hold.
+    """
+
+    HELD: tuple[str, ...] = ("step", "spent", "rate")
+    """Attributes that decide how the run goes on."""
+    GRIDS: tuple[tuple[str, tuple[str, ...]], ...] = ()
+    """Attributes that hold tensors, and which."""
+    optimizers: dict[str, torch.optim.Optimizer]
+
+    def __init__(self, dataset: Path, config, minutes: float | None, steps: int | None, seed: int):
+        self.config, self.minutes, self.steps = config, minutes or math.inf, steps or math.inf
+        self.splits = load_dataset(dataset, monitor.note if parallel.first() else lambda _: None)
+        self.rays = {name: rays.from_split(split, name) for name, split in self.splits.items()}
+        self.generator = torch.Generator().manual_seed(seed)
+        self.nets = parallel.share(networks.initial(config.architecture, config.log_density, self.generator))
+        target = self.rays["train"].target
+        matter = target[target[:, 3] > 0.01]
+        self.opaque = float((matter[:, 3] > 0.99).float().mean()) if len(matter) else 1.0
+        """Share of the object's pixels that nothing shines through: 0.9 and more of solid things, 0.01 of a cloud."""
+        bright = matter[matter[:, 3] > 0.5][:, :3].mean(1)
+        self.exposure = 1 / max(float(bright.quantile(0.95)) if 0 < len(bright) else 1.0, 1e-6)
+        self.step, self.spent = 0, 0.0
+        self.rate = 1.0
+        """Factor of the learning rates, halved by every fault."""
+        self.watch = monitor.Watch()
+        self.terms: dict[str, torch.Tensor] = {}
+        """The last step's weighted terms of the losses."""
+        self.trained = [0, 0]
+        """Camera rays and their samples that this process has trained on."""
+
+    def progress(self) -> float:
+        """Share of the run that is done, in [0, 1]."""
+        return max(self.step / self.steps, self.spent / (60 * self.minutes))
+
+    def advance(self) -> float:
+        """One optimiser step of whatever the recipe trains now; returns the loss. Raises Fault."""
+        raise NotImplementedError
+
+    def carve(self) -> None:
+        """Give the density a first shape, before the first step; none unless the recipe has one."""
+
+    def occupied(self) -> Occupancy:
+        """Where the field has matter now, for pictures of it."""
+        raise NotImplementedError
+
+    def parameters(self) -> dict[str, torch.Tensor]:
+        """Name → tensor of all that is trained."""
+        return self.nets.tensors
+
+    def snapshot(self) -> dict:
+        """A copy of all that validation judges, for :meth:`adopt`."""
+        return {"tensors": {k: v.detach().clone() for k, v in self.parameters().items()}}
+
+    @torch.no_grad()
+    def adopt(self, snapshot: dict) -> None:
+        """Go back to a :meth:`snapshot`."""
+        parameters = self.parameters()
+        for name, value in snapshot["tensors"].items():
+            parameters[name].copy_(value)
+
+    def _descend(self, name: str, loss: torch.Tensor, rate: float) -> float:
+        optimizer = self.optimizers[name]
+        value = float(loss.detach())
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        parameters = [p for group in optimizer.param_groups for p in group["params"]]
+        parallel.average_gradients(parameters)
+        size = float(torch.nn.utils.get_total_norm([p.grad for p in parameters if p.grad is not None]))
+        if not (math.isfinite(value) and math.isfinite(size)):
+            raise monitor.Fault(f"the {name} loss is {value} and its gradient's length {size} at step {self.step}")
+        for group in optimizer.param_groups:
+            group["lr"] = group["base"] * rate * self.rate
+        optimizer.step()
+        return value
+
+
+def total(terms: dict[str, torch.Tensor]) -> torch.Tensor:
+    """The sum of `terms`, from the first to the last: its last bit is part of what makes a run reproducible."""
+    return functools.reduce(torch.add, terms.values())
