@@ -81,7 +81,7 @@ class HierarchicalConfig:
     """Field and transmittance learn together to the end."""
 
 
-PRESETS = {"fast": TrainConfig(), "paper": HierarchicalConfig()}
+PRESETS: dict[str, TrainConfig | HierarchicalConfig] = {"fast": TrainConfig(), "paper": HierarchicalConfig()}
 
 
 NTF = {
