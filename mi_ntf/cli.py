@@ -72,6 +72,14 @@ class Train:
     """Stop after so many steps."""
     seed: int = 0
     """Seed of weights and samples."""
+    ntf: str | None = None
+    """Transmittance network in place of the preset's: mixture2, logistic or ray."""
+    no_augmentation: bool = False
+    """Learn transmittance on camera rays alone."""
+    no_colour_loss: bool = False
+    """Do not compare pixels lit by the learned transmittance with the photographs."""
+    visibility_mlp: bool = False
+    """Also train NeRV's visibility network, of a point and a direction, on the same transmittance."""
     tensorboard: Path | None = None
     """Folder for TensorBoard events: losses, validation, speed, preview pictures."""
     json: bool = False
@@ -83,7 +91,9 @@ class Train:
         from mi_ntf.train import train
 
         report = train(self.dataset, self.output, preset=self.preset, minutes=self.minutes, steps=self.steps,
-                       seed=self.seed, tensorboard=self.tensorboard)
+                       seed=self.seed, tensorboard=self.tensorboard, ntf=self.ntf,
+                       augmentation=not self.no_augmentation, colour_loss=not self.no_colour_loss,
+                       visibility_mlp=self.visibility_mlp)
         if report:  # under torchrun, only the first process has one
             _report(report, self.json, _print_training)
 

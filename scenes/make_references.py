@@ -12,8 +12,8 @@ import numpy as np
 
 from mi_ntf.data.schema import write_exr
 
-NAMES = ("statue", "globe", "knot")
-PASSES, SPP = 16, 128
+NAMES = ("statue", "globe", "knot", "cloud")
+PASSES, SPP = 26, 128
 
 
 def reference(scene_file: Path, light: str) -> tuple[np.ndarray, float]:

@@ -48,7 +48,14 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list:
         (
             "train data -o f.safetensors --minutes 2.5",
             (Path("data"), Path("f.safetensors")),
-            {"preset": "fast", "minutes": 2.5, "steps": None, "seed": 0, "tensorboard": None},
+            {"preset": "fast", "minutes": 2.5, "steps": None, "seed": 0, "tensorboard": None, "ntf": None,
+             "augmentation": True, "colour_loss": True, "visibility_mlp": False},
+        ),
+        (
+            "train data -o f.safetensors --steps 9 --ntf ray --no-augmentation --no-colour-loss --visibility-mlp",
+            (Path("data"), Path("f.safetensors")),
+            {"preset": "fast", "minutes": None, "steps": 9, "seed": 0, "tensorboard": None, "ntf": "ray",
+             "augmentation": False, "colour_loss": False, "visibility_mlp": True},
         ),
         ("swap s.xml f.safetensors -o out.xml", (Path("s.xml"), Path("f.safetensors"), Path("out.xml")), {}),
         ("compare a.exr b.exr", (Path("a.exr"), Path("b.exr")), {}),

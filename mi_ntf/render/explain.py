@@ -7,6 +7,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ..core.errors import MiNtfError
+from ..infer.visibility.transmittance_map import channels
 from . import effects, lights, register
 
 
@@ -81,7 +82,10 @@ def _memory(found, table, integrator, medium) -> dict:
     from .integrator import CHUNK
 
     resolution = medium.field.grid.resolution
-    maps = 8 * integrator.map_resolution**2 * table.count if found.visibility == "transmittance_map" and table else 0
+    maps = 0
+    if found.visibility == "transmittance_map" and table:
+        components = medium.field.network.components if integrator.map_source == "network" else 1
+        maps = 4 * channels(components) * integrator.map_resolution**2 * table.count
     return {
         "field grid": 4 * resolution**3 + 32 * min(resolution, 128) ** 3,
         "transmittance maps": maps,

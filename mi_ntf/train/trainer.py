@@ -13,7 +13,7 @@ import torch
 from ..core import field_file
 from ..core.architecture import Header, Similarity
 from ..core.errors import MiNtfError
-from . import checkpoint, evaluate, networks, parallel
+from . import checkpoint, evaluate, held_out, networks, parallel
 from .config import HierarchicalConfig, TrainConfig, configured
 from .descent import Descent
 from .hierarchical import Hierarchical
@@ -250,6 +250,7 @@ class _Loop(Descent):
         for name in ("val", "test"):
             scores = evaluate.score(stored, self.rays[name], len(self.splits[name].images), self.config.step)
             report[name] = {k: round(v, 3 if k != "alpha_rmse" else 5) for k, v in scores.items()}
+        report["transmittance"] = held_out.score(stored, self.rays["val"])
         field_file.save(self.out, Header(self.config.architecture, similarity, report), tensors)
         checkpoint.delete(self.checkpoint)
         return report

@@ -29,6 +29,16 @@ def test_auto_chooses_by_the_number_of_shading_points():
     assert many["memory_bytes"]["transmittance maps"] == 8 * 128**2 * many["lights"]["count"]
 
 
+def test_maps_of_mixtures_take_four_times_the_memory(tmp_path):
+    text = SCENE.read_text().replace("field.safetensors", str(SCENE.parent / "field.safetensors"))
+    text = text.replace('"light_$light.xml"', f'"{SCENE.parent}/light_point.xml"')
+    text = text.replace("sensor.xml", str(SCENE.parent / "sensor.xml"))
+    network = '<integrator type="nrf"><string name="map_source" value="network"/>'
+    (tmp_path / "scene.xml").write_text(text.replace('<integrator type="nrf">', network))
+    report = explain(tmp_path / "scene.xml", {"visibility": "transmittance_map"})
+    assert report["memory_bytes"]["transmittance maps"] == 4 * 8 * 128**2
+
+
 def test_table_names_every_effect(capsys):
     report = explain(SCENE, {"visibility": "none"})
     print_table(report)

@@ -22,6 +22,11 @@ from ..lights import LightTable
 _ROW = 18
 
 
+def channels(components: int) -> int:
+    """float32 numbers a texel: (a, b), or (w, a, b, 0) for each logistic of a mixture."""
+    return 2 if components == 1 else 4 * components
+
+
 class TransmittanceMap:
     """Maps of all lights of a table, m² texels each, in one Dr.Jit texture of mixtures, layer upon layer.
 
@@ -103,8 +108,8 @@ class TransmittanceMap:
 
     def _build(self, fit):
         texels = self.m * self.m
-        channels = 2 if self.components == 1 else 4 * self.components
-        values = dr.zeros(self.dj.Float, channels * texels * self.count)
+        width = channels(self.components)
+        values = dr.zeros(self.dj.Float, width * texels * self.count)
         # A chunk of lights at a time bounds what a map source holds per ray.
         chunk = max(1, (1 << 22) // texels)
         for first in range(0, self.count, chunk):
@@ -115,7 +120,7 @@ class TransmittanceMap:
             origin, d = self._ray(light, self.dj.Float(rest % columns), self.dj.Float(rest // columns))
             self._store(values, i, fit(origin, d))
             dr.eval(values)
-        tensor = self.dj.TensorXf(values, (self.count * self.m, self.m, channels))
+        tensor = self.dj.TensorXf(values, (self.count * self.m, self.m, width))
         return self.dj.Texture2f(tensor, use_accel=False, filter_mode=dr.FilterMode.Nearest)
 
 

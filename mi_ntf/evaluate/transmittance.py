@@ -1,0 +1,103 @@
+"""What the learned transmittance costs and errs: one scene, its field, 50 directional lights.
+
+    python -m mi_ntf.evaluate.transmittance [SCENE.xml ...] [--size 128] [--spp 4] [--lights 50]
+
+Per scene: relative RMSE of the image lit through `neural_transmittance`, and through maps of 128² and 256² texels made
+by field and network, against `raymarch` on the same field; and nanoseconds a query of the network on random rays, the
+median of five runs of a million after a warm-up.
+"""
+
+import argparse
+import statistics
+import time
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+VARIANTS = {
+    "neural_transmittance": {"visibility": "neural_transmittance"},
+    "map, field, 128²": {"visibility": "transmittance_map"},
+    "map, field, 256²": {"visibility": "transmittance_map", "map_resolution": 256},
+    "map, network, 128²": {"visibility": "transmittance_map", "map_source": "network"},
+    "map, network, 256²": {"visibility": "transmittance_map", "map_source": "network", "map_resolution": 256},
+}
+
+
+def directions(count: int) -> np.ndarray:
+    """`count` unit vectors (count, 3), evenly spread (Fibonacci)."""
+    z = 1 - (np.arange(count) + 0.5) * 2 / count
+    phi = np.arange(count) * np.pi * (3 - 5**0.5)
+    return np.stack([np.sqrt(1 - z * z) * np.cos(phi), np.sqrt(1 - z * z) * np.sin(phi), z], 1)
+
+
+def with_lights(scene, count: int):
+    """The field and the view of `scene` under `count` directional lights."""
+    parts = {"type": "scene", "sensor": scene.sensors()[0]}
+    parts |= {f"shape{i}": shape for i, shape in enumerate(scene.shapes())}
+    for i, d in enumerate(directions(count)):
+        parts[f"light{i}"] = {"type": "directional", "direction": list(-d), "irradiance": 1.0}
+    return mi.load_dict(parts)
+
+
+def study(path: Path, size: int, spp: int, count: int) -> dict[str, float]:
+    """Relative RMSE per variant, and ``ns``, nanoseconds a query."""
+    from ..render import effects
+
+    scene = with_lights(mi.load_file(str(path), res=str(size)), count)
+    images = {}
+    for name, options in ({"raymarch": {"visibility": "raymarch"}} | VARIANTS).items():
+        integrator = mi.load_dict({"type": "nrf", "hide_emitters": True, **options})
+        images[name] = np.array(mi.render(scene, integrator=integrator, spp=spp))[..., :3]
+    truth = images.pop("raymarch")
+    result = {k: float(np.sqrt(((v - truth) ** 2).mean() / (truth**2).mean())) for k, v in images.items()}
+    return result | {"ns": query_time(effects.find_medium(scene))}
+
+
+def query_time(medium, count: int = 1 << 20) -> float:
+    """Nanoseconds per ray of the network's query, features included, on chords that meet the field's bounds."""
+    from ..infer.profile import DepthProfile
+
+    rng = np.random.default_rng(0)
+    d = rng.normal(size=(3, count))
+    d /= np.linalg.norm(d, axis=0)
+    low, high = medium.field.grid.bounds
+    x = (low + rng.uniform(size=(count, 3)) * (high - low)).T
+    x, d = (tuple(mi.Float(c.astype(np.float32)) for c in v) for v in (x, d))
+    profile = DepthProfile(medium.source.density, medium.field.grid, dr.opaque(mi.Float, 2 / 384))
+    times = []
+    for _ in range(6):
+        start = time.perf_counter()
+        _, _, mixture = medium.field.network.ray_mixture(x, d, profile)
+        dr.eval(mixture)
+        dr.sync_thread()
+        times.append(time.perf_counter() - start)
+    return statistics.median(times[1:]) / count * 1e9
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    scenes = Path(__file__).parents[2] / "scenes"
+    parser.add_argument("scenes", nargs="*", type=Path,
+                        default=[scenes / n / "scene.xml" for n in ("statue", "globe", "knot")])
+    parser.add_argument("--size", type=int, default=128)
+    parser.add_argument("--spp", type=int, default=4)
+    parser.add_argument("--lights", type=int, default=50)
+    options = parser.parse_args()
+    mi.set_variant("llvm_ad_rgb")
+    from .. import render
+
+    render.register()
+    table = Table("scene", *VARIANTS, "ns a query", title=f"relative RMSE against raymarch, {options.lights} lights")
+    for path in options.scenes:
+        found = study(path, options.size, options.spp, options.lights)
+        table.add_row(path.parent.name, *(f"{found[k]:.1%}" for k in VARIANTS), f"{found['ns']:.0f}")
+    Console(width=120).print(table)
+
+
+if __name__ == "__main__":
+    main()

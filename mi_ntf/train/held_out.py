@@ -1,0 +1,43 @@
+"""How well the transmittance network knows the field: on points and lights that no training has seen."""
+
+import torch
+
+from .evaluate import CUT
+from .losses import tau
+from .marched import Marched, chords, uniform_directions
+from .networks import Networks, crossings
+from .occupancy import from_networks
+from .rays import Rays
+
+STEPS = 2048
+
+
+@torch.no_grad()
+def score(networks: Networks, rays: Rays, count: int = 4096, chunk: int = 512) -> dict[str, float]:
+    """``rms`` and ``bias`` of τ_nt against the field's own marched τ, on about `count` pairs of a shading point of the
+    (held-out) `rays` and a light in a random direction. Empty where no ray sees matter."""
+    generator = torch.Generator().manual_seed(4)
+    marched = Marched()
+    marched.update(networks, from_networks(networks, 96, CUT, generator))
+    rays = rays[(rays.target[:, 3] > 0.5).nonzero()[:, 0]]
+    errors = [torch.zeros(0)]
+    for _ in range(0, count if len(rays) else 0, chunk):
+        some = rays[torch.randint(len(rays), (chunk,), generator=generator)]
+        m, h = chords(some.o, some.d)
+        profile = marched.march(m, -some.d, h, STEPS)
+        lost = torch.rand(chunk, 1, generator=generator) * -torch.expm1(-profile[:, :1])
+        x = m - crossings(profile, h, -torch.log1p(-lost)) * some.d
+        d = uniform_directions(chunk, generator)
+        m, h = chords(x, d)
+        profile = marched.march(m, d, h, STEPS)
+        t = (x * d).sum(1, keepdim=True)
+        place = ((t / h[:, None] + 1) * (STEPS / 2)).clamp(0, STEPS - 1e-3)
+        lower = place.floor().long()
+        depth = torch.lerp(profile.gather(1, lower), profile.gather(1, lower + 1), place - lower)
+        hit, mixture = networks.ray_mixture(x, d, profile)
+        found = torch.where(hit[:, None], tau(mixture, t), 1.0)
+        errors.append((found - torch.exp(-depth))[:, 0])
+    error = torch.cat(errors)
+    if not len(error):
+        return {}
+    return {"rms": round(float(error.square().mean().sqrt()), 4), "bias": round(float(error.mean()), 4)}
