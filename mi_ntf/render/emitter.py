@@ -4,8 +4,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.errors import MiNtfError
-from ..infer import profile
-from ..infer.visibility import neural_transmittance, raymarch
+from .visibility import Options, build
 
 METHODS = ("neural_transmittance", "raymarch", "none")
 STEP = 2 / 384
@@ -60,21 +59,11 @@ def emitter_class() -> type:
                 # there.
                 ds.dist = dr.maximum(ds.dist, 1000 * far)
                 ds.p = it.p + ds.d * ds.dist
-            method = self._method()
+            method = build(self.visibility, self.medium, None, Options(STEP))
             tau = method.tau(x, d, ds.dist / frame.length, mi.UInt32(0), active) if method else 1
             ds.delta = dr.ones(mi.Bool, dr.width(ds.pdf))
             ds.emitter = mi.EmitterPtr(self)
             return ds, weight * tau
-
-        def _method(self):
-            if self.visibility == "none":
-                return None
-            source, field = self.medium.source, self.medium.field
-            if self.visibility == "neural_transmittance":
-                reader = profile.DepthProfile(source.density, field.grid, dr.opaque(mi.Float, STEP))
-                return neural_transmittance.NeuralTransmittance(field.network, reader)
-            steps = tuple(dr.opaque(mi.Float, s) for s in raymarch.default_steps(STEP))
-            return raymarch.RayMarch(source.density, field.grid, steps)
 
         def pdf_direction(self, it, ds, active=True):
             return mi.Float(0)

@@ -6,9 +6,9 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.errors import MiNtfError
-from ..infer import march, profile, shade
-from ..infer.visibility import METHODS, neural_transmittance, raymarch, transmittance_map
-from . import effects, lights
+from ..infer import march, shade
+from ..infer.visibility import METHODS
+from . import effects, lights, visibility
 
 CHUNK = 1 << 18
 """Camera rays in flight: bounds the memory at some hundred MiB whatever the image and the number of lights."""
@@ -157,19 +157,11 @@ class SceneLight:
                 mi.LogLevel.Warn,
                 f"nrf integrator: {len(scene.shapes()) - 1} ordinary shapes are left out of the picture",
             )
-        frame, field = self.medium.frame, self.medium.field
-        self.table = lights.table(scene, frame, integrator.environment_lights) if self.effects.exhaustive else None
-        self.profile = profile.DepthProfile(self.medium.source.density, field.grid, dr.opaque(mi.Float, self.step))
-        self.map = None
-        if self.effects.visibility == "transmittance_map":
-            source = (
-                transmittance_map.network_source(field.network, self.profile)
-                if integrator.map_source == "network"
-                else transmittance_map.field_source(self.profile)
-            )
-            self.map = transmittance_map.TransmittanceMap(
-                self.table, integrator.map_resolution, field.grid.hull, source, mi
-            )
+        self.table = None
+        if self.effects.exhaustive:
+            self.table = lights.table(scene, self.medium.frame, integrator.environment_lights)
+        options = visibility.Options(self.step, integrator.map_resolution, integrator.map_source)
+        self.visibility = visibility.build(self.effects.visibility, self.medium, self.table, options)
 
     def trace(self, ray, sampler, stream):
         """``(radiance, opacity)`` of camera rays."""
@@ -202,15 +194,4 @@ class SceneLight:
         source = self.table or lights.EmitterSamples(
             self.scene, self.medium.frame, self.integrator.light_samples, stream
         )
-        return shade.reflect(points, source, self._visibility())
-
-    def _visibility(self):
-        method, grid = self.effects.visibility, self.medium.field.grid
-        if method == "transmittance_map":
-            return self.map
-        if method == "neural_transmittance":
-            return neural_transmittance.NeuralTransmittance(self.medium.field.network, self.profile)
-        if method == "none":
-            return None
-        steps = tuple(dr.opaque(mi.Float, s) for s in raymarch.default_steps(self.step))
-        return raymarch.RayMarch(self.medium.source.density, grid, steps)
+        return shade.reflect(points, source, self.visibility)
