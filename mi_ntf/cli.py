@@ -80,6 +80,8 @@ class Train:
     """Do not compare pixels lit by the learned transmittance with the photographs."""
     visibility_mlp: bool = False
     """Also train NeRV's visibility network, of a point and a direction, on the same transmittance."""
+    field: Path | None = None
+    """Field file to keep; its transmittance networks alone are trained, anew."""
     tensorboard: Path | None = None
     """Folder for TensorBoard events: losses, validation, speed, preview pictures."""
     json: bool = False
@@ -91,7 +93,7 @@ class Train:
         from mi_ntf.train import train
 
         report = train(self.dataset, self.output, preset=self.preset, minutes=self.minutes, steps=self.steps,
-                       seed=self.seed, tensorboard=self.tensorboard, ntf=self.ntf,
+                       seed=self.seed, tensorboard=self.tensorboard, field=self.field, ntf=self.ntf,
                        augmentation=not self.no_augmentation, colour_loss=not self.no_colour_loss,
                        visibility_mlp=self.visibility_mlp)
         if report:  # under torchrun, only the first process has one

@@ -108,3 +108,11 @@ def configured(preset: str, *, ntf: str | None = None, augmentation: bool = True
     if visibility_mlp:
         architecture = replace(architecture, visibility=VISIBILITY)
     return replace(config, architecture=architecture)
+
+
+def transmittance_alone(config: TrainConfig | HierarchicalConfig, architecture: Architecture) -> TrainConfig:
+    """The recipe `config` for a finished field of `architecture`: the whole run trains transmittance networks."""
+    if not isinstance(config, TrainConfig):
+        raise MiNtfError("--field goes with the preset 'fast' alone: the paper's learns field and transmittance as one")
+    kept = {name: getattr(architecture, name) for name in ("density", "reflectance")}
+    return replace(config, architecture=replace(config.architecture, **kept), ntf_from=0.0, ntf_alone=0.0)

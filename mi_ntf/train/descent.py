@@ -6,6 +6,8 @@ from pathlib import Path
 
 import torch
 
+from ..core.architecture import Header, Similarity
+from ..core.errors import MiNtfError
 from ..data.readers import load_dataset
 from . import monitor, networks, parallel, rays
 from .occupancy import Occupancy
@@ -38,6 +40,10 @@ class Descent:
         """Share of the object's pixels that nothing shines through: 0.9 and more of solid things, 0.01 of a cloud."""
         bright = matter[matter[:, 3] > 0.5][:, :3].mean(1)
         self.exposure = 1 / max(float(bright.quantile(0.95)) if 0 < len(bright) else 1.0, 1e-6)
+        x, y, z = map(float, self.splits["train"].center)
+        self.similarity = Similarity((x, y, z), float(self.splits["train"].radius))
+        self.given: dict | None = None
+        """How the field was trained that :meth:`take` took."""
         self.step, self.spent = 0, 0.0
         self.rate = 1.0
         """Factor of the learning rates, halved by every fault."""
@@ -54,6 +60,18 @@ class Descent:
     def advance(self) -> float:
         """One optimiser step of whatever the recipe trains now; returns the loss. Raises Fault."""
         raise NotImplementedError
+
+    @torch.no_grad()
+    def take(self, path: Path, header: Header, tensors: dict) -> None:
+        """Take density and reflectance of the field file `path`, which is of this very data set."""
+        here, there = ((*s.center, s.radius) for s in (self.similarity, header.similarity))
+        if max(abs(a - b) for a, b in zip(here, there, strict=True)) > 1e-4 * self.similarity.radius:
+            raise MiNtfError(f"{path} has its unit sphere (centre, radius) at {there}, the data set has it at {here}; "
+                             "--field needs the data set that the field was trained on")
+        for name, value in tensors.items():
+            if name.split(".")[0] in FIELD:
+                self.nets.tensors[name].copy_(torch.from_numpy(value))
+        self.given = header.provenance
 
     def carve(self) -> None:
         """Give the density a first shape, before the first step; none unless the recipe has one."""

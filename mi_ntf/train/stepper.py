@@ -4,7 +4,7 @@ from pathlib import Path
 
 import torch
 
-from ..core.architecture import MAX_LOG_DENSITY
+from ..core.architecture import MAX_LOG_DENSITY, Header
 from . import losses, rays, render
 from .baked import Baked
 from .config import TrainConfig
@@ -49,6 +49,11 @@ class Stepper(Descent):
             wanted[points:] = LOG_EMPTY - 2
             self._descend("field", (raw - wanted).square().mean(), 1 - 0.9 * step / steps)
         self.optimizers["field"] = self._optimizer(*FIELD)
+
+    def take(self, path: Path, header: Header, tensors: dict) -> None:
+        super().take(path, header, tensors)
+        for _ in range(12):  # each looks at one point a cell; skins fill a fraction of theirs
+            self.occupancy.update(self.nets, self.generator)
 
     def occupied(self) -> Occupancy:
         return self.occupancy

@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import hashlib
 import json
 import math
 import os
@@ -11,10 +12,10 @@ from pathlib import Path
 import torch
 
 from ..core import field_file
-from ..core.architecture import Header, Similarity
+from ..core.architecture import Header
 from ..core.errors import MiNtfError
 from . import checkpoint, evaluate, held_out, networks, parallel
-from .config import HierarchicalConfig, TrainConfig, configured
+from .config import HierarchicalConfig, TrainConfig, configured, transmittance_alone
 from .descent import Descent
 from .hierarchical import Hierarchical
 from .monitor import Display, Fault, Log
@@ -31,13 +32,14 @@ BETTER = 0.02
 
 
 def train(dataset: Path, out: Path, *, preset: str = "fast", minutes: float | None = None, steps: int | None = None,
-          seed: int = 0, tensorboard: Path | None = None, **variant) -> dict:
+          seed: int = 0, tensorboard: Path | None = None, field: Path | None = None, **variant) -> dict:
     """Train a field on the photographs in `dataset` and write it to `out`. Returns the report (JSON types).
 
     The run lasts `minutes` (10 unless told) or `steps`; runs given in steps are reproducible, bit for bit on one
     machine. A checkpoint ``OUT.ckpt`` is written every minute, taken up by the same command, deleted at the end.
     Faults (see :class:`mi_ntf.train.monitor.Fault`) are rolled back, listed in the report, and end the run when they
-    keep coming. `tensorboard`: a folder for its events. `variant`: ablations, see :func:`config.configured`.
+    keep coming. `tensorboard`: a folder for its events. `field`: a field file to keep as it is; its transmittance
+    networks alone are trained, anew. `variant`: ablations, see :func:`config.configured`.
 
     Under ``torchrun --nproc-per-node=N -m mi_ntf train DATASET -o FIELD …`` (or any launcher that sets RANK,
     WORLD_SIZE, MASTER_ADDR and MASTER_PORT) N processes share the work of every step and average their gradients; see
@@ -45,6 +47,9 @@ def train(dataset: Path, out: Path, *, preset: str = "fast", minutes: float | No
     prints and writes; the others return an empty report. All must see the same files.
     """
     config = configured(preset, **variant)
+    given = None if field is None else field_file.load(field)
+    if given is not None:
+        config = transmittance_alone(config, given[0].architecture)
     if minutes is not None and steps is not None:
         raise MiNtfError(f"both --minutes {minutes:g} and --steps {steps} are given; a run is limited by one of them")
     limit = steps if steps is not None else 10.0 if minutes is None else minutes
@@ -54,9 +59,12 @@ def train(dataset: Path, out: Path, *, preset: str = "fast", minutes: float | No
         torch.set_num_threads(_threads() if steps is None and parallel.count() == 1 else 1)
         kind = _HierarchicalRun if isinstance(config, HierarchicalConfig) else _Run
         run = kind(Path(dataset), Path(out), config, preset,
-                   minutes=None if steps is not None else float(limit), steps=steps, seed=seed, tensorboard=tensorboard)
+                   minutes=None if steps is not None else float(limit), steps=steps, seed=seed, tensorboard=tensorboard,
+                   given=None if field is None else hashlib.sha256(Path(field).read_bytes()).hexdigest())
+        if given is not None:
+            run.take(field, *given)
         run.resume()
-        if not run.step:
+        if not run.step and given is None:
             run.carve()
         run.loop()
         return run.finish() if parallel.first() else {}
@@ -69,12 +77,12 @@ class _Loop(Descent):
     """Attributes that, with the stepper's, generator, networks, optimisers and loss averages, decide how it goes on."""
 
     def __init__(self, dataset: Path, out: Path, config: TrainConfig | HierarchicalConfig, preset: str, *, minutes,
-                 steps, seed, tensorboard=None):
+                 steps, seed, tensorboard=None, given=None):
         self.log = Log(tensorboard if parallel.first() else None)
         super().__init__(dataset, config, minutes, steps, seed)
         self.out, self.checkpoint = out, Path(f"{out}.ckpt")
         self.identity = json.dumps({"preset": preset, "minutes": minutes, "steps": steps, "seed": seed,
-                                    "config": dataclasses.asdict(config),
+                                    "config": dataclasses.asdict(config), "field": given,
                                     "views": {k: len(s.images) for k, s in self.splits.items()}}, sort_keys=True)
         self.history: list[dict] = []
         self.validated = 0.0
@@ -238,20 +246,20 @@ class _Loop(Descent):
 
     def finish(self) -> dict:
         """Write the field, read it back, measure it, and store the report in its header."""
-        x, y, z = map(float, self.splits["train"].center)
-        similarity = Similarity((x, y, z), float(self.splits["train"].radius))
         tensors = networks.to_tensors(self.nets)
-        report = {k: v for k, v in json.loads(self.identity).items() if k != "config"}
+        report = {k: v for k, v in json.loads(self.identity).items() if k not in ("config", "field")}
+        if self.given is not None:
+            report["field"] = self.given
         report |= {"steps_done": self.step, "seconds": round(self.spent, 1), "history": self.history,
                    "kept": self.kept, "faults": self.faults}
-        header = Header(self.config.architecture, similarity, report)
+        header = Header(self.config.architecture, self.similarity, report)
         field_file.save(self.out, header, tensors)
         stored = networks.from_tensors(self.config.architecture, field_file.load(self.out)[1])
         for name in ("val", "test"):
             scores = evaluate.score(stored, self.rays[name], len(self.splits[name].images), self.config.step)
             report[name] = {k: round(v, 3 if k != "alpha_rmse" else 5) for k, v in scores.items()}
         report["transmittance"] = held_out.score(stored, self.rays["val"])
-        field_file.save(self.out, Header(self.config.architecture, similarity, report), tensors)
+        field_file.save(self.out, Header(self.config.architecture, self.similarity, report), tensors)
         checkpoint.delete(self.checkpoint)
         return report
 

@@ -33,6 +33,29 @@ def test_short_run_learns_the_spheres(photographs, tmp_path):
     assert list(tmp_path.iterdir()) == [out], "checkpoint and temporary files are gone"
 
 
+def test_a_finished_field_learns_another_transmittance(photographs, tmp_path):
+    old, new = tmp_path / "old", tmp_path / "new"
+    train(photographs, old, steps=8)
+    report = train(photographs, new, steps=25, field=old, ntf="logistic", visibility_mlp=True)
+    (before, kept), (after, tensors) = field_file.load(old), field_file.load(new)
+    for name, value in kept.items():
+        if name.startswith(("density", "reflectance")):
+            assert np.array_equal(tensors[name], value), name
+    assert after.architecture.transmittance.components == 1 and after.architecture.visibility is not None
+    assert report["field"] == before.provenance and report["test"] == before.provenance["test"]
+    assert report["transmittance"]["rms"] < before.provenance["transmittance"]["rms"]
+    other = two_spheres.write(tmp_path / "set", {"train": 2, "val": 1, "test": 1}, size=8)
+    for split in ("train", "val", "test"):
+        path = other / f"transforms_{split}.json"
+        data = json.loads(path.read_text())
+        data["unit_sphere"]["radius"] *= 1.1
+        path.write_text(json.dumps(data))
+    with pytest.raises(MiNtfError, match=r"old has its unit sphere .* --field needs the data set"):
+        train(other, tmp_path / "f", steps=1, field=old)
+    with pytest.raises(MiNtfError, match="--field goes with the preset 'fast' alone"):
+        train(photographs, tmp_path / "f", steps=1, field=old, preset="paper")
+
+
 def run(photographs, out, steps):
     return trainer._Run(photographs, out, config.PRESETS["fast"], "fast", minutes=None, steps=steps, seed=3)
 
