@@ -15,6 +15,9 @@ from .occupancy import LOG_EMPTY, Occupancy
 REFRESH = 32
 """Steps between two updates of the occupancy grid; the baked density is renewed at every fourth of them."""
 
+NEAR = 96
+"""Camera rays a step whose pixels are also lit by the learned transmittance."""
+
 
 class Stepper(Descent):
     """The recipe of the project's own: planes, an occupancy grid in the visual hull, transmittance after the field."""
@@ -123,7 +126,7 @@ class Stepper(Descent):
         if c.architecture.visibility is not None:
             terms["visibility"] = losses.visibility(self.nets, targets)
         if c.colour_loss:
-            near = min(96, len(batch))
+            near = min(NEAR, len(batch))
             lit = losses.transmittance_color(self.nets, self.marched, image, batch, self.exposure, near)
             terms["lit colour"] = 0.1 * lit
         return terms
@@ -136,8 +139,10 @@ class Stepper(Descent):
         value = 0.0
         batch, samples = self.batch()
         if alone:
+            ray, t = samples
+            few = ray < NEAR
             with torch.no_grad():
-                image = render.render(self.nets, batch, samples, c.step)
+                image = render.render(self.nets, batch[slice(NEAR)], (ray[few], t[few]), c.step)
             self.terms = {}
         else:
             self.terms, image = self.field_loss(batch, samples)
