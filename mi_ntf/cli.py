@@ -170,6 +170,23 @@ class Explain:
 
 
 @dataclass
+class Bench:
+    """Measure every speed figure of the project on this machine, in one run of some 15 minutes."""
+
+    output: Annotated[Path | None, arg(aliases=("-o",), metavar="FOLDER")] = None
+    """Folder for bench.json and bench.png."""
+    quick: bool = False
+    """Tiny sizes: seconds, but figures without meaning."""
+    json: bool = False
+    """Print JSON in place of a table."""
+
+    def run(self) -> None:
+        from mi_ntf.evaluate.bench import bench, print_table
+
+        _report(bench(self.quick, self.output, lambda text: print(text, file=sys.stderr)), self.json, print_table)
+
+
+@dataclass
 class Info:
     """Describe a field file."""
 
@@ -206,6 +223,7 @@ Command = (
     | Annotated[Render, subcommand("render")]
     | Annotated[Compare, subcommand("compare")]
     | Annotated[Explain, subcommand("explain")]
+    | Annotated[Bench, subcommand("bench")]
     | Annotated[Info, subcommand("info")]
     | Annotated[Doctor, subcommand("doctor")]
 )
@@ -253,7 +271,7 @@ def _report(result: Any, as_json: bool, print_table: Any) -> None:
 
 def _print_training(report: dict[str, Any]) -> None:
     """How long a training run took and how good the field is, of the report in the field's provenance."""
-    wanted = ("steps_done", "seconds", "kept", "faults", "val", "test")
+    wanted = ("steps_done", "seconds", "kept", "faults", "val", "test", "transmittance")
     _print_pairs({key: report[key] for key in wanted if report.get(key)})
 
 
