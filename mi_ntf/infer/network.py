@@ -43,6 +43,7 @@ class NetworkField:
         self._transmittance = _Network(arch.transmittance.encoding, "transmittance", tensors, dj)
         baseline = arch.visibility
         self._visibility = None if baseline is None else _Network(baseline.encoding, "visibility", tensors, dj)
+        self.has_visibility = baseline is not None
 
     def log_density(self, p):
         """ln σ at `p`, clipped to the legal range; without the cuts of :meth:`density`."""

@@ -17,5 +17,5 @@ METHODS = (
     "auto",
 )
 """Every name that users may type."""
-AVAILABLE = ("raymarch", "neural_transmittance", "transmittance_map", "none", "auto")
+AVAILABLE = METHODS
 """Those that this version implements."""

@@ -15,11 +15,14 @@ class NeuralTransmittance:
         self.field, self.profile = field, profile
 
     def tau(self, x, wi, distance, index, active):
-        """The ray's τ at x; for a light inside the sphere, over its value at the light, which is where τ is 1."""
-        hit, h, mix = self.field.ray_mixture(x, wi, self.profile)
-        t = dr.maximum(spheres.coordinate(x, wi), -h)
+        """The ray's τ at x; for a light inside the sphere, over its value at the light, which is where τ is 1. What
+        lies behind such a light is kept from the network's eyes."""
+        here = spheres.coordinate(x, wi)
+        light = here + distance
+        hit, h, mix = self.field.ray_mixture(x, wi, lambda o, d: self.profile(o, d, begin=light))
+        t = dr.maximum(here, -h)
         depth = mixture.optical_depth(ops, t, mix)
-        inside = t + distance < h
-        beyond = mixture.optical_depth(ops, dr.select(inside, t + distance, t), mix)
+        inside = light < h
+        beyond = mixture.optical_depth(ops, dr.select(inside, light, t), mix)
         depth = dr.select(inside, dr.maximum(depth - beyond, 0), dr.maximum(depth, 0))
-        return dr.select(hit, dr.exp(-depth), 1)
+        return dr.select(hit & (light > -h), dr.exp(-depth), 1)

@@ -1,0 +1,242 @@
+"""The rays of a light that tables of transmittance are made for: m² of them, and which four pass nearest to a point.
+
+Transmittance map and transmittance volume share them. A light that sees the object as a whole, within 63° of where it
+looks, has the rays through a rectangle on the plane through the origin that is perpendicular to its axis: the smallest
+of a few rectangles that hold the object's outline, cut into square cells, at most m² of them. Parallel rays are the
+limit of a distant light, so both are one case. A light near the object or inside it looks everywhere: its m × m rays
+are octahedral (Engelhardt and Dachsbacher 2008), neighbours across the seams included.
+
+    û, v̂     unit vectors across, times cells per field unit
+    k, axis  1/(distance of the light from the origin), 0 for directional lights; unit vector from the light to there
+    f        place in the table, in cells: fu = ⟨û, x⟩/depth + u0, depth = 1 + k ⟨axis, x⟩; likewise fv
+"""
+
+from types import ModuleType
+from typing import NamedTuple
+
+import drjit as dr
+import numpy as np
+
+from ...core.ops import dot
+from ..lights import LightTable
+
+ROW = 16
+NEAREST_DEPTH = 0.2
+WIDEST = 2.0
+"""tan 63°. Wider frusta waste their rays on the rim."""
+DIRECTIONAL, FRUSTUM, SPHERE = 0.0, 1.0, 2.0
+
+
+class Light(NamedTuple):
+    """A light's row: û, u0, v̂, v0, k · axis, cells along u; position and kind where asked for."""
+
+    u: tuple
+    u0: object
+    v: tuple
+    v0: object
+    axis: tuple
+    columns: object
+    position: tuple | None = None
+    kind: object = None
+
+
+class LightRays:
+    """Rays of all lights of a table, `resolution`² numbers a light at most. `hull` (k, 3): points whose convex hull
+    holds all density.
+
+    `parallel`: there are directional lights alone; `full`: some light looks everywhere. Kernels leave out what their
+    lights do not need.
+    """
+
+    def __init__(self, lights: LightTable, hull: np.ndarray, resolution: int, dj: ModuleType):
+        self.dj, self.m, self.count = dj, resolution, lights.count
+        rows = frames(lights, hull, resolution)
+        self.parallel, self.full = not (rows[:, 15] > 0).any(), bool((rows[:, 15] == SPHERE).any())
+        self._rows = dj.Float(rows.astype(np.float32).ravel())
+        self._texels = dr.opaque(dj.UInt32, resolution**2)
+        self._area = dr.opaque(dj.Float, resolution**2 + 0.5)
+
+    def light(self, index, active, place=True) -> Light:
+        """The row of light `index`; without position and kind unless `place`."""
+        first = self.dj.UInt32(index) * (ROW // 4)
+        u, v, axis = (dr.gather(self.dj.Array4f, self._rows, first + i, active) for i in range(3))
+        row = Light((u[0], u[1], u[2]), u[3], (v[0], v[1], v[2]), v[3], (axis[0], axis[1], axis[2]), axis[3])
+        if place:
+            last = dr.gather(self.dj.Array4f, self._rows, first + 3, active)
+            row = row._replace(position=(last[0], last[1], last[2]), kind=last[3])
+        return row
+
+    def lines(self, light: Light):
+        """Cells along v."""
+        return dr.floor(self._area / light.columns)
+
+    def ray(self, light: Light, tu, tv):
+        """``(o, d, end)`` of the ray through the centre of cell (tu, tv): a point on it, its direction towards the
+        light and the light's place t' on it (infinite for directional lights)."""
+        u2, v2 = dot(light.u, light.u), dot(light.v, light.v)
+        su, sv = (tu - light.u0) / u2, (tv - light.v0) / v2
+        o = tuple(su * a + sv * b for a, b in zip(light.u, light.v, strict=True))
+        k2 = dot(light.axis, light.axis)
+        towards = _cross(light.u, light.v)  # along the axis, of length |û||v̂|
+        scale = dr.rsqrt(u2 * v2)
+        out = tuple(scale * a + dr.sqrt(k2) * c for a, c in zip(towards, o, strict=True))
+        norm = dr.rsqrt(dot(out, out))
+        d = tuple(-c * norm for c in out)
+        if self.full:
+            sphere = light.kind == SPHERE
+            around = self._octahedral_direction(tu, tv)
+            d = tuple(dr.select(sphere, -a, b) for a, b in zip(around, d, strict=True))
+            o = tuple(dr.select(sphere, a, b) for a, b in zip(light.position, o, strict=True))
+        return o, d, dr.select(light.kind == DIRECTIONAL, dr.inf, dot(light.position, d))
+
+    def all_rays(self, first: int, count: int):
+        """``(texel, o, d, end)`` of every ray of the lights `first` … `first + count` − 1, in the order of the
+        table."""
+        texels = self.m**2
+        texel = dr.arange(self.dj.UInt32, count * texels) + dr.opaque(self.dj.UInt32, first * texels)
+        number = texel // self._texels
+        light = self.light(number, True)
+        rest, columns = texel - number * self._texels, self.dj.UInt32(light.columns)
+        line = rest // columns
+        return texel, *self.ray(light, self.dj.Float(rest - line * columns), self.dj.Float(line))
+
+    def nearest(self, index, x, wi, distance, active):
+        """The four rays of light `index` nearest to `x`: ``(inside, [(weight, texel, t), …])``.
+
+        `inside`: whether light towards `x` can meet the object at all; weights are bilinear; `texel` counts through the
+        tables of all lights; `t`: where the plane through `x` perpendicular to ω_i cuts the ray.
+        """
+        light = self.light(index, active, self.full)
+        ux, vx = dot(light.u, x), dot(light.v, x)
+        depth = 1 if self.parallel else 1 + dot(light.axis, x)
+        inverse = 1 if self.parallel else dr.rcp(dr.maximum(depth, NEAREST_DEPTH / 2))
+        fu, fv = ux * inverse + light.u0, vx * inverse + light.v0
+        columns, lines = light.columns, self.lines(light)
+        inside = active & (fu > -0.5) & (fv > -0.5) & (fu < columns - 0.5) & (fv < lines - 0.5)
+        if not self.parallel:
+            inside &= depth > NEAREST_DEPTH / 2
+        if self.full:
+            sphere = light.kind == SPHERE
+            su, sv = self._octahedral_place(tuple(-c for c in wi))
+            fu, fv, inside = dr.select(sphere, su, fu), dr.select(sphere, sv, fv), inside | (active & sphere)
+        iu, iv = dr.floor(fu), dr.floor(fv)
+        wu, wv = fu - iu, fv - iv
+        base = self.dj.UInt32(index) * self._texels
+        u, v = (dr.maximum(iu, 0), dr.minimum(iu + 1, columns - 1)), (dr.maximum(iv, 0), dr.minimum(iv + 1, lines - 1))
+        along = dot(x, wi)
+        place = None if self.parallel else self._frustum_place(light, x, wi, distance, depth, (fu, fv), (ux, vx), along)
+        width = self.dj.UInt32(columns)
+        found = []
+        for j in (0, 1):
+            row = base + self.dj.UInt32(v[j]) * width
+            for i in (0, 1):
+                texel = row + self.dj.UInt32(u[i])
+                t = along if self.parallel else place(u[i], v[j])
+                if self.full:
+                    tu, tv = self._wrap(iu + i, iv + j)
+                    texel = dr.select(sphere, base + self.dj.UInt32(tv) * width + self.dj.UInt32(tu), texel)
+                    t = dr.select(sphere, self._sphere_place(x, wi, distance, tu, tv), t)
+                found.append(((wu if i else 1 - wu) * (wv if j else 1 - wv), texel, t))
+        return inside, found
+
+    def _frustum_place(self, light, x, wi, distance, depth, f, projected, along):
+        """t of the ray through cell (tu, tv), as a function.
+
+        The ray's direction is ω_i + g, normalised, with g across: −(δu û/û² + δv v̂/v̂²) · depth/r, δ the distance in
+        cells. Written in differences from ω_i, so that a light 10⁴ radii away keeps all its digits: coordinates on the
+        ray, ⟨light, d⟩ − r/⟨d, ω_i⟩, would lose four.
+        """
+        kappa = depth / distance  # 0 for directional lights
+        u2, v2 = dr.rcp(dot(light.u, light.u)), dr.rcp(dot(light.v, light.v))
+        pu, pv = projected[0] * u2, projected[1] * v2
+        qu, qv = dot(light.u, wi) * u2, dot(light.v, wi) * v2
+
+        def place(tu, tv):
+            du, dv = tu - f[0], tv - f[1]
+            xg, wg = kappa * (du * pu + dv * pv), du * qu + dv * qv
+            g2 = du * du * u2 + dv * dv * v2
+            drop = kappa * depth * (g2 - wg * wg) * dr.rcp(1 - kappa * wg)
+            return (along - xg - drop) * dr.rsqrt(1 + kappa * (kappa * g2 - 2 * wg))
+
+        return place
+
+    def _sphere_place(self, x, wi, distance, tu, tv):
+        d = tuple(-c for c in self._octahedral_direction(tu, tv))
+        cosine = dr.maximum(dot(d, wi), 0.1)
+        return dot(x, d) - distance * (1 - cosine * cosine) / cosine
+
+    def _octahedral_place(self, w):
+        """Cell coordinates of the unit direction `w`."""
+        scale = dr.rcp(dr.abs(w[0]) + dr.abs(w[1]) + dr.abs(w[2]))
+        a, b = _fold(w[0] * scale, w[1] * scale, w[2] < 0)
+        half = dr.sqrt(dr.floor(self._area)) * 0.5
+        return (a + 1) * half - 0.5, (b + 1) * half - 0.5
+
+    def _octahedral_direction(self, tu, tv):
+        """Unit direction through the centre of cell (tu, tv)."""
+        step = 2 * dr.rsqrt(dr.floor(self._area))
+        a, b = (tu + 0.5) * step - 1, (tv + 0.5) * step - 1
+        z = 1 - dr.abs(a) - dr.abs(b)
+        a, b = _fold(a, b, z < 0)
+        norm = dr.rsqrt(a * a + b * b + z * z)
+        return a * norm, b * norm, z * norm
+
+    def _wrap(self, tu, tv):
+        """The cell that lies where (tu, tv), up to one cell outside, would: an edge meets its own mirror image."""
+        last = dr.sqrt(dr.floor(self._area)) - 1
+        tv = dr.select((tu < 0) | (tu > last), last - tv, tv)
+        tu = dr.clip(tu, 0, last)
+        tu = dr.select((tv < 0) | (tv > last), last - tu, tu)
+        return tu, dr.clip(tv, 0, last)
+
+
+def _fold(a, b, lower):
+    """The lower half of the octahedron, folded out; its own inverse."""
+    fa = (1 - dr.abs(b)) * dr.select(a < 0, -1, 1)
+    fb = (1 - dr.abs(a)) * dr.select(b < 0, -1, 1)
+    return dr.select(lower, fa, a), dr.select(lower, fb, b)
+
+
+def _cross(a, b):
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+def frames(lights: LightTable, hull: np.ndarray, resolution: int) -> np.ndarray:
+    """The rows of :class:`Light`, (n, 16) float64."""
+    distance = np.maximum(np.linalg.norm(lights.where, axis=1), 1e-9)
+    axis = -lights.where / distance[:, None]
+    k = np.where(lights.is_point, 1 / distance, 0.0)
+    depth = 1 + k * (hull @ axis.T)  # (hull points, n)
+    helper = np.where(np.abs(axis[:, :1]) > 0.9, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
+    side = np.cross(axis, helper)
+    side /= np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
+    up = np.cross(axis, side)
+    best, area = np.zeros((lights.count, 10)), np.full(lights.count, np.inf)
+    for angle in np.arange(8) * np.pi / 16:
+        u = np.cos(angle) * side + np.sin(angle) * up
+        v = np.cos(angle) * up - np.sin(angle) * side
+        row = np.concatenate([u, v, *_window(u, v, hull, np.maximum(depth, NEAREST_DEPTH))], axis=1)
+        size = row[:, 7] * row[:, 9]
+        best = np.where((size < area)[:, None], row, best)
+        area = np.minimum(area, size)
+    u, v, (u_middle, u_half, v_middle, v_half) = best[:, :3], best[:, 3:6], best[:, 6:].T
+    widest = k * np.maximum(np.abs(u_middle) + u_half, np.abs(v_middle) + v_half)
+    sphere = (depth.min(0) < NEAREST_DEPTH) | (widest > WIDEST)
+    columns = np.clip(np.round(resolution * np.sqrt(u_half / v_half)), 2, resolution**2 // 2)
+    columns = np.where(sphere, resolution, columns)
+    lines = np.floor((resolution**2 + 0.5) / columns)
+    su, sv = columns / (2 * u_half), lines / (2 * v_half)
+    u0, v0 = columns / 2 - 0.5 - su * u_middle, lines / 2 - 0.5 - sv * v_middle
+    position = np.where(lights.is_point[:, None], lights.where, 0.0)
+    kind = np.where(sphere, SPHERE, np.where(lights.is_point, FRUSTUM, DIRECTIONAL))
+    parts = (su[:, None] * u, u0, sv[:, None] * v, v0, k[:, None] * axis, columns, position, kind)
+    return np.concatenate([p.reshape(lights.count, -1) for p in parts], axis=1)
+
+
+def _window(u, v, hull, depth):
+    """Middle and half width, along u and v, of what holds `hull` on the plane through the origin, as each light sees
+    it: two (n, 2)."""
+    for along in (u, v):
+        place = hull @ along.T / depth
+        low, high = place.min(0), place.max(0)
+        yield np.stack([(low + high) / 2, np.maximum((high - low) / 2, 1e-3)], axis=1)

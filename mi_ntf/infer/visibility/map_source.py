@@ -1,0 +1,82 @@
+"""Where a transmittance map's mixtures come from: the ray network, or a march through the field.
+
+A source has ``fit(o, d, end) → mixture`` for rays through `o` towards the light along `d`, which lies at t' = `end` or
+beyond the sphere (infinity: at no distance at all); ``components``; and ``weights``, false for one logistic of weight
+1.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from ...core import logistic, mixture, spheres
+from .. import ops
+from . import two_logistics
+
+CLEAR = -100.0
+"""b of a ray that nothing blocks: S(1·(t + 100)) = 1 in float32 for every t of the sphere."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """See the module."""
+
+    fit: Any
+    components: int
+    weights: bool
+
+
+def network_source(field, profile, inside=True) -> Source:
+    """`map_source=network`: the mixture by one query of the ray network; τ = 1 where the ray meets nothing.
+
+    `inside`: some light may lie inside the sphere. The network speaks of whole chords; what lies behind such a light is
+    kept from its eyes, and its τ is divided by its value at the light.
+    """
+
+    def fit(o, d, end):
+        hit, h, mix = field.ray_mixture(o, d, lambda o, d: profile(o, d, begin=end))
+        if inside:
+            near = end < h
+            top = mixture.transmittance(ops, dr.minimum(end, h), mix)
+            scale = dr.select(near, dr.rcp(dr.clip(top, 1e-6, 1)), 1)
+            mix, hit = tuple((w * scale, a, b) for w, a, b in mix), hit & (end > -h)
+        share = 1 / len(mix)
+        return tuple((dr.select(hit, w, share), dr.select(hit, a, 1), dr.select(hit, b, CLEAR)) for w, a, b in mix)
+
+    return Source(fit, field.components, inside or field.components > 1)
+
+
+LEVELS = (1e-3, math.log(4 / 3), math.log(2), math.log(4))
+"""Optical depths where matter begins and where τ is 3/4, 1/2 and 1/4."""
+
+
+def field_source(profile, components: int = 1) -> Source:
+    """`map_source=field`: march the field once per ray, from the light inwards. One logistic follows in closed form
+    from τ's quartiles, two by least squares on eleven levels of τ."""
+
+    def one(o, d, end):
+        hit, _m, h = spheres.chord(ops, o, d)
+        (first, *places), depth = profile(o, d, LEVELS, end)
+        a, b = logistic.through_quantiles(ops, *places)
+        a_part, b_part = _partial(h, first, depth)
+        blocked, clear = depth >= LEVELS[-1], ~hit | (depth < LEVELS[0])
+        a, b = dr.select(blocked, a, a_part), dr.select(blocked, b, b_part)
+        return ((1.0, dr.select(clear, 1, a), dr.select(clear, CLEAR, b)),)
+
+    def two(o, d, end):
+        hit, _m, _h = spheres.chord(ops, o, d)
+        places, depth, last = profile.with_end(o, d, two_logistics.DEPTHS, end)
+        return two_logistics.fit(places, depth, last, hit & (depth > two_logistics.DEPTHS[0]))
+
+    return Source(one if components == 1 else two, components, components > 1)
+
+
+def _partial(h, begin, depth):
+    """(a, b) of a ray that keeps p = e^−depth > 1/4 of the light: a logistic cannot rest at p, so it passes (1 + p)/2
+    where the matter begins and p halfway from there to the far end."""
+    p = dr.exp(-depth)
+    top, low = dr.log((1 + p) / dr.maximum(1 - p, 1e-4)), dr.log(p / dr.maximum(1 - p, 1e-4))
+    a = (top - low) / dr.maximum(0.5 * (begin + h), 1e-2)
+    return a, begin - top / a

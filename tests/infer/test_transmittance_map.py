@@ -1,0 +1,205 @@
+"""Transmittance maps against the rays that they hold."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers import fields
+
+from mi_ntf.core import logistic, mixture, ops
+from mi_ntf.infer.grid import GridField
+from mi_ntf.infer.lights import LightTable
+from mi_ntf.infer.march import optical_depth
+from mi_ntf.infer.network import NetworkField
+from mi_ntf.infer.profile import DepthProfile
+from mi_ntf.infer.visibility.light_rays import DIRECTIONAL, FRUSTUM, SPHERE, frames
+from mi_ntf.infer.visibility.map_source import CLEAR, Source, field_source, network_source
+from mi_ntf.infer.visibility.transmittance_map import TransmittanceMap
+
+BLOBS = [(-0.3, 0.0, 0.0), (0.35, 0.2, 0.1), (0.0, -0.45, 0.3)], [0.4, 0.25, 0.2]
+LIGHTS = {
+    "sun": (np.array([0.48, 0.6, 0.64]), False),
+    "lamp": (np.array([1.5, 1.0, 2.0]), True),
+    "far": (np.array([4800.0, 6000.0, -6400.0]), True),
+    "on the sphere": (np.array([0.0, 0.6, 0.8]), True),
+    "inside": (np.array([0.1, 0.5, -0.15]), True),
+}
+NEAR = ("inside",)
+
+
+def arrays(points):
+    return tuple(mi.Float(np.ascontiguousarray(c, np.float32)) for c in np.asarray(points, np.float64).T)
+
+
+@pytest.fixture(scope="module")
+def network():
+    mi.set_variant("llvm_ad_rgb")
+    return NetworkField(*fields.blobs(*BLOBS, log_density=4.5), mi)
+
+
+@pytest.fixture(scope="module")
+def grid(network):
+    return GridField(network, 96, mi)
+
+
+@pytest.fixture(scope="module")
+def reader(grid):
+    return DepthProfile(grid.density, grid, mi.Float(1 / 256))
+
+
+def table(*names):
+    where, is_point = zip(*(LIGHTS[n] for n in names), strict=True)
+    return LightTable(np.array(where), np.ones((len(names), 3)), np.array(is_point), 1.0, mi)
+
+
+def towards(x, name):
+    """Unit vectors to the light and distances."""
+    where, point = LIGHTS[name]
+    d = (where - x) if point else np.broadcast_to(where, x.shape)
+    r = np.linalg.norm(d, axis=1)
+    return d / r[:, None], r if point else np.full(len(x), np.inf)
+
+
+def look(visibility, x, name, index=0):
+    wi, distance = towards(x, name)
+    return np.array(visibility.tau(arrays(x), arrays(wi), mi.Float(distance), mi.UInt32(index), True))
+
+
+def marched(grid, x, name):
+    wi, distance = towards(x, name)
+    steps = tuple(mi.Float(s) for s in (1 / 512, 1 / 512, 0.1))
+    depth = optical_depth(
+        grid.density, grid, arrays(x), arrays(wi), mi.Float(distance), steps, dr.full(mi.Bool, True, len(x))
+    )
+    return np.exp(-np.array(depth))
+
+
+def analytic_source(a, b_of):
+    """Rays whose (a, b) are a known smooth function of the ray, to test the map without any fit."""
+
+    def fit(o, d, end):
+        return ((1.0, dr.full(mi.Float, a, dr.width(d[0])), b_of(o, d)),)
+
+    return Source(fit, 1, False)
+
+
+def random_rays(rays, index, rng, count=300):
+    """``(o, d, end)`` of rays through random texel centres, NumPy; not those at the table's edges."""
+    light = rays.light(mi.UInt32(index), True)
+    cells = [np.floor(rng.uniform(2, float(np.array(n).ravel()[0]) - 2, count)) for n in (light.columns,
+                                                                                         rays.lines(light))]
+    o, d, end = rays.ray(light, *(mi.Float(c.astype(np.float32)) for c in cells))
+    o, d = (np.array([np.broadcast_to(np.array(c, np.float64), count) for c in v]) for v in (o, d))
+    return o, d, np.broadcast_to(np.array(end, np.float64), count)
+
+
+@pytest.mark.parametrize("source", ["network", "field", "mixture"])
+@pytest.mark.parametrize("name", LIGHTS)
+def test_texel_centre_returns_its_own_ray(grid, network, reader, name, source, rng):
+    """A point on a texel's ray sees that ray's own mixture, exactly."""
+    made = {"network": lambda: network_source(network, reader), "field": lambda: field_source(reader),
+            "mixture": lambda: field_source(reader, 2)}[source]()
+    tmap = TransmittanceMap(table(name), 32, grid.hull, made, mi)
+    o, d, end = random_rays(tmap.rays, 0, rng)
+    where = np.minimum(rng.uniform(-0.4, 0.4, 300), end - 0.02)
+    x = (o + (where - (o * d).sum(0)) * d).T
+    mix = made.fit(arrays(o.T), arrays(d.T), mi.Float(np.minimum(end, 1e30)))
+    mix = [[np.array(v, np.float64) for v in part] for part in mix]
+    truth = np.minimum(mixture.transmittance(ops, where, mix), 1)
+    # float32 texel coordinates: 1e-5 of a texel, times neighbours that differ by at most 1; slopes of a·1e-6.
+    np.testing.assert_allclose(look(tmap, x, name), truth, atol=3e-3)
+
+
+@pytest.mark.parametrize("name", LIGHTS)
+def test_interpolation_reproduces_a_smooth_map(grid, name, rng):
+    """b linear in the ray's place and a = 5: bilinear τ differs from the truth by second order in the texel only."""
+
+    def b_of(o, d):
+        m = tuple(a - (o[0] * d[0] + o[1] * d[1] + o[2] * d[2]) * b for a, b in zip(o, d, strict=True))
+        return 0.3 * m[0] - 0.2 * m[1] + 0.1
+
+    tmap = TransmittanceMap(table(name), 64, grid.hull, analytic_source(5.0, b_of), mi)
+    x = rng.uniform(-0.25, 0.25, (2000, 3))
+    wi, _ = towards(x, name)
+    t = (x * wi).sum(1)
+    m = x - t[:, None] * wi
+    truth = logistic.transmittance(ops, t, 5.0, 0.3 * m[:, 0] - 0.2 * m[:, 1] + 0.1)
+    # (5·0.36)²·(texel 0.03)²/8 of S''; octahedral texels measure 0.06 rad, and creases double the error.
+    np.testing.assert_allclose(look(tmap, x, name), truth, atol=6e-3 if name in NEAR else 2e-3)
+
+
+@pytest.mark.parametrize("components", [1, 2])
+@pytest.mark.parametrize("name", LIGHTS)
+def test_field_source_matches_the_march(grid, reader, name, components, rng):
+    """Maps of the field at points in the open and in shadow, wherever the light is."""
+    tmap = TransmittanceMap(table(name), 256, grid.hull, field_source(reader, components), mi)
+    x = rng.uniform(-0.6, 0.6, (4000, 3))
+    truth = marched(grid, x, name)
+    error = np.abs(look(tmap, x, name) - truth)
+    # Grazing rays keep a plateau that no single logistic has; they are a few per cent.
+    share, rms = ((0.05, 0.06), (0.006, 0.02))[components - 1]
+    assert np.median(error) < 2e-3 and (error > 0.1).mean() < share and np.sqrt((error**2).mean()) < rms
+    assert 0.05 < (truth < 0.5).mean() < 0.95
+
+
+@pytest.mark.parametrize("source", ["network", "mixture"])
+@pytest.mark.parametrize("name", LIGHTS)
+def test_transmittance_along_texel_rays(grid, network, reader, name, source, rng):
+    """In [0, 1], growing towards the light, 1 there."""
+    made = network_source(network, reader) if source == "network" else field_source(reader, 2)
+    tmap = TransmittanceMap(table(name), 32, grid.hull, made, mi)
+    o, d, end = random_rays(tmap.rays, 0, rng, 100)
+    far = np.minimum(end - 1e-3, 1.0)
+    steps = np.linspace(-1, 1, 40)[:, None] * (far + 1) / 2 + (far - 1) / 2
+    tau = np.array([look(tmap, (o + (t - (o * d).sum(0)) * d).T, name) for t in steps])
+    assert (tau >= 0).all() and (tau <= 1).all()
+    # Along a ray the lookup's place in the map is the same up to rounding, 1e-5 of a texel.
+    assert np.diff(tau, axis=0).min() > -3e-3
+    outside = np.linalg.norm(LIGHTS[name][0]) >= 0.99 or source == "network"
+    # A light inside lies in the blobs' faint rim, which takes some light within a thousandth.
+    np.testing.assert_allclose(tau[-1], 1, atol=0.02 if outside else 0.05)
+
+
+def test_map_covers_every_point_with_density(grid, rng):
+    """No point of the object falls outside its light's window, where τ would be 1."""
+    for name in LIGHTS:
+        blocked = analytic_source(1.0, lambda o, d: dr.full(mi.Float, 90.0, dr.width(d[0])))
+        tmap = TransmittanceMap(table(name), 16, grid.hull, blocked, mi)
+        x = rng.uniform(-1, 1, (100000, 3))
+        x = x[np.array(grid.density(arrays(x))) > 0]
+        assert look(tmap, x, name).max() < 1e-6
+
+
+def test_texels_are_square_and_no_more_than_asked_for(grid):
+    """A map of m × m texels on an oblong object has oblong texels, which waste half of them."""
+    tall = grid.hull * [0.3, 1.0, 0.3]
+    for name in ("sun", "lamp", "far"):
+        (row,) = frames(table(name), tall, 64)
+        columns = row[11]
+        lines = np.floor((64**2 + 0.5) / columns)
+        assert 0.95 * 64**2 < columns * lines <= 64**2
+        assert np.linalg.norm(row[:3]) / np.linalg.norm(row[4:7]) == pytest.approx(1, abs=0.06)  # whole texels
+        assert not 0.6 < columns / lines < 1.6
+
+
+def test_which_lights_look_everywhere(grid):
+    """A frustum where it covers the object, all directions where the light is near or within."""
+    kinds = frames(table(*LIGHTS), grid.hull, 32)[:, 15]
+    np.testing.assert_array_equal(kinds, [DIRECTIONAL, FRUSTUM, FRUSTUM, FRUSTUM, SPHERE])
+
+
+def test_outside_and_clear_rays_are_lit(grid, reader):
+    tmap = TransmittanceMap(table("sun"), 16, grid.hull, field_source(reader), mi)
+    b = np.array(tmap.values)[1::2]
+    assert (b == CLEAR).any() and (b > -1.5).any()
+    assert look(tmap, np.array([[0.0, 0.9, -0.9]]), "sun") == 1
+
+
+def test_many_lights_each_get_their_own_map(grid, network, reader, rng):
+    """Light k of a table of many equals the same light alone, whatever stands beside it."""
+    made = network_source(network, reader)
+    together = TransmittanceMap(table(*LIGHTS), 24, grid.hull, made, mi)
+    x = rng.uniform(-0.4, 0.4, (100, 3))
+    for k, name in enumerate(LIGHTS):
+        alone = TransmittanceMap(table(name), 24, grid.hull, made, mi)
+        np.testing.assert_allclose(look(together, x, name, k), look(alone, x, name), atol=1e-5)
