@@ -1,0 +1,98 @@
+"""What every row of ``mi-ntf bench`` is made of: sizes, seconds, and the row itself."""
+
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import drjit as dr
+
+from ..core.architecture import PAPER
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How much is measured.
+
+    hidden          widths of the networks' layers, the paper's
+    queries         network queries a kernel
+    repeats         timed runs after one warm-up
+    slow_lights     lights that stand for all 500 where those would take hours
+    pixels, image   side of the image that stands for 600², and of images rendered whole
+    lights, many    environments, columns × rows: from 1 light to the paper's 500; the large one
+    paper_maps      texels along a map's side: one for each of the paper's pixels, and ours
+    map             ours, where maps are built
+    error_…         the image, the lights and the map whose error is measured
+    """
+
+    hidden: tuple[int, ...]
+    queries: int
+    repeats: int
+    slow_lights: int
+    pixels: int
+    image: int
+    lights: tuple[tuple[int, int], ...]
+    many: tuple[int, int]
+    paper_maps: tuple[int, int]
+    map: int
+    error_image: int
+    error_lights: int
+    error_map: int
+
+
+FULL = Sizes(hidden=PAPER.density.hidden, queries=1 << 17, repeats=5, slow_lights=5, pixels=150, image=600,
+             lights=((1, 1), (10, 5), (20, 5), (25, 10), (50, 10)), many=(128, 64), paper_maps=(600, 128), map=128,
+             error_image=128, error_lights=50, error_map=256)
+QUICK = Sizes(hidden=(16,), queries=1 << 10, repeats=1, slow_lights=5, pixels=12, image=16,
+              lights=((1, 1), (4, 2), (5, 4)), many=(6, 4), paper_maps=(600, 128), map=16,
+              error_image=12, error_lights=2, error_map=16)
+"""Runs every line of the benchmark within seconds; its figures mean nothing."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the report.
+
+    asked         the figure to reach, in words; empty: for information
+    weights       ``trained`` or ``random``, per network that takes part
+    extrapolated  from what; empty: measured whole
+    met           whether `measured` reaches it; None where nothing is asked
+    details       the numbers that `measured` comes from
+    """
+
+    what: str
+    measured: float
+    unit: str
+    asked: str = ""
+    weights: str = "trained"
+    extrapolated: str = ""
+    met: bool | None = None
+    details: dict[str, Any] = field(default_factory=dict)
+
+
+def row(what: str, measured: float, unit: str, *, least: float | None = None, most: float | None = None,
+        **rest: Any) -> Row:
+    """A row with a bound: `least` or `most`, of the same unit as `measured`."""
+    if least is not None:
+        return Row(what, measured, unit, f"≥ {least:g} {unit}", met=measured >= least, **rest)
+    if most is not None:
+        return Row(what, measured, unit, f"≤ {most:g} {unit}", met=measured <= most, **rest)
+    return Row(what, measured, unit, **rest)
+
+
+def seconds(work: dict[str, Callable[[], Any]], repeats: int) -> dict[str, float]:
+    """Median wall seconds of each `work`, kernels compiled before. The rounds alternate between them, so that what else
+    the machine does falls on all alike. A `work` returns what it computes, which is evaluated within its time."""
+    for run in work.values():
+        _timed(run)
+    rounds = [{name: _timed(run) for name, run in work.items()} for _ in range(repeats)]
+    return {name: statistics.median(r[name] for r in rounds) for name in work}
+
+
+def _timed(run: Callable[[], Any]) -> float:
+    dr.sync_thread()
+    start = time.perf_counter()
+    dr.eval(run())
+    dr.sync_thread()
+    return time.perf_counter() - start

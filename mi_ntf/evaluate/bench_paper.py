@@ -1,0 +1,200 @@
+"""The paper's comparison, in its own networks: transmittance map over transmittance volume (Shafiei et al. 2021, Table
+1).
+
+A query costs the same whatever its answer, so the networks have random weights and the paper's sizes
+(:data:`mi_ntf.core.architecture.PAPER`). What the camera sees, and with it how many points are shaded, is the shipped
+field: :class:`PaperField` adds a vanishing part of each query to the shipped field's value.
+
+Costs are measured per network query and composed; both sides of a ratio march, shade and query in kernels of one size.
+"""
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core import spheres
+from ..core.architecture import PAPER, Architecture, Header
+from ..infer import march, ops, shade
+from ..infer.lights import LightTable
+from ..infer.network import NetworkField
+from ..infer.profile import DepthProfile
+from .bench_measure import Row, Sizes, row, seconds
+from .transmittance import directions
+
+LIGHTS = 500
+SIDE = 600
+"""The paper's lights and image side."""
+STAGE_SAMPLES = 64 + 192
+"""Field queries a ray of the hierarchical quadrature: 64 coarse, then all 192 by the fine network."""
+IMAGE_SAMPLES = 192
+VANISHING = 1e-30
+
+
+def random_network(hidden: tuple[int, ...], seed: int = 0) -> NetworkField:
+    """The paper's three networks, of `hidden` layers, with random weights of the usual variance."""
+    rng = np.random.default_rng(seed)
+    architecture = Architecture(*(replace(PAPER.density, hidden=hidden) for _ in range(3)))
+    tensors = {}
+    for name, shape in architecture.skeleton().items():
+        scale = np.sqrt(2 / shape[-1]) if name.endswith("weight") else 0
+        tensors[name] = (rng.normal(size=shape) * scale).astype(np.float32)
+    return NetworkField(Header(architecture), tensors, mi)
+
+
+class PaperField:
+    """The values of `shape` (a :class:`mi_ntf.infer.grid.GridField`) at the price of `network`'s queries."""
+
+    def __init__(self, shape, network: NetworkField):
+        self.shape, self.network = shape, network
+
+    def density(self, p):
+        """σ at `p`."""
+        return self.shape.density(p) + VANISHING * self.network.density(p)
+
+    def reflectance(self, p):
+        """As :meth:`mi_ntf.infer.network.NetworkField.reflectance`."""
+        pairs = zip(self.shape.reflectance(p), self.network.reflectance(p), strict=True)
+        return tuple(tuple(u + VANISHING * v for u, v in zip(a, b, strict=True)) if isinstance(a, tuple)
+                     else a + VANISHING * b for a, b in pairs)
+
+
+def light_rays(lights: int, count: int):
+    """``(o, d)`` of `count` rays in all, spread evenly over `lights` of the 500 directional lights and over the disc of
+    each, radius 0.9."""
+    index = np.arange(count)
+    d = directions(LIGHTS)[(index % lights) * (LIGHTS // lights)]
+    r, phi = 0.9 * np.sqrt((index + 0.5) / count), index * np.pi * (3 - 5**0.5)
+    side = np.cross(d, np.where(np.abs(d[:, :1]) > 0.9, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]]))
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    o = r[:, None] * (np.cos(phi)[:, None] * side + np.sin(phi)[:, None] * np.cross(d, side))
+    o, d = (tuple(mi.Float(c) for c in v.T.astype(np.float32)) for v in (o, d))
+    dr.eval(o, d)
+    return o, d
+
+
+def tabulate(density, o, d, samples: int):
+    """τ at `samples` points along each ray from the light, flat: the work of a transmittance volume, all queries of a
+    ray side by side."""
+    count = dr.opaque(mi.UInt32, samples)
+    index = dr.arange(mi.UInt32, dr.width(o[0]) * samples)
+    ray = index // count
+    o, d = (tuple(dr.gather(mi.Float, c, ray) for c in v) for v in (o, d))
+    _, m, h = spheres.chord(ops, o, d)
+    step = 2 * h / mi.Float(count)
+    t = h - (mi.Float(index - ray * count) + 0.5) * step
+    depth = density(tuple(mi_ + t * di for mi_, di in zip(m, d, strict=True))) * step
+    return dr.exp(-dr.block_prefix_reduce(dr.ReduceOp.Add, depth, samples, exclusive=False))
+
+
+def stage_costs(medium, network: NetworkField, sizes: Sizes) -> dict[str, float]:
+    """Seconds a ray of a light's table: ``volume/256`` and ``volume/192`` samples, ``map`` by the paper's network,
+    ``ours`` by the shipped one, its look at the shipped grid included. As many queries a kernel on either side."""
+    grid = medium.field.grid
+    profile = DepthProfile(grid.density, grid, dr.opaque(mi.Float, 2 / 384))
+    many = light_rays(sizes.slow_lights, sizes.queries)
+    counts = {n: max(1, sizes.queries // n) for n in (STAGE_SAMPLES, IMAGE_SAMPLES)}
+    few = {n: light_rays(sizes.slow_lights, count) for n, count in counts.items()}
+    work = {f"volume/{n}": (lambda n=n: tabulate(network.density, *few[n], n)) for n in counts}
+    work |= {name: (lambda net=net: net.ray_mixture(*many, profile)[2])
+             for name, net in (("map", network), ("ours", medium.field.network))}
+    found = seconds(work, sizes.repeats)
+    rays = {f"volume/{n}": count for n, count in counts.items()}
+    return {name: value / rays.get(name, sizes.queries) for name, value in found.items()}
+
+
+def stage_rows(costs: dict[str, float], sizes: Sizes) -> list[Row]:
+    """The transmittance stage: 500 directional lights, 64 + 192 samples a ray, one resolution for both sides."""
+    rays = max(1, sizes.queries // STAGE_SAMPLES)
+    rest = {"extrapolated": f"volume: {sizes.slow_lights} lights, {rays} rays in all",
+            "details": {f"{k}_seconds_a_ray": v for k, v in costs.items()}}
+    slow = costs[f"volume/{STAGE_SAMPLES}"]
+    what = f"transmittance stage, {LIGHTS} lights, volume over map, "
+    return [
+        row(what + "paper's network", slow / costs["map"], "×", least=230, weights="field, network: random", **rest),
+        row(what + "our network", slow / costs["ours"], "×", least=1000,
+            weights="field: random; network: trained", **rest),
+    ]
+
+
+def camera_cost(sensor, medium, paper: PaperField, sizes: Sizes):
+    """Seconds to march the rays of all pixels, empty space skipped, and to read the reflectance of what they meet; and
+    these shading points."""
+    o, d, far = _view_rays(sensor, medium.frame, sizes.pixels)
+    middle = dr.full(mi.Float, 0.5, dr.width(far))
+    step = dr.opaque(mi.Float, 2 / IMAGE_SAMPLES)
+    strand = march.Strand(paper.density, medium.field.grid, o, d)
+    last = []
+
+    def view():
+        found = march.camera_samples([strand], far, step, middle, middle)
+        along = tuple(dr.gather(mi.Float, c, found.ray) for c in d)
+        x = tuple(dr.gather(mi.Float, a, found.ray) + found.t * b for a, b in zip(o, along, strict=True))
+        p = shade.Points(x, tuple(-c for c in along), paper.reflectance(x))
+        last[:] = [p]
+        return [*p.x, *p.wo, *p.normal, *p.albedo, p.roughness, p.specular]
+
+    return seconds({"camera": view}, sizes.repeats)["camera"], last[0]
+
+
+def _view_rays(sensor, frame, side: int):
+    """``(o, d, length)``, field coordinates: rays through the middles of `side`² pixels of the whole picture."""
+    index = dr.arange(mi.UInt32, side * side)
+    y = index // dr.opaque(mi.UInt32, side)
+    where = mi.Point2f((mi.Float(index - y * side) + 0.5) / side, (mi.Float(y) + 0.5) / side)
+    ray, _ = sensor.sample_ray(mi.Float(0), mi.Float(0), where, mi.Point2f(0.5))
+    far = dr.full(mi.Float, 1e6, side * side)
+    result = frame.point_to_field(ray.o), frame.direction_to_field(ray.d), far
+    dr.eval(result)
+    return result
+
+
+def shading_costs(medium, points, sizes: Sizes) -> dict[str, float]:
+    """``shade/volume`` and ``shade/map``: seconds a point and light to look up and to shade. What the tables hold does
+    not matter, so they are filled from the shipped grid."""
+    from ..render import visibility
+
+    count = sizes.slow_lights
+    table = LightTable(directions(count), np.ones((count, 3)), np.zeros(count, bool), 1.0, mi)
+    options = visibility.Options(2 / IMAGE_SAMPLES, sizes.map)
+    built = {name: visibility.build(f"transmittance_{name}", medium, table, options) for name in ("volume", "map")}
+    found = seconds({f"shade/{n}": (lambda v=v: shade.reflect(points, table, v)) for n, v in built.items()},
+                    sizes.repeats)
+    return {n: v / max(dr.width(points.x[0]) * count, 1) for n, v in found.items()}
+
+
+def per_light(costs: dict[str, float], table: str, texels: int) -> float:
+    """Seconds of a light in the whole picture: its table of `texels` rays at the cost `table`, and shading."""
+    lookup = costs["shade/volume" if table.startswith("volume") else "shade/map"]
+    return texels * costs[table] + SIDE**2 * costs["points"] * lookup
+
+
+def image_rows(costs: dict[str, float], sizes: Sizes) -> list[Row]:
+    """The whole 600 × 600 picture under 500 lights, 192 samples, volume over map, each map resolution."""
+    found, fixed = [], SIDE**2 * costs["camera"]
+    for m in sizes.paper_maps:
+        slow_light = per_light(costs, f"volume/{IMAGE_SAMPLES}", m * m)
+        for table, name, least in (("map", "paper's network", 92), ("ours", "our network", 192)):
+            fast_light = per_light(costs, table, m * m)
+            slow, fast = (fixed + LIGHTS * light for light in (slow_light, fast_light))
+            asked = {"least": least} if m == max(sizes.paper_maps) else {}
+            found.append(row(
+                f"whole {SIDE}² image, {LIGHTS} lights, m = {m}², volume over map, {name}", slow / fast, "×", **asked,
+                weights="field: random; network: " + ("random" if table == "map" else "trained"),
+                extrapolated=f"both sides: {sizes.slow_lights} lights, {sizes.pixels}² pixels",
+                details={"volume_seconds": slow, "map_seconds": fast, "volume_fixed_seconds": fixed,
+                         "map_fixed_seconds": fixed, "volume_lights_seconds": slow_light,
+                         "map_lights_seconds": fast_light}))
+    return found
+
+
+def rows(scene, medium, sizes: Sizes) -> list[Row]:
+    """All rows of this file."""
+    network = random_network(sizes.hidden)
+    costs = stage_costs(medium, network, sizes)
+    camera, points = camera_cost(scene.sensors()[0], medium, PaperField(medium.field.grid, network), sizes)
+    pixels = sizes.pixels**2
+    costs |= {"camera": camera / pixels, "points": dr.width(points.x[0]) / pixels}
+    costs |= shading_costs(medium, points, sizes)
+    return stage_rows(costs, sizes) + image_rows(costs, sizes)

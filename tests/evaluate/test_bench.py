@@ -1,0 +1,82 @@
+"""`mi-ntf bench`: every row is measured, by figures that add up."""
+
+import json
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_ntf.evaluate import bench, bench_figure, bench_image, bench_measure, bench_paper
+
+
+@pytest.fixture(autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+def test_every_line_runs(tmp_path, capsys):
+    report = bench.bench(quick=True, out=tmp_path)
+    bench.print_table(report)
+    text = capsys.readouterr().out
+    assert json.loads((tmp_path / "bench.json").read_text())["rows"] == report["rows"]
+    assert (tmp_path / "bench.png").stat().st_size > 10_000
+    asked = [r["asked"] for r in report["rows"] if r["asked"]]
+    assert [a for a in ("≥ 230 ×", "≥ 1000 ×", "≥ 92 ×", "≥ 192 ×", "≤ 12 s", "≤ 200 s", "≤ 4 GiB", "≥ 3 ×", "linear")
+            if a not in asked] == []
+    for r in report["rows"]:
+        assert np.isfinite(r["measured"]) and r["unit"], r["what"]
+        assert r["met"] is not None or not r["asked"]
+        assert ("random" in r["weights"]) == ("volume" in r["what"])
+    assert "without meaning" in text and "extrapolated" in text
+
+
+def test_rows_know_whether_they_reach_what_is_asked():
+    assert bench_measure.row("a", 93.0, "×", least=92).met and not bench_measure.row("a", 91.0, "×", least=92).met
+    assert bench_measure.row("a", 11.0, "s", most=12).met and not bench_measure.row("a", 13.0, "s", most=12).met
+    assert bench_measure.row("a", 1.0, "s").met is None and bench_measure.row("a", 1.0, "s", most=12).asked == "≤ 12 s"
+
+
+def test_medians_alternate_and_leave_the_first_run_out():
+    calls = []
+    found = bench_measure.seconds({"a": lambda: calls.append("a"), "b": lambda: calls.append("b")}, 2)
+    assert calls == ["a", "b", "a", "b", "a", "b"] and set(found) == {"a", "b"}
+
+
+def test_volume_of_a_uniform_field():
+    """τ at the middles' far edges of n cells of a chord of 2h under σ: exp(−σ · 2h · (k + 1)/n)."""
+    o, d = bench_paper.light_rays(5, 20)
+    tau = np.array(bench_paper.tabulate(lambda p: mi.Float(0.7) + 0 * p[0], o, d, 16)).reshape(20, 16)
+    offset = np.linalg.norm(np.array(o), axis=0)
+    chord = 2 * np.sqrt(1 - offset**2)
+    np.testing.assert_allclose(tau, np.exp(-0.7 * chord[:, None] * (np.arange(16) + 1) / 16), rtol=1e-5)
+    np.testing.assert_allclose((np.array(o) * np.array(d)).sum(0), 0, atol=1e-6)  # rays start on the plane across
+
+
+def test_paper_field_keeps_its_shape():
+    """The networks' queries take part in the kernel, and in no value."""
+    scene = bench_image.under_sky(8)
+    grid = bench_image.medium_of(scene).field.grid
+    paper = bench_paper.PaperField(grid, bench_paper.random_network((16,)))
+    p = tuple(mi.Float(c) for c in np.random.default_rng(1).uniform(-0.5, 0.5, (3, 100)).astype(np.float32))
+    np.testing.assert_allclose(paper.density(p), grid.density(p), atol=1e-20)
+    for ours, theirs in zip(paper.reflectance(p), grid.reflectance(p), strict=True):
+        np.testing.assert_array_equal(np.array(ours), np.array(theirs))
+
+
+def test_sky_of_one_pixel_per_light():
+    image = bench_image.sky(50, 10)
+    assert image.shape == (10, 50, 3) and image.min() > 0
+
+
+def test_speed_up_is_a_ratio_of_lines():
+    """Per light, tables and shading add; the ratio at 500 lights is the row's."""
+    costs = {"camera": 1e-6, "points": 2.0, "volume/192": 192e-6, "map": 1e-6, "ours": 1e-7, "shade/volume": 2e-9,
+             "shade/map": 1e-9}
+    rows = bench_paper.image_rows(costs, bench_measure.FULL)
+    m2, shade = 360_000, 360_000 * 2
+    slow = 0.36 + 500 * (m2 * 192e-6 + shade * 2e-9)
+    fast = 0.36 + 500 * (m2 * 1e-6 + shade * 1e-9)
+    assert rows[0].measured == pytest.approx(slow / fast)
+    d = rows[0].details
+    assert d["volume_fixed_seconds"] + 500 * d["volume_lights_seconds"] == pytest.approx(slow)
+    assert bench_figure.LIGHTS == 500
