@@ -27,8 +27,11 @@ def integrator_class() -> type:
                                     ``transmittance_map``, ``none``, or ``auto``, which picks the cheaper of the first
                                     and third (default: auto)
         samples             integer steps across the unit sphere's diameter (default: 384)
-        light_samples       integer lights drawn per shading point by Mitsuba's emitter sampling, any emitter; 0: all
-                                    lights, every environment texel one (default: 0)
+        light_samples       integer lights per shading point, drawn from Mitsuba's emitter sampling and resampled, from
+                                    any emitters; 0: all lights, every environment texel one, and 2 drawn ones (1 of a
+                                    projector or textured spot) of each emitter that is no finite set of lights, such
+                                    as an area; these need no map and are marched under ``transmittance_map``
+                                    (default: 0)
         environment_lights  integer most directional lights that stand for an environment (default: 512)
         map_resolution      integer texels per side of a light's transmittance map (default: 128)
         map_source          string  ``field``: marched once per texel; ``network``: one query per texel (default: field)
@@ -157,11 +160,16 @@ class SceneLight:
                 mi.LogLevel.Warn,
                 f"nrf integrator: {len(scene.shapes()) - 1} ordinary shapes are left out of the picture",
             )
-        self.table = None
-        if self.effects.exhaustive:
-            self.table = lights.table(scene, self.medium.frame, integrator.environment_lights)
+        self.lights = lights.Lights(scene, [self.medium], integrator.light_samples, integrator.environment_lights)
+        self.table = self.lights.table(self.medium.frame)
         options = visibility.Options(self.step, integrator.map_resolution, integrator.map_source)
-        self.visibility = visibility.build(self.effects.visibility, self.medium, self.table, options)
+        method = self.effects.visibility
+        self.visibility = visibility.build(method, self.medium, self.table, options)
+        # Maps know the table's lights alone.
+        drawn = lights.method_for_drawn(method)
+        self.drawn_visibility = (
+            self.visibility if drawn == method else visibility.build(drawn, self.medium, self.table, options)
+        )
 
     def trace(self, ray, sampler, stream):
         """``(radiance, opacity)`` of camera rays."""
@@ -172,7 +180,7 @@ class SceneLight:
             source.density, grid, o, d, ray.maxt / frame.length, step, sampler.next_1d(), sampler.next_1d()
         )
         sums = [dr.zeros(mi.Float, dr.width(ray.o)) for _ in range(3)]
-        if dr.width(index) > 0 and (self.table is None or self.table.count > 0):
+        if dr.width(index) > 0 and (self.table.count or self.lights.sampled):
             light = self._light(index, t, o, d, stream)
             for total, value in zip(sums, light, strict=True):
                 dr.scatter_reduce(dr.ReduceOp.Add, total, value * w, index)
@@ -191,7 +199,8 @@ class SceneLight:
         x = tuple(dr.gather(mi.Float, a, index) + t * b for a, b in zip(o, along, strict=True))
         points = shade.Points(x, tuple(-c for c in along), self.medium.source.reflectance(x))
         dr.eval(points.x, points.wo, points.normal, points.albedo, points.roughness, points.specular)
-        source = self.table or lights.EmitterSamples(
-            self.scene, self.medium.frame, self.integrator.light_samples, stream
-        )
-        return shade.reflect(points, source, self.visibility)
+        total = [dr.zeros(mi.Float, dr.width(t)) for _ in range(3)]
+        for source, mapped in self.lights.sources(self.table, self.medium.frame, points, stream):
+            part = shade.reflect(points, source, self.visibility if mapped else self.drawn_visibility)
+            total = [a + b for a, b in zip(total, part, strict=True)]
+        return total

@@ -1,125 +1,133 @@
-"""Mitsuba's emitters as lights of the field: a table of discrete ones, or Mitsuba's own sampling."""
+"""The scene's emitters as lights of the field: which are rows of a table, which are drawn by Mitsuba's sampling."""
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.errors import MiNtfError
 from ..infer.lights import LightTable
+from . import light_rows
+from .emitter_samples import EmitterSamples
 from .frame import Frame
 
-DISCRETE = {
+KINDS = {
     "PointLight": "point",
+    "SpotLight": "spot",
     "DirectionalEmitter": "directional",
     "EnvironmentMapEmitter": "envmap",
     "ConstantBackgroundEmitter": "constant",
+    "SunskyEmitter": "sunsky",
+    "TimedSunskyEmitter": "timed_sunsky",
+    "AreaLight": "area",
+    "DirectionalArea": "directionalarea",
+    "Projector": "projector",
 }
-"""Mitsuba's class name → plugin name of the emitters that become rows of a table."""
-SUBSAMPLES = 4
-"""Environment radiance is averaged over SUBSAMPLES² points of each texel of the chosen grid."""
+"""Mitsuba's class name → plugin name."""
+DISCRETE = ("point", "spot", "directional", "envmap", "constant", "sunsky")
+"""Those that become rows of a table."""
+
+
+class Lights:
+    """The emitters of a scene, sorted once per render.
+
+    media               the scene's ``nrf`` media: what an ``ntf`` emitter with one of them wraps is taken without its
+                        shadow, which the integrator casts itself
+    light_samples       0: every discrete light at every point, environments by texels, and a few samples of each
+                        emitter that is no finite set of lights; n: n samples a point of all emitters together
+    environment_lights  most directional lights that stand for an environment
+
+    kinds   plugin name of each emitter
+    sampled emitters that are drawn at random
+    """
+
+    def __init__(self, scene, media=(), light_samples: int = 0, environment_lights: int = 512):
+        emitters = [unwrap(e, scene, media) for e in scene.emitters()]
+        self.kinds = [kind(e) for e in emitters]
+        self.light_samples = light_samples
+        discrete = [(e, k) for e, k in zip(emitters, self.kinds, strict=True) if not light_samples and is_discrete(e)]
+        self.rows = rows(discrete, environment_lights)
+        pairs = [(e, w) for e, w in zip(emitters, scene.emitters(), strict=True) if light_samples or not is_discrete(e)]
+        self.sampled = [e for e, _ in pairs if _shines(e)]
+        self._weights = [outer.sampling_weight() for e, outer in pairs if _shines(e)]
+
+    def table(self, frame: Frame) -> LightTable:
+        """The discrete lights, in the field coordinates of `frame`."""
+        return self.rows.table(frame)
+
+    def sources(self, table: LightTable, frame: Frame, points, seed) -> list:
+        """What to sum over at `points` (in the coordinates of `frame`): pairs of a source, which has ``count`` and
+        ``sample``, and whether its index is a row of `table`, which is what maps are made for."""
+        result = [(table, True)] if table.count else []
+        if self.sampled:
+            drawn = EmitterSamples(self.sampled, self._weights, frame, points, seed, self.light_samples)
+            result.append((drawn, False))
+        return result
+
+
+def method_for_drawn(method: str) -> str:
+    """The visibility method of drawn lights where `method` serves the table's: maps and volumes are made of rows."""
+    return "raymarch" if method in ("transmittance_map", "transmittance_volume") else method
 
 
 def kinds(scene) -> list[str]:
-    """Plugin names of the scene's emitters; the class name of those without a discrete form."""
-    return [DISCRETE.get(e.class_name(), e.class_name()) for e in scene.emitters()]
+    """Plugin names of the scene's emitters."""
+    return [kind(e) for e in scene.emitters()]
+
+
+def kind(emitter) -> str:
+    """Plugin name of an emitter, ``ntf`` that of what it wraps; the class name where Mitsuba has a new one."""
+    inner = getattr(emitter, "inner", None)
+    return kind(inner) if inner is not None else KINDS.get(emitter.class_name(), emitter.class_name())
+
+
+def is_discrete(emitter) -> bool:
+    """Whether the light is a finite set of points and directions: a spot without texture; an environment by texels."""
+    return emitter.class_name() in KINDS and kind(emitter) in DISCRETE and not _is_textured_spot(emitter)
+
+
+def _is_textured_spot(emitter) -> bool:
+    return kind(emitter) == "spot" and mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
+
+
+def _shines(emitter) -> bool:
+    """False with a warning for what Mitsuba's own emitter sampling never finds."""
+    if kind(emitter) == "directionalarea":
+        mi.Log(
+            mi.LogLevel.Warn,
+            f"directionalarea emitter ({emitter.id()}) lights no field: only Mitsuba's particle tracers see its light",
+        )
+        return False
+    return True
+
+
+def unwrap(emitter, scene, media):
+    """What an ``ntf`` emitter wraps, where its medium is one of `media`; any other emitter itself."""
+    while any(_same(getattr(emitter, "medium", None), m) for m in media):
+        emitter = emitter.inner
+        # Nobody else tells a nested environment how large the scene is, and where its shadow rays end.
+        emitter.set_scene(scene)
+    return emitter
+
+
+def _same(medium, other) -> bool:
+    """One medium, or two of one field in one place."""
+    if medium is other:
+        return True
+    if medium is None or medium.path != other.path:
+        return False
+    a, b = medium.frame, other.frame
+    near = np.allclose(a.origin, b.origin, atol=1e-4 * a.length) and np.isclose(a.length, b.length, rtol=1e-4)
+    return bool(near and np.allclose(a.world_to_field_numpy(np.eye(3), True), b.world_to_field_numpy(np.eye(3), True)))
+
+
+def rows(emitters: list, environment_lights: int) -> light_rows.Rows:
+    """Discrete `emitters`, each with its kind, as rows in scene coordinates. Lights without power are dropped."""
+    return light_rows.join([
+        light_rows.environment(e, k, environment_lights)
+        if k in ("envmap", "constant", "sunsky")
+        else light_rows.delta(e, k)
+        for e, k in emitters
+    ])  # fmt: skip
 
 
 def table(scene, frame: Frame, environment_lights: int) -> LightTable:
-    """All emitters as point and directional lights in field coordinates.
-
-    An environment becomes at most `environment_lights` directional lights on a grid of twice as many columns as rows
-    (no finer than the map itself), each with the irradiance of its texel, radiance × solid angle, from the direction of
-    the texel's centre of radiance. Lights without power are dropped.
-    """
-    rows = []
-    for emitter in scene.emitters():
-        kind = DISCRETE.get(emitter.class_name())
-        if kind in ("point", "directional"):
-            rows.append(_delta(emitter, kind, frame))
-        elif kind in ("envmap", "constant"):
-            rows.append(_environment(emitter, kind, frame, environment_lights))
-        else:
-            raise MiNtfError(
-                f"emitter {emitter.class_name()} ({emitter.id()}) is no finite set of directions, which an "
-                'exhaustive light sum needs; set <integer name="light_samples" value="4"/> on the nrf '
-                "integrator with visibility=raymarch or neural_transmittance"
-            )
-    where, power, is_point = (
-        (np.concatenate(c) for c in zip(*rows, strict=True))
-        if rows
-        else (np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, bool))
-    )
-    lit = power.max(axis=1, initial=0) > 0
-    return LightTable(where[lit], power[lit], is_point[lit], frame.length, mi)
-
-
-def _delta(emitter, kind: str, frame: Frame):
-    """A point or directional light through Mitsuba's own sampling, seen from the sphere's centre."""
-    it = dr.zeros(mi.Interaction3f)
-    it.p = mi.Point3f(frame.origin.tolist())
-    ds, weight = emitter.sample_direction(it, mi.Point2f(0.5), True)
-    weight = np.array(weight, np.float64).reshape(1, 3)
-    if kind == "directional":
-        return frame.world_to_field_numpy(_vector(ds.d), direction=True), weight, np.array([False])
-    distance = float(np.array(ds.dist).ravel()[0])
-    if not distance > 0:
-        raise MiNtfError(f"point light ({emitter.id()}) sits exactly at the captured object's centre; move it")
-    return frame.world_to_field_numpy(_vector(ds.p)), weight * distance**2, np.array([True])
-
-
-def _environment(emitter, kind: str, frame: Frame, limit: int):
-    """Directional lights of an environment: directions towards them (field), irradiances."""
-    rows = max(1, int(np.sqrt(limit / 2)))
-    columns = max(1, limit // rows)
-    rotation = np.eye(3)
-    if kind == "envmap":
-        params = mi.traverse(emitter)
-        height, width, _ = params["data"].shape
-        rows, columns = min(rows, height), min(columns, width - 2)  # two columns are Mitsuba's halo
-        rotation = np.array(params["to_world"].matrix, dtype=np.float64)[:3, :3].reshape(3, 3)
-        rotation /= np.cbrt(np.linalg.det(rotation))
-    n = SUBSAMPLES
-    theta = (np.arange(rows * n) + 0.5) * np.pi / (rows * n)
-    phi = (np.arange(columns * n) + 0.5) * 2 * np.pi / (columns * n)
-    theta, phi = (v.ravel() for v in np.meshgrid(theta, phi, indexing="ij"))
-    # Mitsuba's parametrisation of the sphere: y up, u from −z around to +x.
-    local = np.stack([np.sin(phi) * np.sin(theta), np.cos(theta), -np.cos(phi) * np.sin(theta)], axis=1)
-    world = local @ rotation.T
-    si = dr.zeros(mi.SurfaceInteraction3f, len(world))
-    si.wi = mi.Vector3f(*(-world.T).astype(np.float32))
-    radiance = np.array(emitter.eval(si), dtype=np.float64).T
-    solid_angle = np.sin(theta) * (np.pi / rows / n) * (2 * np.pi / columns / n)
-    power = np.broadcast_to(radiance, (len(world), 3)) * solid_angle[:, None]
-    weight = power.sum(axis=1) + 1e-12 * solid_angle
-
-    def by_texel(v):
-        return v.reshape(rows, n, columns, n, -1).sum(axis=(1, 3)).reshape(rows * columns, -1)
-
-    centre = by_texel(world * weight[:, None])
-    centre /= np.linalg.norm(centre, axis=1, keepdims=True)
-    return frame.world_to_field_numpy(centre, direction=True), by_texel(power), np.zeros(rows * columns, bool)
-
-
-def _vector(v) -> np.ndarray:
-    return np.array(v, dtype=np.float64).reshape(1, 3)
-
-
-class EmitterSamples:
-    """`count` samples a shading point by Mitsuba's own emitter sampling: any emitter, unbiased, noisy.
-
-    Same interface as :class:`mi_ntf.infer.lights.LightTable`. `seed`: opaque unsigned integer.
-    """
-
-    def __init__(self, scene, frame: Frame, count: int, seed):
-        self.scene, self.frame, self.count, self.seed = scene, frame, count, seed
-
-    def sample(self, index, x, active):
-        """As LightTable.sample, irradiance = emitter weight/count."""
-        lane = dr.arange(mi.UInt32, dr.width(x[0]))
-        u = mi.sample_tea_float32(lane, self.seed + 2 * index)
-        v = mi.sample_tea_float32(lane, self.seed + 2 * index + 1)
-        it = dr.zeros(mi.Interaction3f, dr.width(x[0]))
-        it.p = self.frame.point_to_world(x)
-        ds, weight = self.scene.sample_emitter_direction(it, mi.Point2f(u, v), False, active)
-        weight = dr.select(ds.pdf > 0, weight / self.count, 0)
-        return self.frame.direction_to_field(ds.d), tuple(weight), ds.dist / self.frame.length
+    """The scene's discrete lights in the field coordinates of `frame`."""
+    return Lights(scene, (), 0, environment_lights).table(frame)

@@ -73,8 +73,6 @@ def test_the_good_scene_renders(path):
         ({"medium": '<string name="filename" value="nowhere.safetensors"/>'}, "nowhere.safetensors does not exist"),
         ({"shape": '<float name="radius" value="0.3"/>'}, "give shape and medium the same placement"),
         ({"shape": '<point name="center" x="1.5" y="0" z="0"/>'}, "but the nrf medium inside it"),
-        ({"light": '<shape type="rectangle"><emitter type="area"/></shape>'},
-         'set <integer name="light_samples" value="4"/>'),
         ({"light": '<emitter type="point"><point name="position" x="0.3" y="0" z="0"/></emitter>',
           "integrator": '<string name="visibility" value="transmittance_map"/>'}, "lies inside the captured object"),
     ],
