@@ -6,7 +6,6 @@ than was run says so. Other work on the machine falsifies seconds, ratios less.
 
 import json
 import os
-import platform
 import time
 from collections.abc import Callable
 from dataclasses import asdict
@@ -16,12 +15,14 @@ import mitsuba as mi
 from rich.console import Console
 from rich.table import Table
 
+from ..render import calibrate, cost, register
 from . import bench_image, bench_paper, bench_product
 from .bench_measure import FULL, QUICK, Row, Sizes
 
 
 def bench(quick: bool = False, out: Path | None = None, say: Callable[[str], None] = lambda text: None) -> dict:
-    """Measure everything; ``{"machine": …, "rows": […]}``, JSON-ready.
+    """Measure everything; ``{"machine": …, "rows": […]}``, JSON-ready. Also keeps the machine's constants for `auto`
+    (:mod:`mi_ntf.render.cost`).
 
     quick  tiny sizes: shows that everything runs
     out    folder for ``bench.json`` and ``bench.png``; None: write nothing
@@ -29,9 +30,7 @@ def bench(quick: bool = False, out: Path | None = None, say: Callable[[str], Non
     """
     if mi.variant() is None:
         mi.set_variant("llvm_ad_rgb")
-    from .. import render
-
-    render.register()
+    register()
     sizes = QUICK if quick else FULL
     start = time.perf_counter()
     rows = []
@@ -52,6 +51,7 @@ def bench(quick: bool = False, out: Path | None = None, say: Callable[[str], Non
 def _sections(sizes: Sizes) -> dict[str, Callable[[], list[Row]]]:
     scene = bench_image.under_sky(sizes.image)
     medium = bench_image.medium_of(scene)
+    calibrate.calibrate(medium)
     return {
         "the paper's networks": lambda: bench_paper.rows(scene, medium, sizes),
         "map lookup": lambda: bench_product.lookup_rows(medium, sizes),
@@ -64,16 +64,8 @@ def _sections(sizes: Sizes) -> dict[str, Callable[[], list[Row]]]:
 
 def machine() -> dict:
     """What the figures were measured on."""
-    return {"processor": processor(), "cores": os.cpu_count(), "load": round(os.getloadavg()[0], 2),
+    return {"processor": cost.processor(), "cores": os.cpu_count(), "load": round(os.getloadavg()[0], 2),
             "variant": mi.variant(), "mitsuba": mi.__version__}
-
-
-def processor() -> str:
-    """The processor's name."""
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.is_file() else []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
 
 
 def print_table(report: dict) -> None:

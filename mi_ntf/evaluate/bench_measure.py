@@ -1,12 +1,7 @@
-"""What every row of ``mi-ntf bench`` is made of: sizes, seconds, and the row itself."""
+"""What ``mi-ntf bench`` measures: how much of it, and the rows of its report."""
 
-import statistics
-import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
-
-import drjit as dr
 
 from ..core.architecture import PAPER
 
@@ -79,20 +74,3 @@ def row(what: str, measured: float, unit: str, *, least: float | None = None, mo
     if most is not None:
         return Row(what, measured, unit, f"≤ {most:g} {unit}", met=measured <= most, **rest)
     return Row(what, measured, unit, **rest)
-
-
-def seconds(work: dict[str, Callable[[], Any]], repeats: int) -> dict[str, float]:
-    """Median wall seconds of each `work`, kernels compiled before. The rounds alternate between them, so that what else
-    the machine does falls on all alike. A `work` returns what it computes, which is evaluated within its time."""
-    for run in work.values():
-        _timed(run)
-    rounds = [{name: _timed(run) for name, run in work.items()} for _ in range(repeats)]
-    return {name: statistics.median(r[name] for r in rounds) for name in work}
-
-
-def _timed(run: Callable[[], Any]) -> float:
-    dr.sync_thread()
-    start = time.perf_counter()
-    dr.eval(run())
-    dr.sync_thread()
-    return time.perf_counter() - start

@@ -20,7 +20,8 @@ from ..infer import march, ops, shade
 from ..infer.lights import LightTable
 from ..infer.network import NetworkField
 from ..infer.profile import DepthProfile
-from .bench_measure import Row, Sizes, row, seconds
+from ..render.calibrate import seconds
+from .bench_measure import Row, Sizes, row
 from .transmittance import directions
 
 LIGHTS = 500

@@ -8,8 +8,9 @@ import numpy as np
 
 from ..infer import shade
 from ..infer.lights import LightTable
+from ..render.calibrate import seconds
 from . import bench_image, transmittance
-from .bench_measure import Row, Sizes, row, seconds
+from .bench_measure import Row, Sizes, row
 
 
 def many_lights_rows(sizes: Sizes) -> list[Row]:

@@ -1,0 +1,129 @@
+"""Measures the machine's constants of :mod:`mi_ntf.render.cost`: seconds of work with the field at hand."""
+
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..infer import march, shade
+from ..infer.lights import LightTable
+from ..infer.visibility import visibility_mlp
+from . import cost, visibility
+
+SAMPLES = 384
+LIGHTS = 4
+WIDTH = 1 << 15
+MAP = 128
+VOLUME = 64
+"""Rays along a volume's side: fewer, since each has an entry for each sample."""
+
+
+def calibrate(medium) -> cost.Constants:
+    """Constants of this machine, by `medium`'s field; kept in the cache. Takes some seconds, compilation mostly."""
+    grid, network = medium.field.grid, medium.field.network
+    table = LightTable(np.eye(3)[[0, 1, 2, 0]] * [[1], [1], [1], [-1]], np.ones((LIGHTS, 3)), np.zeros(LIGHTS, bool),
+                       1.0, mi)
+    options = visibility.Options(2 / SAMPLES, MAP)
+    small = visibility.Options(2 / SAMPLES, VOLUME)
+    points = _points(grid)
+    build = {name: (lambda name=name, o=o: visibility.build(name, medium, table, o).values)
+             for name, o in (("transmittance_map", options), ("transmittance_volume", small))}
+    methods = {name: visibility.build(name, medium, table, o) for name, o in (
+        ("raymarch", options), ("transmittance_map", options), ("transmittance_volume", small),
+        ("neural_transmittance", options))}
+    if getattr(network, "_visibility", None) is not None:
+        methods["visibility_mlp"] = visibility_mlp.VisibilityMLP(network)
+    work = {name: (lambda v=v: _tau(v, table, points.x)) for name, v in methods.items()}
+    work |= {f"build {name}": run for name, run in build.items()}
+    work |= {"camera": lambda: _camera(grid).t, "reflect": lambda: _flat(grid.reflectance(points.x)),
+             "shade": lambda: shade.reflect(points, table, None), "density": lambda: network.density(points.x)}
+    found = seconds(work, 3)
+    ns = {name: 1e9 * value / (WIDTH * (LIGHTS if name in methods or name == "shade" else 1))
+          for name, value in found.items()}
+    default = cost.Constants()
+    result = cost.Constants(
+        camera=ns["camera"] / SAMPLES,
+        reflect=ns["reflect"],
+        shade=ns["shade"],
+        march=ns["raymarch"] / cost.light_steps(SAMPLES),
+        texel=1e9 * found["build transmittance_map"] / (LIGHTS * cost.FILLED * MAP**2 * SAMPLES),
+        lookup=ns["transmittance_map"],
+        cell=1e9 * found["build transmittance_volume"] / (LIGHTS * cost.FILLED * VOLUME**2 * SAMPLES),
+        fetch=ns["transmittance_volume"],
+        density=ns["density"],
+        ray=ns["neural_transmittance"],
+        mlp=ns.get("visibility_mlp", default.mlp),
+    )
+    cost.remember(result)
+    return result
+
+
+def seconds(work: dict[str, Callable[[], Any]], repeats: int) -> dict[str, float]:
+    """Median wall seconds of each `work`, kernels compiled before. The rounds alternate between them, so that what else
+    the machine does falls on all alike. A `work` returns what it computes, which is evaluated within its time."""
+    for run in work.values():
+        _timed(run)
+    rounds = [{name: _timed(run) for name, run in work.items()} for _ in range(repeats)]
+    return {name: statistics.median(r[name] for r in rounds) for name in work}
+
+
+def _timed(run: Callable[[], Any]) -> float:
+    dr.sync_thread()
+    start = time.perf_counter()
+    dr.eval(run())
+    dr.sync_thread()
+    return time.perf_counter() - start
+
+
+def _points(grid) -> shade.Points:
+    """Where random camera rays meet the field, WIDTH points."""
+    found = _camera(grid)
+    lane = dr.arange(mi.UInt32, WIDTH) % dr.opaque(mi.UInt32, max(dr.width(found.t), 1))
+    ray, t = dr.gather(mi.UInt32, found.ray, lane), dr.gather(mi.Float, found.t, lane)
+    o, d = _rays(grid)
+    along = tuple(dr.gather(mi.Float, c, ray) for c in d)
+    x = tuple(dr.gather(mi.Float, a, ray) + t * b for a, b in zip(o, along, strict=True))
+    points = shade.Points(x, tuple(-c for c in along), grid.reflectance(x))
+    dr.eval(points.x, points.wo, points.normal, points.albedo, points.roughness, points.specular)
+    return points
+
+
+def _camera(grid) -> march.Samples:
+    o, d = _rays(grid)
+    middle = dr.full(mi.Float, 0.5, WIDTH)
+    return march.camera_samples([march.Strand(grid.density, grid, o, d)], mi.Float(dr.inf),
+                                dr.opaque(mi.Float, 2 / SAMPLES), middle, middle)
+
+
+def _rays(grid):
+    """WIDTH camera rays, neighbours side by side as pixels are: parallel through a square around the object."""
+    side = int(np.sqrt(WIDTH))
+    low, high = grid.bounds
+    index = np.arange(WIDTH)
+    u, v = (index % side + 0.5) / side, (index // side + 0.5) / (WIDTH // side)
+    o = np.stack([low[0] + u * (high[0] - low[0]), low[1] + v * (high[1] - low[1]), np.full(WIDTH, 3.0)])
+    o, d = (tuple(mi.Float(c) for c in v.astype(np.float32)) for v in (o, np.tile([[0.0], [0.0], [-1.0]], WIDTH)))
+    dr.eval(o, d)
+    return o, d
+
+
+def _tau(method, table, x):
+    """Σ over the table's lights of τ at `x`."""
+    uint = mi.UInt32
+    count = dr.opaque(uint, table.count)
+
+    def body(i, total):
+        wi, _, distance = table.sample(i, x, True)
+        return i + 1, total + method.tau(x, wi, distance, i, mi.Bool(True))
+
+    state = (dr.zeros(uint, dr.width(x)), dr.zeros(mi.Float, dr.width(x)))
+    return dr.while_loop(state=state, cond=lambda i, total: i < count, body=body, label="calibration")[1]
+
+
+def _flat(reflectance) -> list:
+    normal, albedo, roughness, specular = reflectance
+    return [*normal, *albedo, roughness, specular]

@@ -1,0 +1,196 @@
+"""What the stages of a render cost, predicted from a few constants of the machine, and which method is cheapest then.
+
+Constants are measured by :mod:`mi_ntf.render.calibrate`, which `mi-ntf explain --measure` and `mi-ntf bench` run; a
+render reads them from the user's cache, or takes those of two cores of 2024.
+"""
+
+import json
+import math
+import os
+import platform
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+
+from .. import __version__
+from ..infer.visibility.raymarch import default_steps
+from ..infer.visibility.transmittance_map import channels
+
+FACING = 0.5
+"""Share of (point, light) pairs whose light falls on the front, the others ask for no visibility."""
+FILLED = math.pi / 4
+"""Share of a map's texels whose rays meet the object."""
+
+
+@dataclass(frozen=True)
+class Constants:
+    """Nanoseconds on all cores together.
+
+    camera    a camera ray, per sample that would lie across the unit sphere's diameter (most are skipped)
+    reflect   reflectance at a shading point
+    shade     a point and light, its visibility left out
+    march     a step of a light's march, empty space included
+    texel     a ray of a map marched from the field, per sample across the diameter
+    lookup    a point and light, from the map
+    cell      an entry of a transmittance volume
+    fetch     a point and light, from the volume
+    density, ray, mlp   a query of the density, the transmittance and the visibility network
+    """
+
+    camera: float = 0.5
+    reflect: float = 40.0
+    shade: float = 2.0
+    march: float = 2.0
+    texel: float = 1.0
+    lookup: float = 5.0
+    cell: float = 2.0
+    fetch: float = 15.0
+    density: float = 60.0
+    ray: float = 600.0
+    mlp: float = 1500.0
+
+
+@dataclass(frozen=True)
+class Work:
+    """The size of a render. `rays`: camera rays, `points`: shading points, `lights`: of the table or drawn a point;
+    `texels`: m², `components`: logistics a texel; `samples`: cells across the unit sphere's diameter; `network`: the
+    field is its networks, not its grid; `source`: of maps, ``field`` or ``network``; `voxels`: of the grid, a side."""
+
+    rays: float
+    points: float
+    lights: int
+    method: str
+    texels: int
+    samples: int
+    source: str = "field"
+    components: int = 1
+    network: bool = False
+    voxels: int = 192
+
+
+def light_steps(samples: int) -> int:
+    """Steps of a light's march from a point over the mean chord, 1 unit-sphere radius."""
+    shortest, longest, growth = default_steps(2 / samples)
+    t, count = 0.0, 0
+    while t < 1:
+        t += min(max(growth * t, shortest), longest)
+        count += 1
+    return count
+
+
+def per_ray(work: Work, c: Constants) -> float:
+    """ns of one ray of a map: q of research/transmittance.md, section 5."""
+    if work.source == "network":
+        return c.ray
+    return work.samples * (c.texel + (c.density if work.network else 0))
+
+
+def per_pair(work: Work, c: Constants) -> float:
+    """ns of one point and light by the method that `work` names, once it is built."""
+    step = c.march + (c.density if work.network else 0)
+    return {"raymarch": light_steps(work.samples) * step, "transmittance_map": c.lookup * work.components,
+            "transmittance_volume": c.fetch, "neural_transmittance": c.ray, "visibility_mlp": c.mlp,
+            "none": 0.0}[work.method]
+
+
+def break_even(work: Work, c: Constants) -> float:
+    """P*, the shading points from which on maps are cheaper than marches, whatever the number of lights:
+
+        P* = (π/4) m² q / (f (n c_s − c_l))
+
+    with q a texel's cost, n c_s a march's, c_l a lookup's, f the share of lights that a point faces."""
+    march = per_pair(_with(work, "raymarch"), c)
+    lookup = per_pair(_with(work, "transmittance_map"), c)
+    return FILLED * work.texels * per_ray(work, c) / (FACING * (march - lookup)) if march > lookup else math.inf
+
+
+def choose(work: Work, c: Constants | None = None) -> tuple[str, str]:
+    """``(method, reason)`` of ``visibility=auto``: ``transmittance_map`` from P* shading points on, else ``raymarch``.
+    ``work.method`` is not read."""
+    least = break_even(work, c or constants())
+    method = "transmittance_map" if work.points >= least else "raymarch"
+    limit = f"{least:.2g}" if math.isfinite(least) else "no number"
+    return method, f"about {work.points:.2g} shading points, maps pay from {limit} on"
+
+
+def seconds(work: Work, c: Constants) -> dict[str, float]:
+    """Predicted wall seconds of each stage, compilation left out."""
+    query = c.density if work.network else 0
+    pairs = work.points * work.lights
+    tables = {"transmittance_map": FILLED * work.texels * per_ray(work, c),
+              "transmittance_volume": FILLED * work.texels * work.samples * (c.cell + query)}
+    return {
+        "camera march": 1e-9 * work.rays * work.samples * (c.camera + 0.05 * query),
+        "reflectance": 1e-9 * work.points * c.reflect,
+        "maps or volumes": 1e-9 * work.lights * tables.get(work.method, 0.0),
+        "lights": 1e-9 * pairs * (c.shade + FACING * per_pair(work, c)),
+    }
+
+
+def memory(work: Work, chunk: int) -> dict[str, int]:
+    """Bytes held at a time, `chunk` camera rays in flight."""
+    width = {"transmittance_map": channels(work.components), "transmittance_volume": work.samples}
+    share = work.points / max(work.rays, 1)
+    return {
+        "field grid": 4 * work.voxels**3 + 32 * min(work.voxels, 128) ** 3,
+        "maps or volumes": 4 * width.get(work.method, 0) * work.texels * work.lights,
+        # 20 floats a shading point.
+        "rays in flight": round(min(chunk, work.rays) * max(share, 1) * 80),
+    }
+
+
+def _with(work: Work, method: str) -> Work:
+    return Work(**(asdict(work) | {"method": method}))
+
+
+def cache_file() -> Path:
+    """Where constants are kept."""
+    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(home) / "mi_ntf" / "cost.json"
+
+
+def machine() -> str:
+    """What constants hold for: this version, processor, threads and variant."""
+    return f"{__version__} · {processor()} · {dr.thread_count()} threads · {mi.variant()}"
+
+
+def processor() -> str:
+    """The processor's name."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.is_file() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
+
+
+def constants() -> Constants:
+    """This machine's, as measured; the defaults where nothing was measured or the cache cannot be read."""
+    return measured() or Constants()
+
+
+def measured() -> Constants | None:
+    """This machine's constants, None where they are not in the cache."""
+    found = _read().get(machine(), {})
+    complete = isinstance(found, dict) and {f.name for f in fields(Constants)} == set(found)
+    return Constants(**found) if complete and all(isinstance(v, (int, float)) for v in found.values()) else None
+
+
+def remember(found: Constants) -> None:
+    """Keep `found` for this machine. A cache that cannot be written is no fault of the caller's work."""
+    path = cache_file()
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = path.with_suffix(f".{os.getpid()}.part")
+        temporary.write_text(json.dumps(_read() | {machine(): asdict(found)}, indent=1), encoding="utf-8")
+        temporary.replace(path)
+    except OSError as error:
+        mi.Log(mi.LogLevel.Warn, f"cannot keep the machine's constants in {path}: {error}")
+
+
+def _read() -> dict:
+    try:
+        found = json.loads(cache_file().read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}

@@ -1,0 +1,119 @@
+"""The cost model: the rule of `auto` by hand, and where the machine's constants come from."""
+
+import json
+from dataclasses import asdict, replace
+
+import mitsuba as mi
+import pytest
+from helpers import scenes
+
+import mi_ntf.render
+from mi_ntf.core.errors import MiNtfError
+from mi_ntf.infer.visibility import METHODS
+from mi_ntf.render import calibrate, cost
+
+# Of research/transmittance.md, section 5, "knot": 576 ns a texel, 1.6 ns a step, 4.5 ns a lookup.
+KNOT = cost.Constants(texel=576 / 384, march=1.6, lookup=4.5)
+WORK = cost.Work(rays=65536, points=300_000, lights=50, method="raymarch", texels=128**2, samples=384)
+
+
+@pytest.fixture(autouse=True)
+def cache(variant, monkeypatch, tmp_path):
+    mi_ntf.render.register()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return tmp_path / "mi_ntf" / "cost.json"
+
+
+def test_break_even_by_hand():
+    march = cost.light_steps(384) * 1.6
+    assert cost.break_even(WORK, KNOT) == pytest.approx(0.785398 * 16384 * 576 / (0.5 * (march - 4.5)))
+    # Four times the texels, four times the points; any number of lights.
+    assert cost.break_even(replace(WORK, texels=256**2), KNOT) == pytest.approx(4 * cost.break_even(WORK, KNOT))
+    assert cost.break_even(replace(WORK, lights=1), KNOT) == cost.break_even(WORK, KNOT)
+
+
+def test_steps_of_a_light_march():
+    """Steps of 0.375/192, growing by a fifth of the distance, at last 1/64 long: counted for 384 samples."""
+    assert cost.light_steps(384) == 76
+    assert cost.light_steps(96) < cost.light_steps(384) < cost.light_steps(1536)
+
+
+def test_auto_changes_sides_at_the_break_even():
+    least = cost.break_even(WORK, KNOT)
+    assert cost.choose(replace(WORK, points=1.01 * least), KNOT)[0] == "transmittance_map"
+    method, reason = cost.choose(replace(WORK, points=0.99 * least), KNOT)
+    assert method == "raymarch" and "shading points, maps pay from" in reason
+
+
+def test_maps_pay_at_once_where_each_step_is_a_query():
+    """The paper's regime: a march of network queries against one query of the ray network (P* of some hundred)."""
+    slow = replace(KNOT, density=5700, ray=5700)
+    assert cost.break_even(replace(WORK, network=True, source="network"), slow) < 1000
+
+
+def test_maps_never_pay_where_a_lookup_costs_more_than_a_march():
+    assert cost.choose(replace(WORK, points=1e12), replace(KNOT, lookup=1000.0)) == (
+        "raymarch", "about 1e+12 shading points, maps pay from no number on")
+
+
+def test_the_chosen_method_is_the_cheaper_one():
+    """The rule and the stages' predictions are one model: at P* both cost the same."""
+    at = replace(WORK, points=cost.break_even(WORK, KNOT))
+    march, tmap = (sum(cost.seconds(replace(at, method=m), KNOT).values()) for m in ("raymarch", "transmittance_map"))
+    assert march == pytest.approx(tmap, rel=1e-6)
+
+
+@pytest.mark.parametrize("method", [m for m in METHODS if m != "auto"])
+def test_every_method_has_a_price(method):
+    stages = cost.seconds(replace(WORK, method=method), cost.Constants())
+    assert min(stages.values()) >= 0 and stages["lights"] > 0
+    table = {"transmittance_map": 8, "transmittance_volume": 4 * 384}.get(method, 0)
+    assert cost.memory(replace(WORK, method=method), 1 << 18)["maps or volumes"] == table * 16384 * 50
+
+
+def test_constants_are_kept_for_the_machine(cache):
+    assert cost.measured() is None and cost.constants() == cost.Constants()
+    cost.remember(KNOT)
+    assert cost.measured() == KNOT and cost.constants() == KNOT
+    (key, values), = json.loads(cache.read_text()).items()
+    assert "llvm_ad_rgb" in key and values == asdict(KNOT)
+    cache.write_text(json.dumps({"another machine": values}))
+    assert cost.measured() is None
+    cost.remember(KNOT)
+    assert set(json.loads(cache.read_text())) == {key, "another machine"}
+
+
+@pytest.mark.parametrize("content", ["", "[1]", '{"%s": {"march": 1}}', '{"%s": 3}'])
+def test_a_damaged_cache_counts_as_none(cache, content):
+    cache.parent.mkdir()
+    cache.write_text(content.replace("%s", cost.machine()))
+    assert cost.constants() == cost.Constants()
+
+
+def test_a_cache_that_cannot_be_written_is_no_fault(cache):
+    cache.parent.write_text("a file where the folder belongs")
+    cost.remember(KNOT)
+    assert cost.measured() is None
+
+
+def test_rendering_does_not_calibrate(tmp_path, cache, monkeypatch):
+    def refuse(*args):
+        raise MiNtfError("calibrated in a plain render")
+
+    monkeypatch.setattr(calibrate, "calibrate", refuse)
+    scene = scenes.scene(scenes.write_blobs(tmp_path), {"type": "nrf"}, {"light": scenes.light("point")}, size=4, spp=1)
+    assert scenes.render(scene).max() > 0
+    assert not cache.exists()
+
+
+def test_medians_alternate_and_leave_the_first_run_out():
+    calls = []
+    found = calibrate.seconds({"a": lambda: calls.append("a"), "b": lambda: calls.append("b")}, 2)
+    assert calls == ["a", "b", "a", "b", "a", "b"] and set(found) == {"a", "b"}
+
+
+def test_rays_of_the_calibration_meet_the_object(tmp_path):
+    scene = scenes.scene(scenes.write_blobs(tmp_path), {"type": "nrf"}, {"light": scenes.light("point")}, size=4)
+    medium = next(s.interior_medium() for s in scene.shapes())
+    points = calibrate._points(medium.field.grid)
+    assert (mi.Float(medium.field.grid.density(points.x)) > 0.1).numpy().mean() > 0.99
