@@ -59,7 +59,7 @@ def study(path: Path, size: int, spp: int, count: int) -> dict[str, float]:
 
 def query_time(medium, count: int = 1 << 20) -> float:
     """Nanoseconds per ray of the network's query, features included, on chords that meet the field's bounds."""
-    from ..infer.profile import DepthProfile
+    from ..infer.profile import FOR_NETWORKS, DepthProfile
 
     rng = np.random.default_rng(0)
     d = rng.normal(size=(3, count))
@@ -67,7 +67,7 @@ def query_time(medium, count: int = 1 << 20) -> float:
     low, high = medium.field.grid.bounds
     x = (low + rng.uniform(size=(count, 3)) * (high - low)).T
     x, d = (tuple(mi.Float(c.astype(np.float32)) for c in v) for v in (x, d))
-    profile = DepthProfile(medium.source.density, medium.field.grid, dr.opaque(mi.Float, 2 / 384))
+    profile = DepthProfile(medium.source.density, medium.field.grid, dr.opaque(mi.Float, FOR_NETWORKS * 2 / 384))
     times = []
     for _ in range(6):
         start = time.perf_counter()

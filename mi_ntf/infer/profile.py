@@ -7,6 +7,9 @@ from ..core.depth_profile import LEVELS
 from . import ops
 from .march import clear_distance, safe_inverse
 
+FOR_NETWORKS = 1.5
+"""Steps of the march that networks read, in cells of the camera's march: finer ones change relit images by 0.1 %."""
+
 
 class DepthProfile:
     """`density`: callable, σ at a point; `grid`: whose empty space is skipped; `step`: opaque float, field units."""
@@ -18,8 +21,10 @@ class DepthProfile:
         """``(places, total)`` of the rays through `o` along `d` towards the light, as in
         :func:`mi_ntf.core.depth_profile.frame`.
 
-        From the light inwards: σ in the middle of each step, depth linear across it. Ends at the last of the
-        (ascending) `levels`. `begin`: t' of a light inside the sphere, beyond which no matter counts.
+        From the light inwards: σ in the middle of each step, σ linear across it with the slope from the step before.
+        Constant σ would find the places too close to the light where density sets in, and points in a skin too dark.
+        Ends at the last of the (ascending) `levels`. `begin`: t' of a light inside the sphere, beyond which no matter
+        counts.
         """
         return self.with_end(o, d, levels, begin)[:2]
 
@@ -31,27 +36,29 @@ class DepthProfile:
         floats = type(o[0])
         step = self.step
 
-        def body(s, depth, places, last, active):
+        def body(s, depth, before, places, last, active):
             p = tuple(mi + (h - s - 0.5 * step) * di for mi, di in zip(m, d, strict=True))
             skip = clear_distance(self.grid, p, inverse)
             empty = skip > 0
             sigma = dr.select(active & ~empty, self.density(p), 0)
             after = depth + sigma * step
-            rate = dr.rcp(dr.maximum(sigma, 1e-6))
+            rate = dr.rcp(dr.maximum(sigma * step, 1e-6))
+            shares = [(q - depth) * rate for q in levels]  # of the step, for constant σ
+            bend = dr.clip(0.5 * (sigma - before) * step * rate, -1, 1)
             places = tuple(
-                dr.select((depth < q) & (after >= q), s + (q - depth) * rate, c)
-                for c, q in zip(places, levels, strict=True)
+                dr.select((g > 0) & (g <= 1), s + step * (g + bend * g * (1 - g)), c)
+                for c, g in zip(places, shares, strict=True)
             )
             last = dr.select(sigma > 0, s + step, last)
             s = s + dr.select(empty, skip + 1e-4, step)
-            return s, after, places, last, active & (s < 2 * h) & (after < levels[-1])
+            return s, after, sigma, places, last, active & (s < 2 * h) & (after < levels[-1])
 
         zero = dr.zeros(floats, dr.width(h))
         start = zero if begin is None else dr.maximum(h - begin, 0)
         active = dr.mask_t(floats)(hit & (start < 2 * h))
-        _, depth, places, last, _ = dr.while_loop(
-            state=(start, zero, tuple(floats(zero) for _ in levels), floats(zero), active),
-            cond=lambda s, depth, places, last, active: active,
+        _, depth, _, places, last, _ = dr.while_loop(
+            state=(start, zero, floats(zero), tuple(floats(zero) for _ in levels), floats(zero), active),
+            cond=lambda s, depth, before, places, last, active: active,
             body=body,
             label="ray profile",
         )

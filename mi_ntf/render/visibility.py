@@ -50,13 +50,15 @@ def build(method: str, medium, table, options: Options):
         return transmittance_volume.TransmittanceVolume(
             table, options.map_resolution, depths, field.grid.hull, source.density, mi
         )
-    reader = profile.DepthProfile(source.density, field.grid, dr.opaque(mi.Float, options.step))
+    network = method == "neural_transmittance" or options.map_source == "network"
+    step = options.step * (profile.FOR_NETWORKS if network else 1)
+    reader = profile.DepthProfile(source.density, field.grid, dr.opaque(mi.Float, step))
     if method == "neural_transmittance":
         return neural_transmittance.NeuralTransmittance(field.network, reader)
     inside = bool((table.is_point & (np.linalg.norm(table.where, axis=1) < 1)).any())
     fit = (
         map_source.network_source(field.network, reader, inside)
-        if options.map_source == "network"
+        if network
         else map_source.field_source(reader, options.map_components)
     )
     return transmittance_map.TransmittanceMap(table, options.map_resolution, field.grid.hull, fit, mi)
