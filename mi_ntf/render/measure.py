@@ -1,0 +1,44 @@
+"""One render, watched: the seconds that its stages really take, told apart by the loops in their kernels."""
+
+import time
+
+import drjit as dr
+import mitsuba as mi
+
+LOOPS = {"camera march": "camera march", "lights": "lights", "free flight": "bounces"}
+"""Label of a kernel's loop → stage. Kernels of none of them: before the first camera march they make maps, after one
+they fetch reflectance, or are small."""
+
+
+def measure(scene, integrator, spp: int) -> dict:
+    """Render `scene` twice and report the second time, when every kernel is compiled.
+
+    ``stages``: kernel seconds, as in :func:`mi_ntf.render.cost.seconds`; ``wall_seconds`` of the whole, Python and the
+    film included; ``points``: shading points; ``peak_bytes``: most memory that Dr.Jit held.
+    """
+    dr.eval(mi.render(scene, integrator=integrator, seed=1, spp=spp))
+    dr.sync_thread()
+    dr.detail.malloc_clear_statistics()
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        start = time.perf_counter()
+        dr.eval(mi.render(scene, integrator=integrator, seed=0, spp=spp))
+        dr.sync_thread()
+        wall = time.perf_counter() - start
+        history = dr.kernel_history()
+    backend = dr.backend_v(mi.Float)
+    return by_stage(history) | {"wall_seconds": wall, "peak_bytes": int(dr.detail.malloc_watermark(backend))}
+
+
+def by_stage(history: list[dict]) -> dict:
+    """``stages`` and ``points`` of a kernel history."""
+    stages = dict.fromkeys(("maps or volumes", "camera march", "reflectance", "lights"), 0.0)
+    points, marched = 0, False
+    for kernel in history:
+        text = kernel["ir"].getvalue() if kernel.get("ir") is not None else ""
+        stage = next((s for label, s in LOOPS.items() if f"Symbolic loop: {label}\n" in text), None)
+        marched |= stage == "camera march"
+        stage = stage or ("reflectance" if marched else "maps or volumes")
+        stages[stage] = stages.get(stage, 0.0) + 1e-3 * kernel["execution_time"]
+        points += kernel["size"] if stage == "lights" else 0
+    return {"stages": stages, "points": points}
