@@ -101,10 +101,11 @@ class LightRays:
         return texel, *self.ray(light, self.dj.Float(rest - line * columns), self.dj.Float(line))
 
     def nearest(self, index, x, wi, distance, active):
-        """The four rays of light `index` nearest to `x`: ``(inside, [(weight, texel, t), …])``.
+        """The four rays of light `index` nearest to `x`: ``(inside, size, [(weight, texel, t), …])``.
 
-        `inside`: whether light towards `x` can meet the object at all; weights are bilinear; `texel` counts through the
-        tables of all lights; `t`: where the plane through `x` perpendicular to ω_i cuts the ray.
+        `inside`: whether light towards `x` can meet the object at all; `size`: the rays' distance there; weights are
+        bilinear; `texel` counts through the tables of all lights; `t`: where the plane through `x` perpendicular to ω_i
+        cuts the ray.
         """
         light = self.light(index, active, self.full)
         ux, vx = dot(light.u, x), dot(light.v, x)
@@ -126,6 +127,9 @@ class LightRays:
         along = dot(x, wi)
         place = None if self.parallel else self._frustum_place(light, x, wi, distance, depth, (fu, fv), (ux, vx), along)
         width = self.dj.UInt32(columns)
+        size = depth * dr.rsqrt(dot(light.u, light.u))
+        if self.full:
+            size = dr.select(sphere, 3.5 * distance / columns, size)  # √(4π)/m radians
         found = []
         for j in (0, 1):
             row = base + self.dj.UInt32(v[j]) * width
@@ -137,7 +141,7 @@ class LightRays:
                     texel = dr.select(sphere, base + self.dj.UInt32(tv) * width + self.dj.UInt32(tu), texel)
                     t = dr.select(sphere, self._sphere_place(x, wi, distance, tu, tv), t)
                 found.append(((wu if i else 1 - wu) * (wv if j else 1 - wv), texel, t))
-        return inside, found
+        return inside, size, found
 
     def _frustum_place(self, light, x, wi, distance, depth, f, projected, along):
         """t of the ray through cell (tu, tv), as a function.

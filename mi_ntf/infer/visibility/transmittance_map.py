@@ -2,7 +2,8 @@
 section 6; Shafiei et al. 2021, section 3.3, with the slips of its algorithms corrected).
 
 A texel holds the parameters of one of the light's rays (:mod:`mi_ntf.infer.visibility.light_rays`), towards the light.
-A lookup evaluates the four nearest rays and interpolates the four τ bilinearly, never (a, b).
+A lookup evaluates the four nearest rays, on a surface at equal depth in its skin, and interpolates the four τ
+bilinearly, never (a, b).
 """
 
 from types import ModuleType
@@ -15,6 +16,11 @@ from .. import ops
 from ..lights import LightTable
 from .light_rays import LightRays
 from .map_source import Source
+
+
+SAME, APART = 2.0, 4.0
+"""Texels by which the centres of four neighbouring rays may differ to count as one surface, and as two. On `statue` under
+50 lights, 256²: image error 1.8 → 1.5 % with one logistic, 1.0 → 0.9 % with two."""
 
 
 def channels(components: int, weights: bool | None = None) -> int:
@@ -47,11 +53,12 @@ class TransmittanceMap:
 
     def tau(self, x, wi, distance, index, active):
         """Bilinear τ of the four nearest texel rays; 1 where light meets nothing."""
-        inside, found = self.rays.nearest(index, x, wi, distance, active)
+        inside, size, found = self.rays.nearest(index, x, wi, distance, active)
+        mixtures = [self._fetch(texel, inside) for _, texel, _ in found]
+        shifts = _shifts(mixtures, [weight for weight, _, _ in found], size)
         result = 0
-        for weight, texel, t in found:
-            parts = self._fetch(texel, inside)
-            result += weight * sum(w * logistic.transmittance(ops, t, a, b) for w, a, b in parts)
+        for (weight, _, t), shift, parts in zip(found, shifts, mixtures, strict=True):
+            result += weight * sum(w * logistic.transmittance(ops, t + shift, a, b) for w, a, b in parts)
         return dr.select(inside, dr.minimum(result, 1), 1)
 
     def _fetch(self, texel, active):
@@ -65,3 +72,18 @@ class TransmittanceMap:
         for k, part in enumerate(mix):
             row = self.dj.Array2f(*part[1:]) if self.width == 2 else self.dj.Array4f(*part, 0)
             dr.scatter(values, row, texel if self.width == 2 else texel * len(mix) + k)
+
+
+def _shifts(mixtures, weights, size):
+    """How far to move along each of the four rays before reading it.
+
+    On a surface at a slant the four rays meet the same skin at different t', and averaging them blurs it. Where their
+    centres c differ by few texels (`size`), each ray is therefore read as deep in its own skin as the point lies in the
+    interpolated one: t' + c − Σ w c. Where they differ by more, at silhouettes, nothing is moved, which is the paper's
+    rule; between `SAME` and `APART` texels the shift fades out.
+    """
+    centres = [sum((w * b for w, _, b in m[1:]), m[0][0] * m[0][2]) for m in mixtures]
+    mean = sum(w * c for w, c in zip(weights, centres, strict=True))
+    top, low = (f(f(centres[0], centres[1]), f(centres[2], centres[3])) for f in (dr.maximum, dr.minimum))
+    share = dr.clip((APART - (top - low) / size) * (1 / (APART - SAME)), 0, 1)
+    return [share * (c - mean) for c in centres]

@@ -41,7 +41,7 @@ class TransmittanceVolume:
 
     def tau(self, x, wi, distance, index, active):
         """Trilinear τ; 1 where light meets nothing."""
-        inside, found = self.rays.nearest(index, x, wi, distance, active)
+        inside, _, found = self.rays.nearest(index, x, wi, distance, active)
         inverse, last = dr.rcp(self._cell), self.dj.Float(self._n) - 1
         result = 0
         for weight, texel, t in found:
