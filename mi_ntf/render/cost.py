@@ -24,6 +24,10 @@ FILLED = math.pi / 4
 """Share of a map's texels whose rays meet the object."""
 
 
+COVERAGE = 0.35
+"""Share of the camera rays that hit the object."""
+POINTS_A_HIT = 15
+"""Shading points of a camera ray that hits, at 384 samples across the diameter."""
 NOT_SKIPPED = 0.05
 """Share of the samples across the diameter at which a camera ray's march asks the field."""
 
@@ -115,8 +119,13 @@ def choose(work: Work, c: Constants | None = None) -> tuple[str, str]:
     ``work.method`` is not read."""
     least = break_even(work, c or constants())
     method = "transmittance_map" if work.points >= least else "raymarch"
-    limit = f"{least:.2g}" if math.isfinite(least) else "no number"
-    return method, f"about {work.points:.2g} shading points, maps pay from {limit} on"
+    limit = f"{least:.2g} on" if math.isfinite(least) else "no number"
+    return method, f"about {work.points:.2g} shading points, maps pay from {limit}"
+
+
+def expected_points(rays: float, samples: int) -> float:
+    """Shading points of `rays` camera rays, before any is traced: a guess for an opaque object in the picture."""
+    return rays * COVERAGE * POINTS_A_HIT * samples / 384
 
 
 def seconds(work: Work, c: Constants) -> dict[str, float]:

@@ -53,7 +53,7 @@ def test_maps_pay_at_once_where_each_step_is_a_query():
 
 def test_maps_never_pay_where_a_lookup_costs_more_than_a_march():
     assert cost.choose(replace(WORK, points=1e12), replace(KNOT, lookup=1000.0)) == (
-        "raymarch", "about 1e+12 shading points, maps pay from no number on")
+        "raymarch", "about 1e+12 shading points, maps pay from no number")
 
 
 def test_the_chosen_method_is_the_cheaper_one():
