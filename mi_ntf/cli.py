@@ -161,9 +161,7 @@ class Explain:
     """Print JSON in place of a table."""
 
     def run(self) -> None:
-        parameters = dict(item.partition("=")[::2] for item in self.define)
-        if not all("=" in item for item in self.define):
-            raise UsageError(f"-D needs KEY=VALUE, got {' '.join(self.define)}")
+        parameters = _definitions(self.define)
         from mi_ntf.render.explain import explain, print_table
 
         _report(explain(self.scene, parameters), self.json, print_table)
@@ -184,6 +182,27 @@ class Bench:
         from mi_ntf.evaluate.bench import bench, print_table
 
         _report(bench(self.quick, self.output, lambda text: print(text, file=sys.stderr)), self.json, print_table)
+
+
+@dataclass
+class Bake:
+    """Write the transmittance maps of a scene's lights, one part of an EXR file each."""
+
+    scene: Positional[Path]
+    """Scene with an nrf medium and integrator; the integrator's property map_file reads the result."""
+    output: Output
+    """EXR to write."""
+    define: Annotated[UseAppendAction[tuple[str, ...]], arg(aliases=("-D",), metavar="KEY=VALUE")] = field(
+        default_factory=tuple
+    )
+    """Value of $KEY in the scene."""
+    json: bool = False
+    """Print JSON in place of a table."""
+
+    def run(self) -> None:
+        from mi_ntf.render.bake import bake
+
+        _report(bake(self.scene, self.output, _definitions(self.define)), self.json, _print_pairs)
 
 
 @dataclass
@@ -224,6 +243,7 @@ Command = (
     | Annotated[Compare, subcommand("compare")]
     | Annotated[Explain, subcommand("explain")]
     | Annotated[Bench, subcommand("bench")]
+    | Annotated[Bake, subcommand("bake")]
     | Annotated[Info, subcommand("info")]
     | Annotated[Doctor, subcommand("doctor")]
 )
@@ -260,6 +280,13 @@ def parse(words: list[str]) -> Any:
     if words[:1] == ["render"]:  # its flags belong to another parser
         return Render(tuple(words[1:]))
     return tyro.cli(Command, prog="mi-ntf", description=__doc__, args=words, config=(tyro.conf.FlagCreatePairsOff,))
+
+
+def _definitions(items: Sequence[str]) -> dict[str, str]:
+    """Values by name, of words KEY=VALUE."""
+    if not all("=" in item for item in items):
+        raise UsageError(f"-D needs KEY=VALUE, got {' '.join(items)}")
+    return dict(item.partition("=")[::2] for item in items)
 
 
 def _report(result: Any, as_json: bool, print_table: Any) -> None:

@@ -1,7 +1,11 @@
 """Fixtures shared by all tests."""
 
+import os
+
 import numpy as np
 import pytest
+
+os.environ.setdefault("MI_NTF_MAP_CACHE", "off")  # tests neither read nor fill the user's cache
 
 
 @pytest.fixture

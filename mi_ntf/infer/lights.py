@@ -28,23 +28,35 @@ class LightTable:
     ):
         self.where, self.is_point = np.asarray(where, np.float64), np.asarray(is_point, bool)
         self.count = len(self.where)
+        self.first, self.total = 0, self.count  # of a part: the place of its first light in the whole, and its size
         self.dj = dj
-        self._where = dj.Float(self.where.astype(np.float32).ravel())
-        self._power = dj.Float(np.asarray(power, np.float32).ravel())
-        self._flag = dj.Float(self.is_point.astype(np.float32))
+        self._arguments = where, power, is_point, scale, dj, cones
+        flag = self.is_point[:, None]
+        rows = np.concatenate([self.where, flag, np.reshape(power, (-1, 3)), 0 * flag], axis=1)
+        self._rows = dj.Float(rows.astype(np.float32).ravel())
         self._scale = dr.opaque(dj.Float, scale)
         columns = [] if cones is None else np.array(np.transpose(cones), np.float32, order="C")
         self._cones = [dj.Float(c) for c in columns] or None
+
+    def part(self, first: int, last: int) -> "LightTable":
+        """The lights `first` … `last` − 1 as a table of their own."""
+        where, power, is_point, scale, dj, cones = self._arguments
+        rows = slice(first, last)
+        part = LightTable(where[rows], power[rows], is_point[rows], scale, dj, None if cones is None else cones[rows])
+        part.first, part.total = self.first + first, self.total
+        return part
 
     def sample(self, index, x, active):
         """Light `index` seen from `x`: ``(wi, irradiance, distance)``.
 
         `wi`: unit 3-tuple towards the light; `irradiance`: 3-tuple on a surface that faces it; `distance`: field units.
         """
-        where = dr.gather(self.dj.Array3f, self._where, index, active)
-        power = dr.gather(self.dj.Array3f, self._power, index, active)
-        flag = dr.gather(self.dj.Float, self._flag, index, active)
-        d = where - flag * self.dj.Array3f(*x)
+        # Two fetches of four numbers: several times faster than seven of one.
+        first = 2 * self.dj.UInt32(index)
+        where = dr.gather(self.dj.Array4f, self._rows, first, active)
+        power = dr.gather(self.dj.Array4f, self._rows, first + 1, active)
+        flag, power = where[3], self.dj.Array3f(power[0], power[1], power[2])
+        d = self.dj.Array3f(where[0], where[1], where[2]) - flag * self.dj.Array3f(*x)
         r2 = dr.maximum(dr.dot(d, d), 1e-8)
         inverse = dr.rsqrt(r2)
         point = flag > 0

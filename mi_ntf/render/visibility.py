@@ -3,11 +3,13 @@ what each method of :mod:`mi_ntf.infer.visibility` is built from. Integrator and
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core.errors import MiNtfError
 from ..infer import profile
 from ..infer.visibility import (
     map_source,
@@ -17,18 +19,64 @@ from ..infer.visibility import (
     transmittance_volume,
     visibility_mlp,
 )
+from . import bake, map_cache
 
 
 @dataclass(frozen=True)
 class Options:
     """`step`: length of the camera march's cells, field units; `map_resolution`: texels along a map's side;
     `map_source`: ``field`` or ``network``; `map_components`: logistics a texel that the field's march is fitted by, 1
-    or 2 (the network has its own number)."""
+    or 2 (the network has its own number); `map_memory`: MiB that the maps or volumes of one part of the lights may
+    take; `map_file`: EXR of `mi-ntf bake` that holds the maps, or none; `cache`: maps are kept for the next frame and
+    on disk (:mod:`mi_ntf.render.map_cache`)."""
 
     step: float
     map_resolution: int = 128
     map_source: str = "field"
     map_components: int = 1
+    map_memory: float = 1024.0
+    map_file: str = ""
+    cache: bool = False
+
+
+def options(integrator) -> Options:
+    """The options of an ``nrf`` integrator."""
+    wanted = ("map_resolution", "map_source", "map_components", "map_memory", "map_file")
+    found = {name: getattr(integrator, name) for name in wanted if hasattr(integrator, name)}
+    return Options(2 / integrator.samples, **found, cache=True)
+
+
+def parts(method: str, media, table, options: Options) -> list:
+    """``(first, last)`` of runs of lights whose maps or volumes, of all `media`, fit into `map_memory`; one run for
+    methods that hold nothing per light. Raises MiNtfError where not even one light fits."""
+    if method not in ("transmittance_map", "transmittance_volume") or not table.count:
+        return [(0, table.count)]
+    width = max(_numbers(method, medium, table, options) for medium in media)
+    size = 4 * width * options.map_resolution**2
+    # Dr.Jit counts entries in 32 bits.
+    count = int(min(options.map_memory * 2**20 / (size * len(media)), (2**32 - 1) / (size / 4)))
+    if count < 1:
+        raise MiNtfError(
+            f"map_memory is {options.map_memory:.4g} MiB, but one light takes {size * len(media) / 2**20:.4g} MiB "
+            f"({method}, map_resolution {options.map_resolution}, {len(media)} media); raise map_memory or lower "
+            "map_resolution"
+        )
+    return [(first, min(first + count, table.count)) for first in range(0, table.count, count)]
+
+
+def _numbers(method: str, medium, table, options: Options) -> int:
+    """float32 numbers that a light's ray takes."""
+    if method == "transmittance_volume":
+        return math.ceil(2 / options.step)
+    if options.map_source == "field":
+        return transmittance_map.channels(options.map_components)
+    components = medium.field.network.components
+    return transmittance_map.channels(components, components > 1 or _inside(table))
+
+
+def _inside(table) -> bool:
+    """Whether some light lies inside the sphere."""
+    return bool((table.is_point & (np.linalg.norm(table.where, axis=1) < 1)).any())
 
 
 def build(method: str, medium, table, options: Options):
@@ -55,10 +103,20 @@ def build(method: str, medium, table, options: Options):
     reader = profile.DepthProfile(source.density, field.grid, dr.opaque(mi.Float, step))
     if method == "neural_transmittance":
         return neural_transmittance.NeuralTransmittance(field.network, reader)
-    inside = bool((table.is_point & (np.linalg.norm(table.where, axis=1) < 1)).any())
-    fit = (
-        map_source.network_source(field.network, reader, inside)
+    made_by = (
+        map_source.network_source(field.network, reader, _inside(table))
         if network
         else map_source.field_source(reader, options.map_components)
     )
-    return transmittance_map.TransmittanceMap(table, options.map_resolution, field.grid.hull, fit, mi)
+
+    def make(values=None):
+        values = None if values is None else mi.Float(values)
+        return transmittance_map.TransmittanceMap(table, options.map_resolution, field.grid.hull, made_by, mi, values)
+
+    width = _numbers(method, medium, table, options)
+    if options.map_file:
+        path = Path(str(mi.file_resolver().resolve(options.map_file)))
+        return make(bake.read(path, medium, table, options, width))
+    if not options.cache:
+        return make()
+    return map_cache.cached(map_cache.key(medium, table, options, width), make, make)

@@ -17,10 +17,9 @@ from ..lights import LightTable
 from .light_rays import LightRays
 from .map_source import Source
 
-
 SAME, APART = 2.0, 4.0
-"""Texels by which the centres of four neighbouring rays may differ to count as one surface, and as two. On `statue` under
-50 lights, 256²: image error 1.8 → 1.5 % with one logistic, 1.0 → 0.9 % with two."""
+"""Texels by which the centres of four neighbouring rays may differ to count as one surface, and as two. On `statue`
+under 50 lights, 256²: image error 1.8 → 1.5 % with one logistic, 1.0 → 0.9 % with two."""
 
 
 def channels(components: int, weights: bool | None = None) -> int:
