@@ -54,7 +54,7 @@ def study(path: Path, size: int, spp: int, count: int) -> dict[str, float]:
         images[name] = np.array(mi.render(scene, integrator=integrator, spp=spp))[..., :3]
     truth = images.pop("raymarch")
     result = {k: float(np.sqrt(((v - truth) ** 2).mean() / (truth**2).mean())) for k, v in images.items()}
-    return result | {"ns": query_time(effects.find_medium(scene))}
+    return result | {"ns": query_time(effects.find_media(scene)[0])}
 
 
 def query_time(medium, count: int = 1 << 20) -> float:

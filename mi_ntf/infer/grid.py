@@ -28,7 +28,8 @@ class GridField:
 
     Also holds the occupancy: `clearance` (``CELLS``³ floats) is the Chebyshev distance, in cells, to the nearest cell
     with density anywhere in it; `bounds`, the box around all density; `hull` (k, 3), points whose convex hull holds
-    it; `majorant`, an upper bound of the density.
+    it; `majorant`, an upper bound of the density; `gloss`, the highest specular lobe in matter, s/(4 α²): light and
+    view along the normal, relative to a white diffuse surface.
     """
 
     def __init__(self, field: NetworkField, resolution: int, dj: ModuleType):
@@ -38,6 +39,7 @@ class GridField:
         values = _bake(lambda p: _flat(field.reflectance(p)), 8, min(resolution, REFLECTANCE_RESOLUTION), dj)
         self._reflectance = _texture(values, dj)
         dense = log_sigma[..., 0] > np.log(MIN_DENSITY)
+        self.gloss = _highest_gloss(values, dense)
         self.majorant = float(np.exp(log_sigma.max())) if dense.any() else 0.0
         occupied = _occupied_cells(dense)
         self.clearance = dj.Float(_chebyshev_distance(occupied).ravel())
@@ -55,6 +57,13 @@ class GridField:
 
     def _uvw(self, p):
         return self.dj.Array3f(*(0.5 * c + 0.5 for c in p))
+
+
+def _highest_gloss(reflectance: np.ndarray, dense: np.ndarray) -> float:
+    """s/(4 α²), the most of all voxels of `reflectance` (z, y, x, 8) that hold some of the voxels `dense`."""
+    at = np.argwhere(dense) * reflectance.shape[0] // dense.shape[0]
+    roughness, specular = reflectance[tuple(at.T)][:, 6:].T
+    return float((specular / (4 * roughness**4)).max(initial=0.0))
 
 
 def _kernel_mean(log_sigma: np.ndarray) -> np.ndarray:

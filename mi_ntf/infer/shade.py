@@ -3,10 +3,11 @@
 import drjit as dr
 
 from ..core import microfacet
+from ..core.ops import dot
 from . import ops
 
 
-def reflect(points, lights, visibility):
+def reflect(points, lights, visibility, specular=True):
     """Σ over lights of irradiance · τ · f, f the phase function of :func:`mi_ntf.core.microfacet.scattering`: the h(x,
     ω_o) of method.md, section 1.
 
@@ -14,6 +15,7 @@ def reflect(points, lights, visibility):
     lights      has ``count`` and ``sample(index, x, active) → (wi, irradiance, distance)``
     visibility  has ``tau`` (:mod:`mi_ntf.infer.visibility`); None: no shadow. The light then does not pass the skin
                 either, so a point reflects as a surface does, ρ ⟨n,ω_i⟩⁺
+    specular    whether the field has a specular lobe; without, all its albedo is diffuse
 
     Returns radiance per point, a 3-tuple. The loop over lights is symbolic: compile time and memory do not depend on
     their number.
@@ -24,15 +26,11 @@ def reflect(points, lights, visibility):
 
     def body(i, r, g, b):
         wi, irradiance, distance = lights.sample(i, points.x, True)
-        model = microfacet.scattering if visibility else microfacet.lobes
-        diffuse, specular = model(ops, wi, points.wo, points.normal, points.roughness)
+        diffuse, gloss = _lobes(wi, points, bool(visibility), specular)
         lit = diffuse > 0
         tau = dr.select(lit, visibility.tau(points.x, wi, distance, i, lit), 0) if visibility else 1
-        d = (1 - points.specular) * diffuse * tau
-        s = points.specular * specular * tau
-        r = r + irradiance[0] * (points.albedo[0] * d + s)
-        g = g + irradiance[1] * (points.albedo[1] * d + s)
-        b = b + irradiance[2] * (points.albedo[2] * d + s)
+        value = [k * diffuse + gloss for k in points.albedo] if specular else [k * diffuse for k in points.albedo]
+        r, g, b = (c + e * v * tau for c, e, v in zip((r, g, b), irradiance, value, strict=True))
         return i + 1, r, g, b
 
     zero = dr.zeros(floats, dr.width(points.x[0]))
@@ -45,9 +43,25 @@ def reflect(points, lights, visibility):
     return r, g, b
 
 
+def _lobes(wi, points, skin: bool, specular: bool):
+    """The diffuse lobe, to be multiplied by the albedo, and the specular one (None without)."""
+    if not specular:
+        cos = dr.maximum(dot(points.normal, wi), 0)
+        if skin:
+            cos = dr.select(cos > 0, cos + dr.maximum(dot(points.normal, points.wo), 0), 0)
+        return cos * microfacet.INV_PI, None
+    model = microfacet.scattering if skin else microfacet.lobes
+    diffuse, gloss = model(ops, wi, points.wo, points.normal, points.roughness)
+    return (1 - points.specular) * diffuse, points.specular * gloss
+
+
 class Points:
     """Shading points: position, direction to the viewer, reflectance. 3-tuples and scalars, all of one width."""
 
     def __init__(self, x, wo, reflectance):
         self.x, self.wo = x, wo
         self.normal, self.albedo, self.roughness, self.specular = reflectance
+
+    def evaluate(self) -> None:
+        """Compute them now: what follows loops over lights."""
+        dr.eval(self.x, self.wo, self.normal, self.albedo, self.roughness, self.specular)

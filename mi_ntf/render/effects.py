@@ -2,52 +2,100 @@
 
 from dataclasses import dataclass
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from ..core.errors import MiNtfError
 from ..infer.visibility import AVAILABLE, METHODS
-from . import lights
 
 SAMPLES_IN_MATTER = 5
 """Shaded samples of a camera ray that hits the object, and the share of rays that do: for predicting cost only."""
 COVERAGE = 0.3
 
 
+PINHOLES = ("PerspectiveCamera",)
+"""Cameras whose rays all pass one point: light from there goes the way of the view."""
+MIN_GLOSS = 0.01
+"""Specular lobes that stay below this share of a white diffuse surface (:class:`mi_ntf.infer.grid.GridField`, `gloss`)
+are left out."""
+NEAR = 1e-3
+"""A light counts as at the camera within this share of the distance to the nearest field's sphere."""
+
+
 @dataclass(frozen=True)
 class Effects:
-    """`emitters`: their kinds; `background`: the environment is seen directly; `exhaustive`: every light at every
-    shading point, rather than random ones; `visibility`: the method that runs, never ``auto``; `reason`: why that
-    one."""
+    """What takes part in a render; what does not is neither traced into a kernel nor built.
+
+    emitters    their kinds
+    lit         a light has power, and `max_depth` lets it scatter
+    background  the environment is seen directly
+    exhaustive  every light at every shading point, rather than random ones
+    visibility  the method that runs, never ``auto``; `reason`: why that one
+    collocated  all light comes from the camera: the view transmittance is the light's too
+    in_view     of each medium, whether the camera may see matter of it
+    surfaces    there are shapes other than the media's bounds
+    specular    a field has a specular lobe
+    bounces     light scatters more than once
+    gradients   a scene parameter is attached
+    """
 
     emitters: tuple[str, ...]
+    lit: bool
     background: bool
     exhaustive: bool
     visibility: str
     reason: str
+    collocated: bool
+    in_view: tuple[bool, ...]
+    surfaces: bool
+    specular: bool
+    bounces: bool
+    gradients: bool
+
+    @property
+    def needs_visibility(self) -> bool:
+        """Whether a visibility method has to be built."""
+        return self.lit and (not self.collocated or self.surfaces or self.bounces)
 
 
-def find_medium(scene):
-    """The scene's one ``nrf`` medium. Raises MiNtfError where there is none, several, or its bounding shape is
-    wrong."""
-    found = {}
+def find_media(scene) -> list:
+    """The scene's ``nrf`` media. Raises MiNtfError where there is none, or a bounding shape is wrong."""
+    media, bounds = [], []
     for shape in scene.shapes():
-        medium = shape.interior_medium() if shape.is_medium_transition() else None
-        if getattr(medium, "is_nrf", False):
-            found.setdefault(medium.id() or medium.path, (medium, []))[1].append(shape)
-    if not found:
+        medium = _nrf_medium(shape)
+        if medium is None:
+            continue
+        if not any(medium is m for m in media):
+            media.append(medium)
+            bounds.append([])
+        bounds[next(i for i, m in enumerate(media) if m is medium)].append(shape)
+    if not media:
         raise MiNtfError(
             'nrf integrator: the scene has no nrf medium; put one inside a bounding shape: <shape type="sphere"> '
             '… <bsdf type="null"/> <medium type="nrf" name="interior"> … </medium> </shape>, '
             "or let `mi-ntf swap` write the scene"
         )
-    if len(found) > 1:
-        raise MiNtfError(
-            f"nrf integrator: the scene has {len(found)} nrf media ({', '.join(found)}), this version renders "
-            "one; merge them or render them with stock volpath"
-        )
-    ((medium, shapes),) = found.values()
-    _check_bounds(medium, shapes)
-    return medium
+    for medium, shapes in zip(media, bounds, strict=True):
+        _check_bounds(medium, shapes)
+    return media
+
+
+def ordinary_shapes(scene) -> list:
+    """All shapes but the bounds of ``nrf`` media. Raises MiNtfError where one holds another medium."""
+    shapes = [s for s in scene.shapes() if _nrf_medium(s) is None]
+    for shape in shapes:
+        if shape.is_medium_transition():
+            raise MiNtfError(
+                f"nrf integrator: shape {shape.id()} bounds a medium that is no nrf medium, which this integrator does "
+                "not see; remove the medium, or render the scene with volpath"
+            )
+    return shapes
+
+
+def _nrf_medium(shape):
+    medium = shape.interior_medium() if shape.is_medium_transition() else None
+    return medium if getattr(medium, "is_nrf", False) else None
 
 
 def _check_bounds(medium, shapes) -> None:
@@ -74,10 +122,35 @@ def _text(v) -> str:
     return "(" + ", ".join(f"{float(c):.4g}" for c in np.array(v).ravel()) + ")"
 
 
-def describe(scene, integrator, pixels: int, spp: int) -> Effects:
-    """The effects of rendering `scene` by an ``nrf`` integrator: `pixels` × `spp` camera rays."""
-    kinds = lights.kinds(scene)
+def describe(scene, integrator, sensor, spp: int, media: list, light) -> Effects:
+    """The effects of rendering `scene`, with its `media` and `light` (:class:`mi_ntf.render.lights.Lights`), by an
+    ``nrf`` integrator with `spp` camera rays a pixel."""
+    depth = integrator.max_depth
+    lit = bool(light.rows.power.size or light.sampled) and not 0 <= depth < 2
     exhaustive = integrator.light_samples == 0
+    collocated = lit and integrator.visibility != "none" and _at_camera(light, sensor, media)
+    width, height = sensor.film().crop_size()
+    method, reason = _method(integrator, width * height * spp, exhaustive)
+    if collocated:
+        reason += "; not needed where the camera's own transmittance is the light's"
+    return Effects(
+        emitters=tuple(light.kinds),
+        lit=lit,
+        background=scene.environment() is not None and not integrator.hide_emitters and depth != 0,
+        exhaustive=exhaustive,
+        visibility=method,
+        reason=reason,
+        collocated=collocated,
+        in_view=_in_view(sensor, media),
+        surfaces=len(ordinary_shapes(scene)) > 0,
+        specular=any(m.field.grid.gloss > MIN_GLOSS for m in media),
+        bounces=lit and not 0 <= depth <= 2,
+        gradients=any(dr.grad_enabled(v) for _, v in mi.traverse(scene)),
+    )
+
+
+def _method(integrator, rays: int, exhaustive: bool) -> tuple[str, str]:
+    """The visibility method that runs, and why."""
     method, reason = integrator.visibility, "chosen by name"
     if method not in AVAILABLE:
         raise MiNtfError(
@@ -91,14 +164,44 @@ def describe(scene, integrator, pixels: int, spp: int) -> Effects:
             "light and sums all of them; remove light_samples or choose raymarch or neural_transmittance"
         )
     if method == "auto":
-        points = pixels * spp * COVERAGE * SAMPLES_IN_MATTER
+        points = rays * COVERAGE * SAMPLES_IN_MATTER
         break_even = 12 * integrator.map_resolution**2
-        use_map = exhaustive and points > break_even
-        method = "transmittance_map" if use_map else "raymarch"
+        method = "transmittance_map" if exhaustive and points > break_even else "raymarch"
         reason = (
             f"about {points:.0f} shading points, maps pay from {break_even}"
             if exhaustive
             else "random lights have no maps"
         )
-    background = scene.environment() is not None and not integrator.hide_emitters
-    return Effects(tuple(kinds), background, exhaustive, method, reason)
+    return method, reason
+
+
+def _at_camera(light, sensor, media) -> bool:
+    """Whether all lights are points at the pinhole of the camera."""
+    if light.sampled or sensor.class_name() not in PINHOLES or not light.rows.is_point.all():
+        return False
+    eye = _eye(sensor)
+    to_field = min(abs(np.linalg.norm(m.frame.origin - eye) - m.frame.length) for m in media)
+    return bool((np.linalg.norm(light.rows.where - eye, axis=1) <= NEAR * to_field).all())
+
+
+def _in_view(sensor, media) -> tuple[bool, ...]:
+    """Of each medium, whether its sphere reaches into the pinhole camera's pyramid and holds matter."""
+    held = [m.field.grid.majorant > 0 for m in media]
+    if sensor.class_name() not in PINHOLES:
+        return tuple(held)
+    film = sensor.film()
+    margin = film.rfilter().radius() + 1 if film.sample_border() else 0
+    (u0, u1), (v0, v1) = ((-margin / n, 1 + margin / n) for n in film.crop_size())
+    rays, _ = sensor.sample_ray(0.0, 0.0, mi.Point2f([u0, u1, u1, u0], [v0, v0, v1, v1]), mi.Point2f(0.5))
+    corners = np.array(rays.d, np.float64).T
+    sides = np.cross(corners, np.roll(corners, -1, axis=0))
+    sides *= np.sign(sides @ corners.sum(0))[:, None] / np.linalg.norm(sides, axis=1, keepdims=True)
+    eye = _eye(sensor)
+    return tuple(
+        h and bool((sides @ (m.frame.origin - eye) > -m.frame.length).all()) for h, m in zip(held, media, strict=True)
+    )
+
+
+def _eye(sensor) -> np.ndarray:
+    """Where the pinhole of a camera is."""
+    return np.array(sensor.world_transform().translation(), np.float64).ravel()

@@ -24,12 +24,14 @@ def explain(scene: Path, parameters: dict[str, str]) -> dict:
     integrator = loaded.integrator()
     if not hasattr(integrator, "map_resolution"):
         raise MiNtfError(f'{scene}: its integrator is {integrator.class_name()}; explain reads <integrator type="nrf">')
-    medium = effects.find_medium(loaded)
+    media = effects.find_media(loaded)
+    medium = media[0]
     sensor = loaded.sensors()[0]
     width, height = (int(v) for v in sensor.film().size())
     spp = sensor.sampler().sample_count()
-    found = effects.describe(loaded, integrator, width * height, spp)
-    table = lights.table(loaded, medium.frame, integrator.environment_lights) if found.exhaustive else None
+    light = lights.Lights(loaded, media, integrator.light_samples, integrator.environment_lights)
+    found = effects.describe(loaded, integrator, sensor, spp, media, light)
+    table = light.table(medium.frame) if found.exhaustive else None
     return {
         "scene": str(scene),
         "image": {"width": width, "height": height, "spp": spp},
@@ -48,7 +50,7 @@ def explain(scene: Path, parameters: dict[str, str]) -> dict:
 
 def _effects(scene, found, table, integrator) -> dict:
     """Each effect: whether it takes part, and the reason."""
-    others = len(scene.shapes()) - 1
+    others = len(effects.ordinary_shapes(scene))
     shadow = found.visibility != "none"
     use_map = found.visibility == "transmittance_map"
     unlit = table is not None and table.count == 0
@@ -70,10 +72,10 @@ def _effects(scene, found, table, integrator) -> dict:
         },
         "shading": {"on": not unlit, "why": "no emitter has power" if unlit else "the scene has lights"},
         "ordinary surfaces": {
-            "on": False,
-            "why": f"{others} shapes are left out: this version renders fields alone" if others else "there are none",
+            "on": found.surfaces,
+            "why": f"{others} shapes beside the fields' bounds" if others else "there are none",
         },
-        "multiple scattering": {"on": False, "why": "single scattering; use stock volpath for more"},
+        "multiple scattering": {"on": found.bounces, "why": f"max_depth is {integrator.max_depth}"},
     }
 
 

@@ -6,9 +6,8 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.errors import MiNtfError
-from ..infer import march, shade
 from ..infer.visibility import METHODS
-from . import effects, lights, visibility
+from .composition import Composition
 
 CHUNK = 1 << 18
 """Camera rays in flight: bounds the memory at some hundred MiB whatever the image and the number of lights."""
@@ -35,16 +34,22 @@ def integrator_class() -> type:
         environment_lights  integer most directional lights that stand for an environment (default: 512)
         map_resolution      integer texels per side of a light's transmittance map (default: 128)
         map_source          string  ``field``: marched once per texel; ``network``: one query per texel (default: field)
-        hide_emitters       boolean leave the environment out of the picture (default: false)
+        max_depth           integer longest path in edges: 1 shows emitters alone, 2 is single scattering, more is
+                                    multiple scattering in fields and between surfaces, −1 has no limit and ends paths
+                                    by Russian roulette from depth 5 on (default: 2)
+        hide_emitters       boolean leave the environment and shapes that shine out of the picture (default: false)
         timeout             float   seconds after which rendering ends with what is there; below 0: never (default: -1)
         =================== ======= ===================================================================================
 
-        Light scatters once: camera ray → point → light, with L = ∫ τ σ h dt (Bi et al. 2020, eq. 2). Alpha is the
-        opacity. Every camera ray carries its whole distribution of depths, so 16 samples per pixel look like thousands
-        of a path tracer.
+        At `max_depth` 2 light scatters once: camera ray → point → light, with L = ∫ τ σ h dt (Bi et al. 2020, eq. 2).
+        Alpha is the opacity. Every camera ray carries its whole distribution of depths, so 16 samples per pixel look
+        like thousands of a path tracer.
 
-        Does not support: more than one ``nrf`` medium; ordinary surfaces (left out with a warning); multiple
-        scattering; spectral and polarised variants.
+        Any number of ``nrf`` media, which may overlap (densities add), and ordinary shapes with any BSDF: all hide,
+        shade and, from `max_depth` 3 on, light each other. Shadow rays of surfaces are marched where `visibility` is a
+        method of maps or volumes. With ``none`` fields cast no shadows and receive none.
+
+        Does not support: media other than ``nrf``; spectral and polarised variants.
         """
 
         def __init__(self, props):
@@ -56,6 +61,7 @@ def integrator_class() -> type:
             self.light_samples = _whole(props, "light_samples", 0, 0, 65536)
             self.environment_lights = _whole(props, "environment_lights", 512, 1, 65536)
             self.map_resolution = _whole(props, "map_resolution", 128, 4, 4096)
+            self.max_depth = _whole(props, "max_depth", 2, -1, 1 << 20)
             props["timeout"] = -1.0
             mi.SamplingIntegrator.__init__(self, props)
 
@@ -68,6 +74,7 @@ def integrator_class() -> type:
                 f"NRFIntegrator[\n  visibility = {self.visibility},\n  samples = {self.samples},\n"
                 f"  light_samples = {self.light_samples},\n  environment_lights = {self.environment_lights},\n"
                 f"  map_resolution = {self.map_resolution},\n  map_source = {self.map_source},\n"
+                f"  max_depth = {self.max_depth},\n"
                 f"  hide_emitters = {self.hide_emitters},\n  timeout = {self.timeout}\n]"
             )
 
@@ -99,7 +106,7 @@ def _render(self, scene, sensor, seed: int, spp: int, develop: bool):
     sampler.set_samples_per_wavefront(spp)
     size = mi.ScalarVector2u(film.crop_size()) + (2 * film.rfilter().border_size() if film.sample_border() else 0)
     pixels = size.x * size.y
-    scene_light = SceneLight(self, scene, pixels, spp)
+    composition = Composition(scene, self, sensor, spp)
     film.prepare([])
     block = film.create_block()
     block.set_offset(film.crop_offset())
@@ -114,7 +121,7 @@ def _render(self, scene, sensor, seed: int, spp: int, develop: bool):
         sampler.seed(stream, count * spp)
         pixel = dr.arange(mi.UInt32, count * spp) // dr.opaque(mi.UInt32, spp) + dr.opaque(mi.UInt32, first)
         ray, weight, position = _camera_rays(sensor, film, sampler, pixel, size.x)
-        radiance, opacity = scene_light.trace(ray, sampler, stream)
+        radiance, opacity = composition.trace(ray, sampler, stream)
         value = radiance * weight
         channels = (
             [value.x, value.y, value.z] + ([opacity] if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else []) + [1.0]
@@ -145,62 +152,3 @@ def _camera_rays(sensor, film, sampler, pixel, width: int):
         moment += sampler.next_1d() * sensor.shutter_open_time()
     ray, weight = sensor.sample_ray(moment, 0.0, mi.Point2f(scaled), aperture)
     return ray, weight, corner if film.rfilter().is_box_filter() else inside
-
-
-class SceneLight:
-    """The scene prepared for one render: medium, lights, visibility. What the scene lacks is not built."""
-
-    def __init__(self, integrator, scene, pixels: int, spp: int):
-        self.scene, self.integrator = scene, integrator
-        self.medium = effects.find_medium(scene)
-        self.effects = effects.describe(scene, integrator, pixels, spp)
-        self.step = 2 / integrator.samples
-        if len(scene.shapes()) > 1:
-            mi.Log(
-                mi.LogLevel.Warn,
-                f"nrf integrator: {len(scene.shapes()) - 1} ordinary shapes are left out of the picture",
-            )
-        self.lights = lights.Lights(scene, [self.medium], integrator.light_samples, integrator.environment_lights)
-        self.table = self.lights.table(self.medium.frame)
-        options = visibility.Options(self.step, integrator.map_resolution, integrator.map_source)
-        method = self.effects.visibility
-        self.visibility = visibility.build(method, self.medium, self.table, options)
-        # Maps know the table's lights alone.
-        drawn = lights.method_for_drawn(method)
-        self.drawn_visibility = (
-            self.visibility if drawn == method else visibility.build(drawn, self.medium, self.table, options)
-        )
-
-    def trace(self, ray, sampler, stream):
-        """``(radiance, opacity)`` of camera rays."""
-        frame, source, grid = self.medium.frame, self.medium.source, self.medium.field.grid
-        o, d = frame.point_to_field(ray.o), frame.direction_to_field(ray.d)
-        step = dr.opaque(mi.Float, self.step)
-        index, t, w, transmittance = march.camera_samples(
-            source.density, grid, o, d, ray.maxt / frame.length, step, sampler.next_1d(), sampler.next_1d()
-        )
-        sums = [dr.zeros(mi.Float, dr.width(ray.o)) for _ in range(3)]
-        if dr.width(index) > 0 and (self.table.count or self.lights.sampled):
-            light = self._light(index, t, o, d, stream)
-            for total, value in zip(sums, light, strict=True):
-                dr.scatter_reduce(dr.ReduceOp.Add, total, value * w, index)
-        radiance = mi.Color3f(*sums)
-        opacity = 1 - transmittance
-        if self.effects.background:
-            si = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray.o))
-            si.wi = -ray.d
-            radiance += transmittance * self.scene.environment().eval(si)
-            opacity = dr.ones(mi.Float, dr.width(ray.o))
-        return radiance, opacity
-
-    def _light(self, index, t, o, d, stream):
-        """Reflected radiance at the samples (ray `index`, distance `t`)."""
-        along = tuple(dr.gather(mi.Float, c, index) for c in d)
-        x = tuple(dr.gather(mi.Float, a, index) + t * b for a, b in zip(o, along, strict=True))
-        points = shade.Points(x, tuple(-c for c in along), self.medium.source.reflectance(x))
-        dr.eval(points.x, points.wo, points.normal, points.albedo, points.roughness, points.specular)
-        total = [dr.zeros(mi.Float, dr.width(t)) for _ in range(3)]
-        for source, mapped in self.lights.sources(self.table, self.medium.frame, points, stream):
-            part = shade.reflect(points, source, self.visibility if mapped else self.drawn_visibility)
-            total = [a + b for a, b in zip(total, part, strict=True)]
-        return total

@@ -51,16 +51,14 @@ def quadrature(density, o, d, t0, t1, n=20000):
 def test_transmittance_and_weights(grid, rng):
     o, d = rays(rng, 300)
     step = 2 / 2048
-    index, t, w, transmittance = march.camera_samples(
-        grid.density,
-        grid,
-        arrays(o),
-        arrays(d),
+    samples = march.camera_samples(
+        [march.Strand(grid.density, grid, arrays(o), arrays(d))],
         mi.Float(np.full(300, 1e9)),
         mi.Float(step),
         mi.Float(rng.random(300)),
         mi.Float(rng.random(300)),
     )
+    index, t, (w,), transmittance = samples.ray, samples.t, samples.weights, samples.transmittance
     depth = quadrature(grid.density, o, d, np.full(300, 2.0), np.full(300, 4.0), 4000)
     # Midpoint rule on trilinear density of slope ~1e3: error per step ~ σ'Δ²/8, below 1e-3 in depth.
     np.testing.assert_allclose(np.array(transmittance), np.exp(-depth), atol=3e-3)
@@ -76,17 +74,14 @@ def test_samples_follow_free_flight(slab, rng):
     """In a uniform medium the weighted mean depth is that of an exponential cut off at the far side."""
     n, sigma = 20000, 1.5
     o, d = np.tile([[0.0, 0.0, 3.0]], (n, 1)), np.tile([[0.0, 0.0, -1.0]], (n, 1))
-    _, t, w, _ = march.camera_samples(
-        slab.density,
-        slab,
-        arrays(o),
-        arrays(d),
+    samples = march.camera_samples(
+        [march.Strand(slab.density, slab, arrays(o), arrays(d))],
         mi.Float(np.full(n, 1e9)),
         mi.Float(0.25),
         mi.Float(rng.random(n)),
         mi.Float(rng.random(n)),
     )
-    w, t = np.array(w, np.float64), np.array(t, np.float64)
+    w, t = np.array(samples.weights[0], np.float64), np.array(samples.t, np.float64)
     assert w.sum() / n == pytest.approx(1 - np.exp(-2 * sigma), rel=4e-3)  # voxels at the surface, 1/128 wide
     mean = 2 + 1 / sigma - 2 * np.exp(-2 * sigma) / (1 - np.exp(-2 * sigma))
     # Coarse steps of an eighth of the chord, yet no bias: that is what the random depth inside a step is for.
@@ -141,16 +136,15 @@ def test_skipping_changes_nothing(grid, rng):
 
     o, d = rays(rng, 200)
     arguments = (
-        arrays(o),
-        arrays(d),
         mi.Float(np.full(200, 1e9)),
         mi.Float(2 / 300),
         mi.Float(rng.random(200)),
         mi.Float(rng.random(200)),
     )
-    fast, slow = (march.camera_samples(grid.density, g, *arguments) for g in (grid, Everywhere))
+    strands = [[march.Strand(grid.density, g, arrays(o), arrays(d))] for g in (grid, Everywhere)]
+    fast, slow = ((s.ray, s.t, *s.weights) for s in (march.camera_samples(k, *arguments) for k in strands))
     order = [np.lexsort((np.array(r[1]), np.array(r[0]))) for r in (fast, slow)]
-    for a, b in zip(fast[:3], slow[:3], strict=True):
+    for a, b in zip(fast, slow, strict=True):
         np.testing.assert_allclose(np.array(a)[order[0]], np.array(b)[order[1]], atol=2e-5)
 
 
@@ -158,15 +152,43 @@ def test_rays_that_miss():
     mi.set_variant("llvm_ad_rgb")
     empty = GridField(NetworkField(*fields.empty(), mi), 32, mi)
     o, d = np.array([[0, 0, 3.0], [5.0, 0, 3.0]]), np.array([[0, 0, -1.0], [0, 0, -1.0]])
-    index, _, _, transmittance = march.camera_samples(
-        empty.density,
-        empty,
-        arrays(o),
-        arrays(d),
+    samples = march.camera_samples(
+        [march.Strand(empty.density, empty, arrays(o), arrays(d))],
         mi.Float([1e9, 1e9]),
         mi.Float(0.01),
         mi.Float([0.3, 0.3]),
         mi.Float([0.5, 0.5]),
     )
-    assert len(index) == 0
-    np.testing.assert_array_equal(np.array(transmittance), [1, 1])
+    assert len(samples.ray) == 0
+    np.testing.assert_array_equal(np.array(samples.transmittance), [1, 1])
+
+
+def test_overlapping_fields_add(rng):
+    """Two uniform balls that overlap, along one line: weights, shares and free flight in closed form."""
+    dense, thin = (GridField(NetworkField(*fields.uniform(s), mi), 128, mi) for s in (0.5, 0.6))
+    n = 4000
+    axis = np.tile([[0.0, 0.0, -1.0]], (n, 1))
+    # Scene units are those of the dense ball; the thin one is twice its size, its centre 1.2 behind the other's.
+    strands = [
+        march.Strand(dense.density, dense, arrays(np.tile([[0, 0, 3.0]], (n, 1))), arrays(axis), mi.Float(1.0)),
+        march.Strand(thin.density, thin, arrays(np.tile([[0, 0, 2.1]], (n, 1))), arrays(axis), mi.Float(0.5)),
+    ]
+    step, far = mi.Float(0.01), mi.Float(np.full(n, 1e9))
+    u = [mi.Float(rng.random(n)) for _ in range(4)]
+    samples = march.camera_samples(strands, far, step, u[0], u[1])
+    # The dense ball fills t in [2, 4], the thin one [2.2, 6.2] at density 0.3.
+    t = np.linspace(2, 6.2, 42001)
+    sigma = np.stack([np.where(t < 4, 0.5, 0), np.where(t > 2.2, 0.3, 0)])
+    passed = np.concatenate([[0], np.cumsum(0.5 * (sigma.sum(0)[1:] + sigma.sum(0)[:-1]) * 1e-4)])
+    truth = (sigma * np.exp(-passed)).sum(1) * 1e-4
+    got = [np.array(w, np.float64).sum() / n for w in samples.weights]
+    np.testing.assert_allclose(got, truth, rtol=0.01)  # voxels at the spheres' surfaces, 1/64 wide
+    np.testing.assert_allclose(np.array(samples.transmittance), np.exp(-passed[-1]), rtol=0.02)
+    hit, where, index = march.free_flight(strands, far, step, u[0], -dr.log(1 - u[2]), u[3])
+    hit, where, index = (np.array(a) for a in (hit, where, index))
+    noise = 4 * np.sqrt(0.25 / n)
+    assert [(hit & (index == i)).mean() for i in (0, 1)] == pytest.approx(list(truth), abs=noise)
+    assert where[hit].mean() == pytest.approx((sigma.sum(0) * np.exp(-passed) * t).sum() / (
+        sigma.sum(0) * np.exp(-passed)).sum(), abs=4 * where[hit].std() / np.sqrt(n))
+    cut = mi.Float(np.full(n, 3.0))
+    assert np.array(march.camera_samples(strands, cut, step, u[0], u[1]).t).max() <= 3.0

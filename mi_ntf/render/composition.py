@@ -1,0 +1,223 @@
+"""Fields, surfaces and lights of a scene in one picture: what hides, shades and dims what."""
+
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from ..infer import march, shade
+from . import effects, lights, visibility
+from .surfaces import Surfaces
+from .walk import Paths, Walk
+
+
+@dataclass(frozen=True)
+class Part:
+    """One ``nrf`` medium prepared for a render: lights in its field coordinates; visibility of the table's lights and
+    of drawn ones and any other rays (None: no shadows)."""
+
+    medium: object
+    table: object
+    mapped: object
+    drawn: object
+
+    @property
+    def frame(self):
+        return self.medium.frame
+
+    @property
+    def source(self):
+        return self.medium.source
+
+
+class Shadow:
+    """All that dims a light on its way to points of one field: that field (`own`, a visibility method in the
+    coordinates of `frame`), the others (pairs of frame and method) and `surfaces`. A visibility method itself."""
+
+    def __init__(self, frame, own, others: list, surfaces):
+        self.frame, self.own, self.others, self.surfaces = frame, own, others, surfaces
+
+    def tau(self, x, wi, distance, index, active):
+        """The product of their transmittances, in [0, 1]."""
+        tau = self.own.tau(x, wi, distance, index, active)
+        p, d = self.frame.point_to_world(x), self.frame.direction_to_world(wi)
+        length = distance * self.frame.length
+        for frame, other in self.others:
+            tau = tau * _tau(frame, other, p, d, length, index, active & (tau > 0))
+        if self.surfaces:
+            tau = dr.select(self.surfaces.blocked(p, d, length, active & (tau > 0)), 0, tau)
+        return tau
+
+
+class Known:
+    """A visibility method that knows its answer: that of a light at the camera, which light and view share."""
+
+    def __init__(self, tau):
+        self._tau = tau
+
+    def tau(self, x, wi, distance, index, active):
+        return self._tau
+
+
+def _tau(frame, method, p, d, length, index, active):
+    """A field's transmittance between scene points."""
+    return method.tau(frame.point_to_field(p), frame.direction_to_field(d), length / frame.length, index, active)
+
+
+class Composition:
+    """The scene prepared for one render. What it lacks is not built (:mod:`mi_ntf.render.effects`)."""
+
+    def __init__(self, scene, integrator, sensor, spp: int):
+        self.scene, self.integrator = scene, integrator
+        media = effects.find_media(scene)
+        self.lights = lights.Lights(scene, media, integrator.light_samples, integrator.environment_lights)
+        self.effects = effects.describe(scene, integrator, sensor, spp, media, self.lights)
+        self.parts = [self._part(m) for m in media if m.field.grid.majorant > 0]
+        seen = [m for m, visible in zip(media, self.effects.in_view, strict=True) if visible]
+        self.in_view = [p for p in self.parts if p.medium in seen]
+        self.surfaces = None
+        if self.effects.surfaces:
+            shapes = effects.ordinary_shapes(scene)
+            self.surfaces = Surfaces(scene, shapes, integrator.hide_emitters, self.transmittance)
+
+    def _part(self, medium) -> Part:
+        found = self.effects
+        table = self.lights.table(medium.frame)
+        if not found.lit or not found.needs_visibility:
+            return Part(medium, table, None, None)
+        options = visibility.options(self.integrator)
+        drawn = lights.method_for_drawn(found.visibility)
+        mapped = visibility.build(found.visibility, medium, table, options)
+        if drawn == found.visibility:
+            return Part(medium, table, mapped, mapped)
+        return Part(medium, table, mapped, visibility.build(drawn, medium, table, options))
+
+    def transmittance(self, p, d, distance, active):
+        """What the fields let through from scene point `p` along `d`, as far as `distance`."""
+        tau = mi.Float(1)
+        for part in self.parts:
+            if part.drawn:
+                tau = tau * _tau(part.frame, part.drawn, p, d, distance, mi.UInt32(0), active)
+        return tau
+
+    def strands(self, ray, parts):
+        """``(strands, unit, step)`` of scene rays through `parts`: t counts in `unit`, scene lengths."""
+        unit = parts[0].frame.length
+        several = len(parts) > 1
+        result = [
+            march.Strand(
+                p.source.density,
+                p.medium.field.grid,
+                p.frame.point_to_field(ray.o),
+                p.frame.direction_to_field(ray.d),
+                dr.opaque(mi.Float, unit / p.frame.length) if several else None,
+            )
+            for p in parts
+        ]
+        finest = min(p.frame.length for p in parts) / unit
+        return result, unit, dr.opaque(mi.Float, finest * 2 / self.integrator.samples)
+
+    def fly(self, ray, maxt, offset, depth, which):
+        """:func:`mi_ntf.infer.march.free_flight` of scene rays through all fields."""
+        strands, unit, step = self.strands(ray, self.parts)
+        hit, t, index = march.free_flight(strands, maxt / unit, step, offset, depth, which)
+        return hit, t * unit, index
+
+    def reflect(self, part: Part, points, stream, view=None):
+        """Radiance that `points` of `part` reflect from all lights; `view`: their transmittance, if lights share it."""
+        total = [dr.zeros(mi.Float, dr.width(points.x[0])) for _ in range(3)]
+        for source, mapped in self.lights.sources(part.table, part.frame, points, stream):
+            shadow = Known(view) if view is not None else self._shadow(part, "mapped" if mapped else "drawn")
+            light = shade.reflect(points, source, shadow, self.effects.specular)
+            total = [a + b for a, b in zip(total, light, strict=True)]
+        return total
+
+    def _shadow(self, part: Part, kind: str):
+        own = getattr(part, kind)
+        others = [(p.frame, getattr(p, kind)) for p in self.parts if p is not part]
+        return Shadow(part.frame, own, others, self.surfaces) if own and (others or self.surfaces) else own
+
+    def trace(self, ray, sampler, stream):
+        """``(radiance, opacity)`` of camera rays."""
+        n, found = dr.width(ray.o), self.effects
+        total = [dr.zeros(mi.Float, n) for _ in range(3)]
+        hit = None
+        if self.surfaces:
+            hit = self.surfaces.first(ray)
+            dr.eval(hit)
+        transmittance = dr.ones(mi.Float, n)
+        offset, depth = sampler.next_1d(), sampler.next_1d()
+        if self.in_view:
+            transmittance = self._fields(ray, hit, offset, depth, total, stream)
+        if self.surfaces or found.bounces:
+            self._bounces(ray, hit, transmittance, offset, total, stream)
+        opacity = 1 - transmittance
+        radiance = mi.Color3f(*total)
+        missed = True
+        if hit is not None:
+            missed = ~hit.is_valid()
+            opacity = dr.select(missed, opacity, 1)
+        if found.background:
+            si = dr.zeros(mi.SurfaceInteraction3f, n)
+            si.wi = -ray.d
+            radiance += dr.select(missed, transmittance, 0) * self.scene.environment().eval(si)
+            opacity = dr.ones(mi.Float, n)
+        return radiance, opacity
+
+    def _fields(self, ray, hit, offset, depth, total, stream):
+        """Adds the light that fields scatter once; returns the transmittance of the rays."""
+        found = self.effects
+        strands, unit, step = self.strands(ray, self.in_view)
+        maxt = dr.minimum(ray.maxt, hit.t) if hit is not None else ray.maxt
+        samples = march.camera_samples(
+            strands, maxt / unit, step, offset, depth, shade=found.lit, view=found.collocated
+        )
+        for part, strand, weight in zip(self.in_view, strands, samples.weights, strict=True):
+            index, t, view = samples.ray, samples.t, samples.view
+            if len(strands) > 1:
+                kept = dr.compress(weight > 0)
+                index, t, weight = (dr.gather(type(a), a, kept) for a in (index, t, weight))
+                view = dr.gather(mi.Float, view, kept) if view is not None else None
+            if not dr.width(index):
+                continue
+            t = t if strand.rate is None else t * strand.rate
+            along = tuple(dr.gather(mi.Float, c, index) for c in strand.d)
+            x = tuple(dr.gather(mi.Float, a, index) + t * b for a, b in zip(strand.o, along, strict=True))
+            points = shade.Points(x, tuple(-c for c in along), part.source.reflectance(x))
+            points.evaluate()
+            for channel, value in zip(total, self.reflect(part, points, stream, view), strict=True):
+                dr.scatter_reduce(dr.ReduceOp.Add, channel, value * weight, index)
+        return samples.transmittance
+
+    def _bounces(self, ray, hit, transmittance, offset, total, stream):
+        """Adds the light of surfaces that the camera sees, and of paths of more than one bounce."""
+        n = dr.width(ray.o)
+        walk = Walk(self, self.integrator.max_depth, total, stream)
+        rng = mi.PCG32(n, mi.UInt64(stream), dr.arange(mi.UInt64, n))
+        camera = Paths(mi.Ray3f(ray), mi.Color3f(transmittance), dr.arange(mi.UInt32, n), mi.Float(-1), rng)
+        if hit is not None:
+            si = hit.compute_surface_interaction(mi.Ray3f(ray))
+            if self.surfaces.shining:
+                walk.add(camera, si.emitter(self.scene).eval(si, hit.is_valid()))
+            if self.effects.lit:
+                self._surface_paths(walk, camera, si, hit)
+        if self.effects.bounces and self.in_view:
+            self._field_paths(walk, camera, hit, transmittance, offset)
+
+    def _surface_paths(self, walk, camera, si, hit):
+        """Direct light on the surfaces that the camera sees, and what comes after."""
+        onward = walk.on_surface(camera, si)
+        if self.effects.bounces or self.surfaces.lights_can_be_hit:
+            walk.run(onward.take(dr.compress(hit.is_valid() & (dr.max(onward.weight) > 0))))
+
+    def _field_paths(self, walk, camera, hit, transmittance, offset):
+        """Paths that a camera ray's matter scatters on: one collision, drawn among those that stop the ray."""
+        u = [camera.rng.next_float32() for _ in range(2)]
+        maxt = camera.ray.maxt if hit is None else dr.minimum(camera.ray.maxt, hit.t)
+        stopped, t, which = self.fly(camera.ray, maxt, offset, -dr.log(1 - u[0] * (1 - transmittance)), u[1])
+        camera = replace(camera, weight=mi.Color3f(1 - transmittance))
+        dr.eval(stopped, t, which, camera.weight, camera.rng.state)
+        for i, part in enumerate(self.parts):
+            index = dr.compress(stopped & (which == i) & (transmittance < 1))
+            if dr.width(index):
+                walk.run(walk.in_field(part, camera.take(index), dr.gather(mi.Float, t, index), 2))

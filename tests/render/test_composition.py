@@ -1,0 +1,196 @@
+"""Several fields, surfaces and depths in one scene: against stock ``volpath`` and against closed forms."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers import fields, scenes, ztest
+
+import mi_ntf.render
+from mi_ntf.core import field_file, microfacet, ops
+from mi_ntf.core.architecture import Similarity
+
+SEEDS = 4
+TURN = [-1.4, -0.6, 1.2]
+
+
+@pytest.fixture(autouse=True)
+def plugins(variant):
+    mi_ntf.render.register()
+
+
+@pytest.fixture(scope="module")
+def blobs(tmp_path_factory):
+    return scenes.write_blobs(tmp_path_factory.mktemp("field"), log_density=3.0)
+
+
+def nrf(visibility="raymarch", **options):
+    return {"type": "nrf", "visibility": visibility, **options}
+
+
+def room(field, floor=None, lamp=False) -> dict:
+    """Beside the object of `scenes.scene`: itself once more, half as large, turned, and maybe a floor, a ball, a
+    lamp."""
+    to_world, centre = mi.ScalarTransform4f, list(scenes.SIMILARITY.center)
+    place = to_world().translate(TURN).rotate([0, 1, 0], 120)
+    shapes = {
+        "small": {
+            "type": "sphere",
+            "to_world": place @ to_world().scale(0.5).translate(centre).scale(scenes.SIMILARITY.radius),
+            "bsdf": {"type": "null"},
+            "interior": {"type": "nrf", "filename": str(field), "to_world": place, "scale": 0.5},
+        }
+    }
+    if floor:
+        shapes["floor"] = {
+            "type": "rectangle",
+            "to_world": to_world().translate([centre[0], -1.5, centre[2]]).rotate([1, 0, 0], -90).scale(6),
+            "bsdf": floor,
+        }
+        shapes["pebble"] = {"type": "sphere", "center": [1.5, 0.4, 2.2], "radius": 0.4}
+    if lamp:
+        shapes["lamp"] = {
+            "type": "rectangle",
+            "to_world": to_world().look_at([2.5, 3.5, 1.5], centre, [0, 0, 1]).scale(0.7),
+            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [20, 18, 15]}},
+        }
+    return shapes
+
+
+DIFFUSE = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.7, 0.5, 0.3]}}
+METAL = {"type": "roughconductor", "alpha": 0.2}
+
+
+@pytest.mark.parametrize(
+    ("light", "floor", "lamp", "depth"),
+    [
+        ("point", DIFFUSE, False, 2),
+        (None, METAL, True, 2),  # light that a BSDF-sampled ray meets behind a field arrives dimmed
+        ("directional", METAL, False, 4),
+        pytest.param("env", METAL, False, 2, marks=pytest.mark.slow),
+        pytest.param(None, DIFFUSE, True, -1, marks=pytest.mark.slow),
+    ],
+)
+def test_agrees_with_volpath(blobs, light, floor, lamp, depth):
+    """Two fields of one file, floor and ball, every kind of shadow and bounce among them: z-test per 4×4 block, and
+    8×8 block means within 4 %, four times volpath's noise in them."""
+    options = {"light_samples": 2} if light in (None, "env") else {}
+    lights = {"light": scenes.light(light)} if light else {}
+
+    def renders(integrator, spp):
+        loaded = scenes.scene(
+            blobs, {**integrator, "max_depth": depth}, lights, spp=spp, size=24, shapes=room(blobs, floor, lamp)
+        )
+        return [scenes.render(loaded, seed) for seed in range(SEEDS)]
+
+    ours, theirs = renders(nrf(samples=1024, **options), 64), renders({"type": "volpath"}, 256)
+    ztest.check([i[..., :3] for i in ours], [i[..., :3] for i in theirs], f"room {light} {depth}", block=4)
+    difference = ztest.block_difference(np.mean(ours, 0)[..., :3], np.mean(theirs, 0)[..., :3], 8, floor=0.3)
+    assert difference.max() < 0.04
+    np.testing.assert_allclose(np.mean(ours, 0)[..., 3].mean(), np.mean(theirs, 0)[..., 3].mean(), rtol=0.01)
+
+
+# Two uniform balls that overlap, of unequal size, seen along −z: every transmittance is a chord.
+CENTRES, LENGTHS, SIGMAS = np.array([[-0.4, 0.0, 0.0], [0.7, 0.3, 0.4]]), np.array([1.0, 1.5]), np.array([0.8, 1.2])
+TOWARDS = np.array([0.6, 0.64, 0.48])
+
+
+def chord(p, d, centre, radius, length=np.inf):
+    """Length of the part of the rays p + t d, 0 < t < `length`, inside a ball."""
+    rel = p - centre
+    b = rel @ d
+    h = np.sqrt(np.maximum(b * b - (rel * rel).sum(-1) + radius**2, 0))
+    return np.clip(-b + h, 0, length) - np.clip(-b - h, 0, length)
+
+
+def overlap_by_quadrature(x, y, steps=1500):
+    """Single scattering by a midpoint rule along parallel view rays at (x, y), light of irradiance 1 from `TOWARDS`."""
+    view, total = np.array([0.0, 0.0, -1.0]), np.zeros((*x.shape, 3))
+    passed = np.zeros(x.shape)
+    dt = 5.0 / steps
+    for k in range(steps):
+        p = np.stack([x, y, np.full(x.shape, 2.5 - (k + 0.5) * dt)], -1)
+        inside = [((p - c) ** 2).sum(-1) < r * r for c, r in zip(CENTRES, LENGTHS, strict=True)]
+        sigma = [s / r * i for s, r, i in zip(SIGMAS, LENGTHS, inside, strict=True)]
+        light = sum(s / r * chord(p, TOWARDS, c, r) for s, c, r in zip(SIGMAS, CENTRES, LENGTHS, strict=True))
+        for centre, s in zip(CENTRES, sigma, strict=True):
+            n = (p - centre) / np.linalg.norm(p - centre, axis=-1, keepdims=True)
+            wi, wo = (tuple(np.full(x.shape, c) for c in v) for v in (TOWARDS, -view))
+            diffuse, gloss = microfacet.scattering(ops, wi, wo, tuple(np.moveaxis(n, -1, 0)), 0.5)
+            value = [0.8 * k * diffuse + 0.2 * gloss for k in (0.6, 0.5, 0.4)]
+            total += np.stack(value, -1) * (s * np.exp(-passed - 0.5 * sum(sigma) * dt - light) * dt)[..., None]
+        passed = passed + sum(sigma) * dt
+    return total, 1 - np.exp(-passed)
+
+
+@pytest.mark.parametrize("visibility", ["raymarch", "transmittance_map"])
+def test_overlapping_fields_against_quadrature(tmp_path, visibility):
+    """Densities add for the view, transmittances multiply for the light."""
+    media = {}
+    for i, (centre, length, sigma) in enumerate(zip(CENTRES, LENGTHS, SIGMAS, strict=True)):
+        path = tmp_path / f"{i}.safetensors"
+        field_file.save(path, *fields.uniform(sigma, similarity=Similarity(tuple(centre), length)), np.float32)
+        media[f"ball_{i}"] = {
+            "type": "sphere",
+            "center": list(centre),
+            "radius": length,
+            "bsdf": {"type": "null"},
+            "interior": {"type": "nrf", "filename": str(path), "resolution": 96},
+        }
+    view = mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0]).scale(2)
+    loaded = mi.load_dict({
+        "type": "scene",
+        "integrator": nrf(visibility),
+        "sensor": {"type": "orthographic", "to_world": view, "film": scenes.film(16),
+                   "sampler": {"type": "multijitter", "sample_count": 256}},
+        "sun": {"type": "directional", "direction": list(-TOWARDS)},
+        **media,
+    })  # fmt: skip
+    image = scenes.render(loaded)
+    # Pixels by their own 4×4 quadrature points; x to the right.
+    c = (np.arange(64) + 0.5) / 16 - 2
+    light, alpha = overlap_by_quadrature(*np.meshgrid(c, -c))
+    light, alpha = (v.reshape(16, 4, 16, 4, -1).mean((1, 3)) for v in (light, alpha))
+    np.testing.assert_allclose(image[..., 3:], alpha, atol=0.04)  # voxels of a field's 1/48 at the rims
+    # A field's voxels of 1/48 at the rims; that one logistic is no exponential makes most of the map's error.
+    tolerance = 0.02 if visibility == "raymarch" else 0.15
+    assert np.sqrt(((image[..., :3] - light) ** 2).mean() / (light**2).mean()) < tolerance
+
+
+def test_shapes_that_shine_and_what_hides_them(blobs):
+    """The lamp is seen with its radiance and covers; `hide_emitters` leaves it out, its light stays."""
+    shapes = {"lamp": {"type": "sphere", "center": [0.4, -0.2, 3.0], "radius": 0.3,
+                       "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [7, 6, 5]}}}}  # fmt: skip
+    options = {"size": 16, "spp": 64, "shapes": shapes}
+    shown, hidden, dark = (
+        scenes.render(scenes.scene(blobs, nrf(light_samples=4, **extra), {}, **options))
+        for extra in ({}, {"hide_emitters": True}, {"max_depth": 1})
+    )
+    lamp = (shown[..., :3] > 4.9).all(-1)
+    assert lamp.any()
+    np.testing.assert_allclose(shown[lamp], [[7, 6, 5, 1]] * lamp.sum(), rtol=1e-5)
+    np.testing.assert_allclose(dark[lamp], shown[lamp], rtol=1e-5)
+    assert (hidden[..., :3] < 4).all() and hidden[lamp][:, :3].min() > 0
+    others = (dark[..., :3] == 0).all(-1) & (shown[..., 3] > 0.5)
+    assert others.any() and (shown[others][:, :3] > 0).all()
+
+
+def test_a_shape_hides_the_field_behind_it(blobs):
+    """A black wall through the middle of the object: nothing of what lies behind it is seen, whatever the step."""
+    centre = scenes.SIMILARITY.center
+    wall = {"wall": {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate(list(centre)).scale(9),
+                     "bsdf": {"type": "diffuse", "reflectance": 0.0}}}  # fmt: skip
+    lights = {"light": scenes.light("point")}
+
+    def render(**options):
+        return scenes.render(scenes.scene(blobs, nrf(**options), lights, size=16, spp=256, shapes=wall))
+
+    fine, coarse = render(samples=2048), render(samples=96)
+    assert (fine[..., 3] == 1).all()
+    assert coarse[..., :3].mean() == pytest.approx(fine[..., :3].mean(), rel=0.02)
+
+
+def test_a_foreign_medium_is_refused(blobs):
+    fog = {"fog": {"type": "cube", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}, "id": "fog"}}
+    with pytest.raises(Exception) as caught:
+        scenes.render(scenes.scene(blobs, nrf(), {"light": scenes.light("point")}, size=8, spp=1, shapes=fog))
+    assert "bounds a medium that is no nrf medium" in str(caught.value.__cause__ or caught.value)
