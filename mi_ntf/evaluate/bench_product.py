@@ -101,7 +101,7 @@ class Gathers:
 
     def __init__(self, lights: int, m: int):
         self.m = dr.opaque(mi.UInt32, m)
-        self.values = dr.ones(mi.Float, lights * m * m * 2)
+        self.values = dr.opaque(mi.Float, 1, lights * m * m * 2)  # a literal would be folded into the kernel
 
     def tau(self, x, wi, distance, index, active):
         """The mean of the four pairs' first entries: 1."""

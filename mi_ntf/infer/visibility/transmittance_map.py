@@ -11,8 +11,6 @@ from types import ModuleType
 import drjit as dr
 import numpy as np
 
-from ...core import logistic
-from .. import ops
 from ..lights import LightTable
 from .light_rays import LightRays
 from .map_source import Source
@@ -56,8 +54,10 @@ class TransmittanceMap:
         mixtures = [self._fetch(texel, inside) for _, texel, _ in found]
         shifts = _shifts(mixtures, [weight for weight, _, _ in found], size)
         result = 0
-        for (weight, _, t), shift, parts in zip(found, shifts, mixtures, strict=True):
-            result += weight * sum(w * logistic.transmittance(ops, t + shift, a, b) for w, a, b in parts)
+        for k in range(len(mixtures[0])):
+            terms = [(weight * m[k][0], m[k][1] * (t + shift - m[k][2]))
+                     for (weight, _, t), shift, m in zip(found, shifts, mixtures, strict=True)]
+            result += _four_logistics(*terms)
         return dr.select(inside, dr.minimum(result, 1), 1)
 
     def _fetch(self, texel, active):
@@ -71,6 +71,15 @@ class TransmittanceMap:
         for k, part in enumerate(mix):
             row = self.dj.Array2f(*part[1:]) if self.width == 2 else self.dj.Array4f(*part, 0)
             dr.scatter(values, row, texel if self.width == 2 else texel * len(mix) + k)
+
+
+def _four_logistics(*terms):
+    """Σ w S(z) of four ``(w, z)`` by one division: S(z) = 1/(1 + e^−z), and the product of four denominators is finite
+    for z ≥ −20, where S is 2e-9."""
+    w = [weight for weight, _ in terms]
+    e = [1 + dr.exp(-dr.clip(z, -20, 20)) for _, z in terms]
+    p, q = e[0] * e[1], e[2] * e[3]
+    return ((w[0] * e[1] + w[1] * e[0]) * q + (w[2] * e[3] + w[3] * e[2]) * p) * dr.rcp(p * q)
 
 
 def _shifts(mixtures, weights, size):
