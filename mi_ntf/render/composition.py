@@ -13,10 +13,12 @@ from .walk import Paths, Walk
 
 @dataclass(frozen=True)
 class Part:
-    """One ``nrf`` medium prepared for a render: lights in its field coordinates; visibility of the table's lights and
-    of drawn ones and any other rays (None: no shadows)."""
+    """One ``nrf`` medium prepared for a render: lights in its field coordinates, all of them (`lights`) and those of
+    the present run (`table`); visibility of the table's lights and of drawn ones and any other rays (None: no
+    shadows)."""
 
     medium: object
+    lights: object
     table: object
     mapped: object
     drawn: object
@@ -72,25 +74,44 @@ class Composition:
         media = effects.find_media(scene)
         self.lights = lights.Lights(scene, media, integrator.light_samples, integrator.environment_lights)
         self.effects = effects.describe(scene, integrator, sensor, spp, media, self.lights)
-        self.parts = [self._part(m) for m in media if m.field.grid.majorant > 0]
-        seen = [m for m, visible in zip(media, self.effects.in_view, strict=True) if visible]
-        self.in_view = [p for p in self.parts if p.medium in seen]
+        self._media = [m for m in media if m.field.grid.majorant > 0]
+        self._seen = [m for m, visible in zip(media, self.effects.in_view, strict=True) if visible]
+        self.runs, self.run = self._runs(), None
+        self.select(0)
         self.surfaces = None
         if self.effects.surfaces:
             shapes = effects.ordinary_shapes(scene)
             self.surfaces = Surfaces(scene, shapes, integrator.hide_emitters, self.transmittance)
 
+    def _runs(self) -> list:
+        """Runs of the table's lights, (first, last), whose maps fit into memory together."""
+        found = self.effects
+        if not self._media or not found.lit or not found.needs_visibility:
+            return [None]
+        table = self.lights.table(self._media[0].frame)
+        return visibility.parts(found.visibility, self._media, table, visibility.options(self.integrator))
+
+    def select(self, run: int) -> None:
+        """Prepare the lights of run `run`: the first adds all else that shines as well, later ones these lights alone,
+        where fields scatter them once. Further bounces march towards all lights in the first run."""
+        if run == self.run:
+            return
+        self.run, self.parts, self.in_view = run, [], []  # lets go of the maps before others are made
+        self.parts = [self._part(m) for m in self._media]
+        self.in_view = [p for p in self.parts if p.medium in self._seen]
+
     def _part(self, medium) -> Part:
         found = self.effects
-        table = self.lights.table(medium.frame)
+        whole = self.lights.table(medium.frame)
         if not found.lit or not found.needs_visibility:
-            return Part(medium, table, None, None)
+            return Part(medium, whole, whole, None, None)
+        table = whole.part(*self.runs[self.run]) if len(self.runs) > 1 else whole
         options = visibility.options(self.integrator)
         drawn = lights.method_for_drawn(found.visibility)
         mapped = visibility.build(found.visibility, medium, table, options)
         if drawn == found.visibility:
-            return Part(medium, table, mapped, mapped)
-        return Part(medium, table, mapped, visibility.build(drawn, medium, table, options))
+            return Part(medium, whole, table, mapped, mapped)
+        return Part(medium, whole, table, mapped, visibility.build(drawn, medium, table, options))
 
     def transmittance(self, p, d, distance, active):
         """What the fields let through from scene point `p` along `d`, as far as `distance`."""
@@ -127,6 +148,8 @@ class Composition:
         """Radiance that `points` of `part` reflect from all lights; `view`: their transmittance, if lights share it."""
         total = [dr.zeros(mi.Float, dr.width(points.x[0])) for _ in range(3)]
         for source, mapped in self.lights.sources(part.table, part.frame, points, stream):
+            if self.run and not mapped:
+                continue
             shadow = Known(view) if view is not None else self._shadow(part, "mapped" if mapped else "drawn")
             light = shade.reflect(points, source, shadow, self.effects.specular)
             total = [a + b for a, b in zip(total, light, strict=True)]
@@ -149,7 +172,7 @@ class Composition:
         offset, depth = sampler.next_1d(), sampler.next_1d()
         if self.in_view:
             transmittance = self._fields(ray, hit, offset, depth, total, stream)
-        if self.surfaces or found.bounces:
+        if (self.surfaces or found.bounces) and not self.run:
             self._bounces(ray, hit, transmittance, offset, total, stream)
         opacity = 1 - transmittance
         radiance = mi.Color3f(*total)
@@ -157,7 +180,7 @@ class Composition:
         if hit is not None:
             missed = ~hit.is_valid()
             opacity = dr.select(missed, opacity, 1)
-        if found.background:
+        if found.background and not self.run:
             si = dr.zeros(mi.SurfaceInteraction3f, n)
             si.wi = -ray.d
             radiance += dr.select(missed, transmittance, 0) * self.scene.environment().eval(si)
@@ -191,7 +214,9 @@ class Composition:
 
     def _bounces(self, ray, hit, transmittance, offset, total, stream):
         """Adds the light of surfaces that the camera sees, and of paths of more than one bounce."""
-        n = dr.width(ray.o)
+        n, parts = dr.width(ray.o), self.parts
+        if len(self.runs) > 1:
+            self.parts = [replace(p, table=p.lights, mapped=p.drawn) for p in parts]
         walk = Walk(self, self.integrator.max_depth, total, stream)
         rng = mi.PCG32(n, mi.UInt64(stream), dr.arange(mi.UInt64, n))
         camera = Paths(mi.Ray3f(ray), mi.Color3f(transmittance), dr.arange(mi.UInt32, n), mi.Float(-1), rng)
@@ -203,6 +228,7 @@ class Composition:
                 self._surface_paths(walk, camera, si, hit)
         if self.effects.bounces and self.in_view:
             self._field_paths(walk, camera, hit, transmittance, offset)
+        self.parts = parts
 
     def _surface_paths(self, walk, camera, si, hit):
         """Direct light on the surfaces that the camera sees, and what comes after."""

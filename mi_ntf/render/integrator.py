@@ -1,5 +1,6 @@
 """The ``nrf`` integrator."""
 
+import itertools
 import time
 
 import drjit as dr
@@ -34,6 +35,11 @@ def integrator_class() -> type:
         environment_lights  integer most directional lights that stand for an environment (default: 512)
         map_resolution      integer texels per side of a light's transmittance map (default: 128)
         map_source          string  ``field``: marched once per texel; ``network``: one query per texel (default: field)
+        map_components      integer logistics per texel of a marched map, 1 or 2: two err less on maps of 256² or more
+                                    and on what is not opaque, and take four times the memory (default: 1)
+        map_memory          float   MiB that maps or volumes may take: more lights are rendered in several runs
+                                    (default: 1024)
+        map_file            string  EXR of ``mi-ntf bake`` that holds the maps (default: none)
         max_depth           integer longest path in edges: 1 shows emitters alone, 2 is single scattering, more is
                                     multiple scattering in fields and between surfaces, −1 has no limit and ends paths
                                     by Russian roulette from depth 5 on (default: 2)
@@ -61,6 +67,9 @@ def integrator_class() -> type:
             self.light_samples = _whole(props, "light_samples", 0, 0, 65536)
             self.environment_lights = _whole(props, "environment_lights", 512, 1, 65536)
             self.map_resolution = _whole(props, "map_resolution", 128, 4, 4096)
+            self.map_components = _whole(props, "map_components", 1, 1, 2)
+            self.map_memory = float(props.get("map_memory", 1024.0))
+            self.map_file = props.get("map_file", "")
             self.max_depth = _whole(props, "max_depth", 2, -1, 1 << 20)
             props["timeout"] = -1.0
             mi.SamplingIntegrator.__init__(self, props)
@@ -74,6 +83,8 @@ def integrator_class() -> type:
                 f"NRFIntegrator[\n  visibility = {self.visibility},\n  samples = {self.samples},\n"
                 f"  light_samples = {self.light_samples},\n  environment_lights = {self.environment_lights},\n"
                 f"  map_resolution = {self.map_resolution},\n  map_source = {self.map_source},\n"
+                f"  map_components = {self.map_components},\n  map_memory = {self.map_memory},\n"
+                f"  map_file = {self.map_file},\n"
                 f"  max_depth = {self.max_depth},\n"
                 f"  hide_emitters = {self.hide_emitters},\n  timeout = {self.timeout}\n]"
             )
@@ -111,10 +122,12 @@ def _render(self, scene, sensor, seed: int, spp: int, develop: bool):
     block = film.create_block()
     block.set_offset(film.crop_offset())
     per_chunk = max(1, CHUNK // spp)
-    for first in range(0, pixels, per_chunk):
+    # Lights in runs whose maps fit into memory, and for each the same camera rays.
+    for run, first in itertools.product(range(len(composition.runs)), range(0, pixels, per_chunk)):
         if self.should_stop() or (self.timeout > 0 and time.monotonic() - start > self.timeout):
             mi.Log(mi.LogLevel.Warn, f"nrf integrator: stopped after {first} of {pixels} pixels")
             break
+        composition.select(run)
         count = min(per_chunk, pixels - first)
         # Another stream for each chunk and seed; opaque, so that no seed is compiled into a kernel.
         stream = mi.sample_tea_32(_opaque(seed), dr.opaque(mi.UInt32, first))[0]
@@ -124,7 +137,9 @@ def _render(self, scene, sensor, seed: int, spp: int, develop: bool):
         radiance, opacity = composition.trace(ray, sampler, stream)
         value = radiance * weight
         channels = (
-            [value.x, value.y, value.z] + ([opacity] if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else []) + [1.0]
+            [value.x, value.y, value.z]
+            + ([0.0 if run else opacity] if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else [])
+            + [0.0 if run else 1.0]
         )
         block.put(position, [mi.Float(c) for c in channels])
         dr.eval(block.tensor())

@@ -15,6 +15,7 @@ from mi_ntf import cli
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.infer.lights import LightTable
 from mi_ntf.render import bake, effects, map_cache, visibility
+from mi_ntf.render import lights as lights_module
 
 WHERE = np.array([[0.48, 0.6, 0.64], [1.5, 1.0, 2.0], [0.1, 0.5, -0.1]])
 IS_POINT = np.array([False, True, True])
@@ -192,3 +193,49 @@ def test_bake_command(path, tmp_path, capsys):
     assert 300 < parts[0].channels["b"].pixels.size <= 400
     assert cli.main(["bake", str(scene), "-o", str(tmp_path / "no" / "maps.exr")]) == 1
     assert "folder" in capsys.readouterr().err
+
+
+def test_lights_in_runs_give_the_same_picture(path):
+    """Maps of one light at a time, with a drawn light, a surface and the environment behind: nothing counts twice."""
+    lights = {
+        "sun": scenes.light("directional"),
+        "lamp": scenes.light("point"),
+        "sky": {"type": "constant", "radiance": 0.1},
+        "panel": {"type": "rectangle", "emitter": {"type": "area", "radiance": 2.0},
+                  "to_world": mi.ScalarTransform4f().translate([0.4, 3.0, 0.3]).rotate([1, 0, 0], 90)},
+    }
+    floor = {"floor": {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0.4, -1.9, 0.3])
+                       .rotate([1, 0, 0], -90).scale(3)}}
+
+    def render(memory, **options):
+        nrf = {"type": "nrf", "visibility": "transmittance_map", "map_resolution": 16, "environment_lights": 4,
+               "samples": 128, "map_memory": memory, **options}
+        return scenes.render(scenes.scene(path, nrf, lights, shapes=floor, size=16, spp=4, medium={"resolution": 64}))
+
+    whole = render(1024.0)
+    assert whole[..., :3].mean() > 0.1
+    np.testing.assert_allclose(render(0.0025), whole, atol=2e-5)
+    # Two runs or more bounce by the march: maps of 16² differ from it by some per cent of the second bounce.
+    many, one = render(0.008, max_depth=3), render(1024.0, max_depth=3)
+    np.testing.assert_allclose(many[..., 3], one[..., 3], atol=1e-6)
+    assert many[..., :3].mean() == pytest.approx(one[..., :3].mean(), rel=0.02)
+
+
+def test_scene_names_its_map_file(path, tmp_path):
+    """The integrator's property; a file for another scene is refused, with both named."""
+    lights = {"sun": scenes.light("directional")}
+
+    def scene(**options):
+        nrf = {"type": "nrf", "visibility": "transmittance_map", "map_resolution": 16, "samples": 128, **options}
+        return scenes.scene(path, nrf, lights, size=16, spp=2, medium={"resolution": 64})
+
+    plain = scene()
+    (medium,) = effects.find_media(plain)
+    options = visibility.options(plain.integrator())
+    rows = lights_module.Lights(plain, [medium], 0, 512).table(medium.frame)
+    bake.write(tmp_path / "maps.exr", medium, rows, options, [build(medium, rows, options)])
+    np.testing.assert_array_equal(scenes.render(scene(map_file=str(tmp_path / "maps.exr"))), scenes.render(plain))
+    lights["sun"]["direction"] = [0, -1, 0]
+    with pytest.raises(Exception) as caught:
+        scenes.render(scene(map_file=str(tmp_path / "maps.exr")))
+    assert "light 0: where is [" in str(caught.value.__cause__ or caught.value)
