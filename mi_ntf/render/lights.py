@@ -1,5 +1,7 @@
 """The scene's emitters as lights of the field: which are rows of a table, which are drawn by Mitsuba's sampling."""
 
+from contextlib import contextmanager
+
 import mitsuba as mi
 import numpy as np
 
@@ -23,6 +25,8 @@ KINDS = {
 """Mitsuba's class name → plugin name."""
 DISCRETE = ("point", "spot", "directional", "envmap", "constant", "sunsky")
 """Those that become rows of a table."""
+SINGLE = ("point", "spot", "directional")
+"""Those that become one row."""
 
 
 class Lights:
@@ -39,7 +43,8 @@ class Lights:
     """
 
     def __init__(self, scene, media=(), light_samples: int = 0, environment_lights: int = 512):
-        emitters = [unwrap(e, scene, media) for e in scene.emitters()]
+        self._wrapped: list = []
+        emitters = [self._unwrap(e, scene, media) for e in scene.emitters()]
         self.kinds = [kind(e) for e in emitters]
         self.light_samples = light_samples
         discrete = [(e, k) for e, k in zip(emitters, self.kinds, strict=True) if not light_samples and is_discrete(e)]
@@ -47,6 +52,27 @@ class Lights:
         pairs = [(e, w) for e, w in zip(emitters, scene.emitters(), strict=True) if light_samples or not is_discrete(e)]
         self.sampled = [e for e, _ in pairs if _shines(e)]
         self._weights = [outer.sampling_weight() for e, outer in pairs if _shines(e)]
+
+    def _unwrap(self, emitter, scene, media):
+        """What an ``ntf`` emitter wraps, where its medium is one of `media`; any other emitter itself."""
+        while any(_same(getattr(emitter, "medium", None), m) for m in media):
+            self._wrapped.append(emitter)
+            emitter = emitter.attached()
+            # Nobody else tells a nested environment how large the scene is, and where its shadow rays end.
+            emitter.set_scene(scene)
+        return emitter
+
+    @contextmanager
+    def bare(self):
+        """Inside, ``scene.sample_emitter_direction`` and its kin see the light of ``ntf`` emitters without the shadows
+        that the integrator casts."""
+        for emitter in self._wrapped:
+            emitter.bare = True
+        try:
+            yield
+        finally:
+            for emitter in self._wrapped:
+                emitter.bare = False
 
     def table(self, frame: Frame) -> LightTable:
         """The discrete lights, in the field coordinates of `frame`."""
@@ -96,15 +122,6 @@ def _shines(emitter) -> bool:
         )
         return False
     return True
-
-
-def unwrap(emitter, scene, media):
-    """What an ``ntf`` emitter wraps, where its medium is one of `media`; any other emitter itself."""
-    while any(_same(getattr(emitter, "medium", None), m) for m in media):
-        emitter = emitter.inner
-        # Nobody else tells a nested environment how large the scene is, and where its shadow rays end.
-        emitter.set_scene(scene)
-    return emitter
 
 
 def _same(medium, other) -> bool:
