@@ -26,7 +26,7 @@ def read(path: Path, identity: str) -> dict | None:
     if not path.is_file():
         return None
     try:
-        data = torch.load(path, weights_only=True)
+        data = torch.load(path, map_location=torch.get_default_device(), weights_only=True)
         found, state = data["identity"], data["state"]
     except Exception as error:
         raise MiNtfError(f"{path} cannot be read ({error}); delete it to start anew") from None

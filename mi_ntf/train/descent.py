@@ -9,7 +9,7 @@ import torch
 from ..core.architecture import Header, Similarity
 from ..core.errors import MiNtfError
 from ..data.readers import load_dataset
-from . import monitor, networks, parallel, rays
+from . import device, monitor, networks, parallel, rays
 from .occupancy import Occupancy
 
 FIELD = ("density", "reflectance")
@@ -32,7 +32,7 @@ class Descent:
         self.config, self.minutes, self.steps = config, minutes or math.inf, steps or math.inf
         self.splits = load_dataset(dataset, monitor.note if parallel.first() else lambda _: None)
         self.rays = {name: rays.from_split(split, name) for name, split in self.splits.items()}
-        self.generator = torch.Generator().manual_seed(seed)
+        self.generator = device.generator(seed)
         self.nets = parallel.share(networks.initial(config.architecture, config.log_density, self.generator))
         target = self.rays["train"].target
         matter = target[target[:, 3] > 0.01]
@@ -70,7 +70,7 @@ class Descent:
                              "--field needs the data set that the field was trained on")
         for name, value in tensors.items():
             if name.split(".")[0] in FIELD:
-                self.nets.tensors[name].copy_(torch.from_numpy(value))
+                self.nets.tensors[name].copy_(torch.as_tensor(value))
         self.given = header.provenance
 
     def carve(self) -> None:

@@ -4,6 +4,7 @@ import math
 
 import torch
 
+from . import device
 from .networks import Networks
 from .occupancy import Occupancy, from_networks
 from .rays import Rays
@@ -47,7 +48,7 @@ def psnr(predicted: torch.Tensor, target: torch.Tensor, images: int) -> dict[str
 
 def score(networks: Networks, rays: Rays, images: int, step: float, cells: int = 128) -> dict[str, float]:
     """PSNR of a whole split, from the networks alone: what they put outside the visual hull is seen too."""
-    generator = torch.Generator().manual_seed(1)
+    generator = device.generator(1)
     occupancy = from_networks(networks, cells, CUT, generator)
     color, alpha, _ = render_all(networks, rays, occupancy, step, generator, passes=2)
     error = (alpha - rays.target[:, 3]).square().mean()

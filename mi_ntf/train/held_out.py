@@ -2,6 +2,7 @@
 
 import torch
 
+from . import device
 from .evaluate import CUT
 from .losses import tau
 from .marched import Marched, chords, uniform_directions
@@ -16,7 +17,7 @@ STEPS = 2048
 def score(networks: Networks, rays: Rays, count: int = 4096, chunk: int = 512) -> dict[str, float]:
     """``rms`` and ``bias`` of τ_nt against the field's own marched τ, on about `count` pairs of a shading point of the
     (held-out) `rays` and a light in a random direction. Empty where no ray sees matter."""
-    generator = torch.Generator().manual_seed(4)
+    generator = device.generator(4)
     marched = Marched()
     marched.update(networks, from_networks(networks, 96, CUT, generator))
     rays = rays[(rays.target[:, 3] > 0.5).nonzero()[:, 0]]

@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 
 from ..core.errors import MiNtfError
-from . import evaluate, losses, networks, occupancy, parallel
+from . import device, evaluate, losses, networks, occupancy, parallel
 from .config import HierarchicalConfig
 from .descent import FIELD, Descent, total
 from .marched import chords, random_chords
@@ -105,7 +105,7 @@ class Hierarchical(Descent):
         return self.nets.tensors | {f"coarse.{k}": v for k, v in self.coarse.tensors.items()}
 
     def occupied(self) -> occupancy.Occupancy:
-        generator = torch.Generator().manual_seed(3)
+        generator = device.generator(3)
         return occupancy.from_networks(self.nets, self.config.cells, evaluate.CUT, generator)
 
     def patches(self) -> Rays:

@@ -176,4 +176,4 @@ def from_tensors(architecture: Architecture, tensors: dict[str, np.ndarray], dty
 
 def to_tensors(networks: Networks) -> dict[str, np.ndarray]:
     """Arrays for :func:`mi_ntf.core.field_file.save`."""
-    return {k: v.detach().numpy() for k, v in networks.tensors.items()}
+    return {k: v.detach().cpu().numpy() for k, v in networks.tensors.items()}

@@ -14,6 +14,7 @@ from itertools import pairwise
 import torch
 import torch.distributed as dist
 
+from . import device
 from .networks import Networks
 
 
@@ -23,7 +24,7 @@ def processes() -> Iterator[None]:
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
         yield
         return
-    dist.init_process_group("gloo")
+    dist.init_process_group(device.backend())
     try:
         yield
     finally:

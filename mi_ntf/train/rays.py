@@ -42,10 +42,10 @@ def from_split(split: Split, name: str) -> Rays:
     origins, directions = pixel_rays(split.c2w, split.focal, width, height, split.principal)
     origins = (origins - split.center) / split.radius
     intensity = np.broadcast_to((split.light_intensity / split.radius**2)[:, None, None], (n, height, width, 3))
-    o, d, light = (torch.from_numpy(np.array(a, np.float32).reshape(-1, 3)) for a in
+    o, d, light = (torch.as_tensor(np.array(a, np.float32).reshape(-1, 3)) for a in
                    (origins, directions, intensity))
     t0, t1 = sphere_span(o, d)
-    return Rays(o, d, t0, t1, torch.from_numpy(split.images.reshape(-1, 4)), light)
+    return Rays(o, d, t0, t1, torch.as_tensor(split.images.reshape(-1, 4)), light)
 
 
 def sphere_span(o: torch.Tensor, d: torch.Tensor):

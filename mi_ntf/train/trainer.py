@@ -14,7 +14,7 @@ import torch
 from ..core import field_file
 from ..core.architecture import Header
 from ..core.errors import MiNtfError
-from . import checkpoint, evaluate, held_out, networks, parallel
+from . import checkpoint, device, evaluate, held_out, networks, parallel
 from .config import HierarchicalConfig, TrainConfig, configured, transmittance_alone
 from .descent import Descent
 from .hierarchical import Hierarchical
@@ -35,8 +35,8 @@ def train(dataset: Path, out: Path, *, preset: str = "fast", minutes: float | No
           seed: int = 0, tensorboard: Path | None = None, field: Path | None = None, **variant) -> dict:
     """Train a field on the photographs in `dataset` and write it to `out`. Returns the report (JSON types).
 
-    The run lasts `minutes` (10 unless told) or `steps`; runs given in steps are reproducible, bit for bit on one
-    machine. A checkpoint ``OUT.ckpt`` is written every minute, taken up by the same command, deleted at the end.
+    The run lasts `minutes` (10 unless told) or `steps`; runs given in steps are reproducible, bit for bit on one CPU.
+    A checkpoint ``OUT.ckpt`` is written every minute, taken up by the same command, deleted at the end.
     Faults (see :class:`mi_ntf.train.monitor.Fault`) are rolled back, listed in the report, and end the run when they
     keep coming. `tensorboard`: a folder for its events. `field`: a field file to keep as it is; its transmittance
     networks alone are trained, anew. `variant`: ablations, see :func:`config.configured`.
@@ -55,7 +55,7 @@ def train(dataset: Path, out: Path, *, preset: str = "fast", minutes: float | No
     limit = steps if steps is not None else 10.0 if minutes is None else minutes
     if not (limit > 0 and math.isfinite(limit)):
         raise MiNtfError(f"--{'minutes' if steps is None else 'steps'} is {limit:g}; it must be positive")
-    with parallel.processes():
+    with device.chosen(), parallel.processes():
         torch.set_num_threads(_threads() if steps is None and parallel.count() == 1 else 1)
         kind = _HierarchicalRun if isinstance(config, HierarchicalConfig) else _Run
         run = kind(Path(dataset), Path(out), config, preset,
@@ -156,7 +156,7 @@ class _Loop(Descent):
         split = self.splits["val"]
         count, shape = min(4, len(split.images)), split.images.shape[1:3]
         part = self.rays["val"][slice(0, count * shape[0] * shape[1])]
-        generator = torch.Generator().manual_seed(2)
+        generator = device.generator(2)
         color, _, normal = evaluate.render_all(self.nets, part, self.occupied(), self.config.step, generator)
         exact = evaluate.psnr(color, part.target[:, :3], count)["srgb"]
         entry = {"step": self.step, "psnr": round(exact, 2)}
@@ -209,7 +209,7 @@ class _Loop(Descent):
         for name, value in state["held"].items():
             setattr(self, name, value)
         self.watch.seen = state["watch"]
-        self.generator.set_state(state["random"])
+        self.generator.set_state(state["random"].cpu())
 
     def roll_back(self, fault: Fault) -> str:
         """Go back to the last good state with half the learning rates; says so. The generator goes on, so that the same

@@ -1,0 +1,29 @@
+"""Where training runs: on a GPU where PyTorch finds one, else on the CPU. ``CUDA_VISIBLE_DEVICES=`` keeps it off."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+
+
+@contextmanager
+def chosen() -> Iterator[None]:
+    """Make new tensors on the device of this process: GPU number LOCAL_RANK (0 outside ``torchrun``), or the CPU."""
+    if not torch.cuda.is_available():
+        yield
+        return
+    device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")) % torch.cuda.device_count())
+    torch.cuda.set_device(device)
+    with device:
+        yield
+
+
+def generator(seed: int) -> torch.Generator:
+    """A source of random numbers on the device of new tensors."""
+    return torch.Generator(torch.get_default_device()).manual_seed(seed)
+
+
+def backend() -> str:
+    """What processes of ``torchrun`` talk through."""
+    return "nccl" if torch.get_default_device().type == "cuda" else "gloo"
