@@ -55,12 +55,15 @@ class Lights:
 
     def _unwrap(self, emitter, scene, media):
         """What an ``ntf`` emitter wraps, where its medium is one of `media`; any other emitter itself."""
-        while any(_same(getattr(emitter, "medium", None), m) for m in media):
-            self._wrapped.append(emitter)
-            emitter = emitter.attached()
+        bare, inner = emitter, emitter
+        while hasattr(inner, "attached"):
+            outer, inner = inner, inner.attached()
             # Nobody else tells a nested environment how large the scene is, and where its shadow rays end.
-            emitter.set_scene(scene)
-        return emitter
+            inner.set_scene(scene)
+            if any(_same(outer.medium, m) for m in media):
+                self._wrapped.append(outer)
+                bare = inner if bare is outer else bare
+        return bare
 
     @contextmanager
     def bare(self):

@@ -172,3 +172,13 @@ def test_a_field_does_not_shadow_itself_twice(blobs, kind, options):
     emitter["medium"]["to_world"] = mi.ScalarTransform4f().translate([0, 0.4, -0.3])
     other = scenes.render(scenes.scene(blobs, integrator, elsewhere, size=12, spp=4), 3)
     assert other[..., :3].mean() < 0.9 * bare[..., :3].mean()
+
+
+def test_a_floor_beside_its_field_is_not_shadowed_twice(blobs):
+    """`nrf` on an ordinary surface: the ``ntf`` light through the scene's own field, and the bare one."""
+    integrator = {"type": "nrf", "visibility": "raymarch", "hide_emitters": True}
+    bare, wrapped = (
+        scenes.render(floor_scene(integrator, light("area", path), ROUGH, 8, **ball(blobs)), 3)
+        for path in (None, blobs)
+    )
+    np.testing.assert_allclose(wrapped, bare, rtol=1e-3, atol=1e-4)  # equal seeds draw equal lights
