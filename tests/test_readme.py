@@ -12,7 +12,8 @@ ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
 BLOCKS = dict(re.findall(r"```(\w+)\n(.*?)```", TEXT, re.S))
 COMMANDS = [line.split("#")[0].split() for line in TEXT.splitlines() if re.match(r"    (mi-ntf|mitsuba|make) ", line)]
-SMALLER = {"capture": "--views 12 --size 24 --test-views 1 --spp 2".split()}
+SMALLER = {"--minutes": "0.1", "--steps": "20", "--size": "24"}
+CAPTURE = {"--views": "12", "--size": "24", "--test-views": "1", "--spp": "2"}
 
 
 @pytest.fixture(scope="module")
@@ -56,9 +57,11 @@ def test_commands_in_their_order(folder):
         if words[0] == "make":  # they install, or run this suite
             assert re.search(rf"^{words[1]}:", (ROOT / "Makefile").read_text(), re.M)
             continue
-        if words[1] == "train":
-            words[words.index("--minutes") + 1] = "0.1"
-        extra = SMALLER.get(words[1], [])
+        for option, value in SMALLER.items():
+            if option in words:
+                words[words.index(option) + 1] = value
+        missing = {k: v for k, v in CAPTURE.items() if words[1] == "capture" and k not in words}
+        extra = [word for pair in missing.items() for word in pair]
         if words[0] == "mitsuba":
             # `$res` of the shipped scenes; a swapped one is small by itself.
             small = ["-D", "res=16"] if "scenes/" in words[-1] else []
