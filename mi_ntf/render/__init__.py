@@ -26,6 +26,7 @@ INTEGRATOR_PROPERTIES = (
     "map_components",
     "map_memory",
     "map_file",
+    "aovs",
     "hide_emitters",
     "timeout",
     "max_depth",

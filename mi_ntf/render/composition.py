@@ -160,8 +160,9 @@ class Composition:
         others = [(p.frame, getattr(p, kind)) for p in self.parts if p is not part]
         return Shadow(part.frame, own, others, self.surfaces) if own and (others or self.surfaces) else own
 
-    def trace(self, ray, sampler, stream):
-        """``(radiance, opacity)`` of camera rays."""
+    def trace(self, ray, sampler, stream, sums=None):
+        """``(radiance, opacity)`` of camera rays. `sums`: where other outputs are gathered
+        (:class:`mi_ntf.render.aovs.Sums`), None where nobody asks."""
         n, found = dr.width(ray.o), self.effects
         total = [dr.zeros(mi.Float, n) for _ in range(3)]
         hit = None
@@ -171,7 +172,7 @@ class Composition:
         transmittance = dr.ones(mi.Float, n)
         offset, depth = sampler.next_1d(), sampler.next_1d()
         if self.in_view:
-            transmittance = self._fields(ray, hit, offset, depth, total, stream)
+            transmittance = self._fields(ray, hit, offset, depth, total, stream, sums)
         if (self.surfaces or found.bounces) and not self.run:
             self._bounces(ray, hit, transmittance, offset, total, stream)
         opacity = 1 - transmittance
@@ -180,6 +181,10 @@ class Composition:
         if hit is not None:
             missed = ~hit.is_valid()
             opacity = dr.select(missed, opacity, 1)
+        if sums:
+            sums.add_opacity(opacity)
+            if hit is not None:
+                sums.add_surface(ray, hit, transmittance)
         if found.background and not self.run:
             si = dr.zeros(mi.SurfaceInteraction3f, n)
             si.wi = -ray.d
@@ -187,13 +192,14 @@ class Composition:
             opacity = dr.ones(mi.Float, n)
         return radiance, opacity
 
-    def _fields(self, ray, hit, offset, depth, total, stream):
+    def _fields(self, ray, hit, offset, depth, total, stream, sums):
         """Adds the light that fields scatter once; returns the transmittance of the rays."""
         found = self.effects
         strands, unit, step = self.strands(ray, self.in_view)
         maxt = dr.minimum(ray.maxt, hit.t) if hit is not None else ray.maxt
+        wanted = found.lit or bool(sums and sums.needs_points)
         samples = march.camera_samples(
-            strands, maxt / unit, step, offset, depth, shade=found.lit, view=found.collocated
+            strands, maxt / unit, step, offset, depth, shade=wanted, view=found.collocated
         )
         for part, strand, weight in zip(self.in_view, strands, samples.weights, strict=True):
             index, t, view = samples.ray, samples.t, samples.view
@@ -203,11 +209,16 @@ class Composition:
                 view = dr.gather(mi.Float, view, kept) if view is not None else None
             if not dr.width(index):
                 continue
-            t = t if strand.rate is None else t * strand.rate
+            distance, t = t * unit, t if strand.rate is None else t * strand.rate
             along = tuple(dr.gather(mi.Float, c, index) for c in strand.d)
             x = tuple(dr.gather(mi.Float, a, index) + t * b for a, b in zip(strand.o, along, strict=True))
             points = shade.Points(x, tuple(-c for c in along), part.source.reflectance(x))
             points.evaluate()
+            if sums:
+                shadow = Known(view) if view is not None else self._shadow(part, "mapped")
+                sums.add_field(part.frame, points, index, distance, weight, part.table, shadow)
+            if not found.lit:
+                continue
             for channel, value in zip(total, self.reflect(part, points, stream, view), strict=True):
                 dr.scatter_reduce(dr.ReduceOp.Add, channel, value * weight, index)
         return samples.transmittance
@@ -218,7 +229,9 @@ class Composition:
         if len(self.runs) > 1:
             self.parts = [replace(p, table=p.lights, mapped=p.drawn) for p in parts]
         walk = Walk(self, self.integrator.max_depth, total, stream)
-        rng = mi.PCG32(n, mi.UInt64(stream), dr.arange(mi.UInt64, n))
+        # Neighbouring sequences of one start are alike.
+        start, sequence = mi.sample_tea_32(stream, dr.arange(mi.UInt32, n))
+        rng = mi.PCG32(n, mi.UInt64(start), mi.UInt64(sequence))
         camera = Paths(mi.Ray3f(ray), mi.Color3f(transmittance), dr.arange(mi.UInt32, n), mi.Float(-1), rng)
         if hit is not None:
             si = hit.compute_surface_interaction(mi.Ray3f(ray))

@@ -8,6 +8,7 @@ import mitsuba as mi
 
 from ..core.errors import MiNtfError
 from ..infer.visibility import METHODS
+from . import aovs
 from .composition import Composition
 
 CHUNK = 1 << 18
@@ -43,6 +44,9 @@ def integrator_class() -> type:
         max_depth           integer longest path in edges: 1 shows emitters alone, 2 is single scattering, more is
                                     multiple scattering in fields and between surfaces, −1 has no limit and ends paths
                                     by Russian roulette from depth 5 on (default: 2)
+        aovs                string  further outputs, a comma-separated list of ``depth``, ``normal``, ``albedo``,
+                                    ``roughness``, ``opacity``, ``visibility``, ``visibility_lights``: see
+                                    :mod:`mi_ntf.render.aovs` (default: none)
         hide_emitters       boolean leave the environment and shapes that shine out of the picture (default: false)
         timeout             float   seconds after which rendering ends with what is there; below 0: never (default: -1)
         =================== ======= ===================================================================================
@@ -71,12 +75,19 @@ def integrator_class() -> type:
             self.map_memory = float(props.get("map_memory", 1024.0))
             self.map_file = props.get("map_file", "")
             self.max_depth = _whole(props, "max_depth", 2, -1, 1 << 20)
+            self.aovs = aovs.parse(props.get("aovs", ""))
+            self.lights_seen = 0
             props["timeout"] = -1.0
             mi.SamplingIntegrator.__init__(self, props)
 
         def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             return _render(self, scene, sensor, seed, spp, develop)
+
+        def aov_names(self):
+            """Of the last render: a layer for each light is known from then on."""
+            known = [name for name in self.aovs if name not in aovs.OF_LIGHTS or self.lights_seen]
+            return aovs.channel_names(tuple(known), self.lights_seen)
 
         def to_string(self):
             return (
@@ -85,7 +96,7 @@ def integrator_class() -> type:
                 f"  map_resolution = {self.map_resolution},\n  map_source = {self.map_source},\n"
                 f"  map_components = {self.map_components},\n  map_memory = {self.map_memory},\n"
                 f"  map_file = {self.map_file},\n"
-                f"  max_depth = {self.max_depth},\n"
+                f"  max_depth = {self.max_depth},\n  aovs = {', '.join(self.aovs)},\n"
                 f"  hide_emitters = {self.hide_emitters},\n  timeout = {self.timeout}\n]"
             )
 
@@ -118,7 +129,11 @@ def _render(self, scene, sensor, seed: int, spp: int, develop: bool):
     size = mi.ScalarVector2u(film.crop_size()) + (2 * film.rfilter().border_size() if film.sample_border() else 0)
     pixels = size.x * size.y
     composition = Composition(scene, self, sensor, spp)
-    film.prepare([])
+    picture = None
+    if self.aovs:
+        self.lights_seen = len(composition.lights.rows.power)
+        picture = aovs.Picture(film, self.aovs, self.lights_seen)
+    film.prepare(picture.names if picture else [])
     block = film.create_block()
     block.set_offset(film.crop_offset())
     per_chunk = max(1, CHUNK // spp)
@@ -134,15 +149,22 @@ def _render(self, scene, sensor, seed: int, spp: int, develop: bool):
         sampler.seed(stream, count * spp)
         pixel = dr.arange(mi.UInt32, count * spp) // dr.opaque(mi.UInt32, spp) + dr.opaque(mi.UInt32, first)
         ray, weight, position = _camera_rays(sensor, film, sampler, pixel, size.x)
-        radiance, opacity = composition.trace(ray, sampler, stream)
+        sums = picture and picture.sums(dr.width(ray.o), run, composition.runs[run])
+        with composition.lights.bare():
+            radiance, opacity = composition.trace(ray, sampler, stream, sums)
         value = radiance * weight
         channels = (
             [value.x, value.y, value.z]
             + ([0.0 if run else opacity] if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else [])
             + [0.0 if run else 1.0]
         )
+        if sums:
+            picture.put(position, sums)
+        channels += [0.0] * len(picture.names if picture else [])
         block.put(position, [mi.Float(c) for c in channels])
         dr.eval(block.tensor())
+    if picture:
+        picture.write_to(block)
     film.put_block(block)
     return film.develop() if develop else mi.TensorXf()
 

@@ -1,0 +1,201 @@
+"""Arbitrary output variables of the ``nrf`` integrator: what the camera's samples mean besides light.
+
+A pixel's value is the expectation over all its samples by their weights w, the share of the view that each stops:
+Σ w v / Σ w. What stops nothing has none, and the pixel is 0 there. Ordinary surfaces take part with the share that the
+fields in front of them let through.
+
+=================== ================ ==================================================================================
+name                channels         value
+=================== ================ ==================================================================================
+depth               T                distance along the camera ray from the near plane on, scene units
+normal              X, Y, Z          unit vector, scene coordinates
+albedo              R, G, B          diffuse albedo of surfaces, albedo of fields, linear RGB
+roughness           Y                of fields
+opacity             Y                1 − T: share of the view that ends on something
+visibility          Y                of fields: τ towards a light, mean over the lights of the table
+visibility_lights   0.Y, 1.Y, …      of fields: τ towards each light of the table
+=================== ================ ==================================================================================
+"""
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.errors import MiNtfError
+
+CHANNELS = {
+    "depth": ("T",), "normal": ("X", "Y", "Z"), "albedo": ("R", "G", "B"), "roughness": ("Y",), "opacity": ("Y",),
+    "visibility": ("Y",), "visibility_lights": (),
+}
+OF_FIELDS = ("roughness", "visibility", "visibility_lights")
+OF_LIGHTS = ("visibility", "visibility_lights")
+MAX_LIGHTS = 128
+"""Layers of ``visibility_lights``: each is a float a camera ray in flight."""
+
+
+def parse(text: str) -> tuple[str, ...]:
+    """The names of a comma-separated list. Raises MiNtfError on unknown and repeated ones."""
+    names = tuple(word for word in (w.strip() for w in text.split(",")) if word)
+    for name in names:
+        if name not in CHANNELS:
+            raise MiNtfError(f'nrf integrator: aovs has "{name}", expected some of {", ".join(CHANNELS)}')
+        if names.count(name) > 1:
+            raise MiNtfError(f'nrf integrator: aovs has "{name}" twice; name each once')
+    return names
+
+
+def channel_names(wanted: tuple[str, ...], lights: int) -> list[str]:
+    """Names of the film's extra channels, in order, with `lights` lights in the table."""
+    if "visibility_lights" in wanted and not 0 < lights <= MAX_LIGHTS:
+        raise MiNtfError(
+            f"aovs=visibility_lights needs 1 to {MAX_LIGHTS} lights that are points or directions, this scene has "
+            f'{lights}; ask for "visibility", their mean, or set environment_lights to {MAX_LIGHTS} at most'
+        )
+    if "visibility" in wanted and not lights:
+        raise MiNtfError(
+            "aovs=visibility needs lights that are points or directions, this scene has none (light_samples draws "
+            "lights instead: set it to 0)"
+        )
+    return [f"{name}.{channel}" for name in wanted for channel in _channels(name, lights)]
+
+
+def _channels(name: str, lights: int) -> tuple[str, ...]:
+    return tuple(f"{i}.Y" for i in range(lights)) if name == "visibility_lights" else CHANNELS[name]
+
+
+class Sums:
+    """Σ w v and Σ w of `rays` camera rays, for the `wanted` names and `lights` lights in all.
+
+    `first`, `later`: where a run of the lights begins, and whether it is not the first: then the same rays have been
+    here before, and add the visibility of these lights alone.
+    """
+
+    def __init__(self, wanted: tuple[str, ...], lights: int, rays: int, first: int = 0, later: bool = False):
+        self.wanted, self.lights, self.rays, self.first, self.later = wanted, lights, rays, first, later
+        self.sums = {n: [dr.zeros(mi.Float, rays) for _ in _channels(n, lights)]
+                     for n in wanted if n not in ("opacity", "visibility_lights")}
+        self.layers = dr.zeros(mi.Float, rays * lights) if "visibility_lights" in wanted else None
+        self.opacity, self.stopped, self.stopped_by_fields = (dr.zeros(mi.Float, rays) for _ in range(3))
+
+    @property
+    def needs_points(self) -> bool:
+        """Whether there is more to know than what :meth:`add_opacity` is told."""
+        return any(name != "opacity" for name in self.wanted)
+
+    def add_field(self, frame, points, index, t, weight, table, shadow) -> None:
+        """Shading `points` (field coordinates of `frame`) of rays `index`, `t` scene units from their origins.
+        `table`: the lights of this run, `shadow`: their visibility method, None: nothing is dimmed."""
+        if any(name in self.wanted for name in OF_LIGHTS):
+            tau = self._visibility(points, index, weight, table, shadow)
+            if "visibility" in self.sums:
+                self._add(self.sums["visibility"], [tau], index, weight)
+        if self.later:
+            return
+        values = {"depth": lambda: [t], "normal": lambda: frame.direction_to_world(points.normal),
+                  "albedo": lambda: points.albedo, "roughness": lambda: [points.roughness]}
+        for name in values.keys() & self.sums.keys():
+            self._add(self.sums[name], values[name](), index, weight)
+        self._add([self.stopped, self.stopped_by_fields], [1, 1], index, weight)
+
+    def add_opacity(self, opacity) -> None:
+        """Share of each ray that ends on something."""
+        if not self.later:
+            self.opacity = opacity
+
+    def add_surface(self, ray, hit, transmittance) -> None:
+        """What lies behind the fields: preliminary intersections `hit` of the rays; `transmittance` of the fields
+        before them."""
+        if self.later:
+            return
+        si, hit = hit.compute_surface_interaction(mi.Ray3f(ray)), hit.is_valid()
+        weight = dr.select(hit, transmittance, 0)
+        values = {"depth": lambda: [si.t], "normal": lambda: si.sh_frame.n,
+                  "albedo": lambda: si.bsdf().eval_diffuse_reflectance(si, hit)}
+        for name in values.keys() & self.sums.keys():
+            self.sums[name] = [total + dr.select(hit, value, 0) * weight
+                               for total, value in zip(self.sums[name], values[name](), strict=True)]
+        self.stopped = self.stopped + weight
+
+    def _add(self, sums, values, index, weight) -> None:
+        for total, value in zip(sums, values, strict=True):
+            dr.scatter_reduce(dr.ReduceOp.Add, total, weight * value, index)
+
+    def _visibility(self, points, index, weight, table, shadow):
+        """Σ of the table's lights of τ at `points`, over the number of all; each one's, times `weight`, goes to its
+        layer."""
+        everything, count, first = (dr.opaque(mi.UInt32, n) for n in (self.lights, table.count, self.first))
+
+        def body(i, total):
+            wi, _, distance = table.sample(i, points.x, True)
+            tau = shadow.tau(points.x, wi, distance, i, mi.Bool(True)) if shadow else mi.Float(1)
+            if self.layers is not None:
+                dr.scatter_reduce(dr.ReduceOp.Add, self.layers, weight * tau, index * everything + first + i)
+            return i + 1, total + tau
+
+        n = dr.width(points.x[0])
+        state = (dr.zeros(mi.UInt32, n), dr.zeros(mi.Float, n))
+        _, total = dr.while_loop(state=state, cond=lambda i, total: i < count, body=body, label="visibility")
+        return total / mi.Float(everything)
+
+    def values(self) -> list:
+        """Σ w v of every channel, in the order of :func:`channel_names`, then Σ w of all and Σ w of fields."""
+        ray = dr.arange(mi.UInt32, self.rays)
+        count = dr.opaque(mi.UInt32, self.lights)
+        found = []
+        for name in self.wanted:
+            if name == "opacity":
+                found.append(self.opacity)
+            elif name == "visibility_lights":
+                found += [dr.gather(mi.Float, self.layers, ray * count + dr.opaque(mi.UInt32, i))
+                          for i in range(self.lights)]
+            else:
+                found += self.sums[name]
+        return [*found, self.stopped, self.stopped_by_fields]
+
+
+class Picture:
+    """Sums over pixels, beside the film's own block, until each pixel's expectation can be taken."""
+
+    def __init__(self, film, wanted: tuple[str, ...], lights: int):
+        self.wanted, self.lights = wanted, lights
+        self.names = channel_names(wanted, lights)
+        self.block = mi.ImageBlock(film.crop_size(), film.crop_offset(), len(self.names) + 2, film.rfilter())
+
+    def sums(self, rays: int, run: int, lights: tuple[int, int] | None) -> Sums | None:
+        """For camera rays lit by the run `run` of lights (first, last), None: all of them; None where a later run has
+        nothing to add."""
+        if run and not any(name in self.wanted for name in OF_LIGHTS):
+            return None
+        return Sums(self.wanted, self.lights, rays, lights[0] if lights else 0, run > 0)
+
+    def put(self, position, sums: Sums) -> None:
+        """Add the rays' sums at their film positions."""
+        values = sums.values()
+        dr.eval(values, position)
+        self.block.put(position, values)
+        dr.eval(self.block.tensor())
+
+    def write_to(self, block) -> None:
+        """Fill the extra channels of the film's `block`, which hold 0 so far. The film divides all by the sum of its
+        filter's weights, so values are written times that."""
+        ours, theirs = self.block.tensor(), block.tensor()
+        width, base = theirs.shape[2], theirs.shape[2] - len(self.names)
+        pixel = dr.arange(mi.UInt32, theirs.shape[0] * theirs.shape[1])
+        filtered = dr.gather(mi.Float, theirs.array, pixel * width + (base - 1))
+        sums = [dr.gather(mi.Float, ours.array, pixel * ours.shape[2] + i) for i in range(ours.shape[2])]
+        *sums, stopped, by_fields = sums
+        first = 0
+        for name in self.wanted:
+            channels = sums[first : first + len(_channels(name, self.lights))]
+            whole = by_fields if name in OF_FIELDS else stopped
+            for i, value in enumerate(_expectation(name, channels, whole, filtered)):
+                dr.scatter(theirs.array, value, pixel * width + (base + first + i))
+            first += len(channels)
+
+
+def _expectation(name: str, channels: list, whole, filtered) -> list:
+    if name == "opacity":
+        return channels
+    if name == "normal":
+        length = dr.sqrt(channels[0] * channels[0] + channels[1] * channels[1] + channels[2] * channels[2])
+        whole = dr.select(whole > 0, length, 0)
+    return [dr.select(whole > 1e-6 * dr.abs(filtered), c / whole * filtered, 0) for c in channels]
