@@ -6,6 +6,9 @@ import mitsuba as mi
 from ..core.errors import MiNtfError
 from ..infer import scatter
 
+VOID = 1e-8
+"""Density of samples that carry no light, 1/sr."""
+
 
 def phase_class() -> type:
     """The plugin class for the current variant."""
@@ -51,9 +54,9 @@ def phase_class() -> type:
             viewer, reflectance = self._look(mei)
             light = scatter.sample(viewer, reflectance, sample1, (sample2.x, sample2.y))
             value, pdf = scatter.evaluate(light, viewer, reflectance)
-            pdf = dr.select(active & (pdf > 1e-8), pdf, 0)
-            weight = mi.Spectrum(value) * dr.select(pdf > 0, dr.rcp(pdf), 0)
-            return self.frame.direction_to_world(light), weight, pdf
+            weight = mi.Spectrum(value) * dr.select(active & (pdf > VOID), dr.rcp(pdf), 0)
+            # Of density 0 a void sample would not end the path: volpath and prbvolpath then go straight on unscattered.
+            return self.frame.direction_to_world(light), weight, dr.maximum(pdf, VOID)
 
         def to_string(self):
             return "NRFPhase[]"
