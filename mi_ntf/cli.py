@@ -149,7 +149,7 @@ class Compare:
 
 @dataclass
 class Explain:
-    """Say how a scene would be rendered: fields, lights, visibility, and why."""
+    """Say how a scene would be rendered, why, and what it costs."""
 
     scene: Positional[Path]
     """Scene with an nrf medium."""

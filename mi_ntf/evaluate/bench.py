@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ..render import calibrate, cost, register
+from ..render.measure import maps_made_anew
 from . import bench_image, bench_paper, bench_product
 from .bench_measure import FULL, QUICK, Row, Sizes
 
@@ -34,9 +35,10 @@ def bench(quick: bool = False, out: Path | None = None, say: Callable[[str], Non
     sizes = QUICK if quick else FULL
     start = time.perf_counter()
     rows = []
-    for title, work in _sections(sizes).items():
-        say(f"{time.perf_counter() - start:5.0f} s  {title}")
-        rows += work()
+    with maps_made_anew():
+        for title, work in _sections(sizes).items():
+            say(f"{time.perf_counter() - start:5.0f} s  {title}")
+            rows += work()
     report = {"machine": machine(), "quick": quick, "seconds": time.perf_counter() - start,
               "rows": [asdict(r) for r in rows]}
     if out is not None:

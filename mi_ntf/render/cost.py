@@ -62,9 +62,16 @@ class Constants:
 
 @dataclass(frozen=True)
 class Work:
-    """The size of a render. `rays`: camera rays, `points`: shading points, `lights`: of the table or drawn a point;
-    `texels`: m², `components`: logistics a texel; `samples`: cells across the unit sphere's diameter; `network`: the
-    field is its networks, not its grid; `source`: of maps, ``field`` or ``network``; `voxels`: of the grid, a side."""
+    """The size of a render.
+
+    rays, points  camera rays, shading points
+    lights        of the table, and drawn ones a point
+    texels        of a map: m²; `components`: logistics in each
+    samples       cells across the unit sphere's diameter
+    source        of maps: ``field`` or ``network``
+    network       the field is its networks, not its grid, of `voxels`³
+    map_bytes     that maps may take at a time
+    """
 
     rays: float
     points: float
@@ -76,6 +83,7 @@ class Work:
     components: int = 1
     network: bool = False
     voxels: int = 192
+    map_bytes: float = math.inf
 
 
 def light_steps(samples: int) -> int:
@@ -123,9 +131,17 @@ def choose(work: Work, c: Constants | None = None) -> tuple[str, str]:
     return method, f"about {work.points:.2g} shading points, maps pay from {limit}"
 
 
-def expected_points(rays: float, samples: int) -> float:
-    """Shading points of `rays` camera rays, before any is traced: a guess for an opaque object in the picture."""
-    return rays * COVERAGE * POINTS_A_HIT * samples / 384
+def work(integrator, medium, method: str, rays: int, lights: int = 1) -> Work:
+    """What it comes to that an ``nrf`` integrator traces `rays` camera rays through `medium` under `lights` lights.
+    Shading points are guessed: an opaque object in the picture."""
+    network = integrator.map_source == "network"
+    return Work(
+        rays=rays, points=rays * COVERAGE * POINTS_A_HIT * integrator.samples / 384, lights=lights, method=method,
+        texels=integrator.map_resolution**2, samples=integrator.samples, source=integrator.map_source,
+        components=medium.field.network.components if network else integrator.map_components,
+        network=medium.representation == "network", voxels=medium.field.grid.resolution,
+        map_bytes=integrator.map_memory * 2**20,
+    )
 
 
 def seconds(work: Work, c: Constants) -> dict[str, float]:
@@ -148,7 +164,7 @@ def memory(work: Work, chunk: int) -> dict[str, int]:
     share = work.points / max(work.rays, 1)
     return {
         "field grid": 4 * work.voxels**3 + 32 * min(work.voxels, 128) ** 3,
-        "maps or volumes": 4 * width.get(work.method, 0) * work.texels * work.lights,
+        "maps or volumes": int(min(4 * width.get(work.method, 0) * work.texels * work.lights, work.map_bytes)),
         # 20 floats a shading point.
         "rays in flight": round(min(chunk, work.rays) * max(share, 1) * 80),
     }
@@ -161,7 +177,7 @@ def _with(work: Work, method: str) -> Work:
 def cache_file() -> Path:
     """Where constants are kept."""
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(home) / "mi_ntf" / "cost.json"
+    return Path(home) / "mi-ntf" / "cost.json"
 
 
 def machine() -> str:

@@ -8,11 +8,7 @@ import numpy as np
 
 from ..core.errors import MiNtfError
 from ..infer.visibility import AVAILABLE, METHODS
-
-SAMPLES_IN_MATTER = 5
-"""Shaded samples of a camera ray that hits the object, and the share of rays that do: for predicting cost only."""
-COVERAGE = 0.3
-
+from . import cost
 
 PINHOLES = ("PerspectiveCamera",)
 """Cameras whose rays all pass one point: light from there goes the way of the view."""
@@ -130,7 +126,7 @@ def describe(scene, integrator, sensor, spp: int, media: list, light) -> Effects
     exhaustive = integrator.light_samples == 0
     collocated = lit and integrator.visibility != "none" and _at_camera(light, sensor, media)
     width, height = sensor.film().crop_size()
-    method, reason = _method(integrator, width * height * spp, exhaustive)
+    method, reason = _method(integrator, width * height * spp, exhaustive, media)
     if collocated:
         reason += "; not needed where the camera's own transmittance is the light's"
     return Effects(
@@ -149,7 +145,7 @@ def describe(scene, integrator, sensor, spp: int, media: list, light) -> Effects
     )
 
 
-def _method(integrator, rays: int, exhaustive: bool) -> tuple[str, str]:
+def _method(integrator, rays: int, exhaustive: bool, media: list) -> tuple[str, str]:
     """The visibility method that runs, and why."""
     method, reason = integrator.visibility, "chosen by name"
     if method not in AVAILABLE:
@@ -164,14 +160,9 @@ def _method(integrator, rays: int, exhaustive: bool) -> tuple[str, str]:
             "light and sums all of them; remove light_samples or choose raymarch or neural_transmittance"
         )
     if method == "auto":
-        points = rays * COVERAGE * SAMPLES_IN_MATTER
-        break_even = 12 * integrator.map_resolution**2
-        method = "transmittance_map" if exhaustive and points > break_even else "raymarch"
-        reason = (
-            f"about {points:.0f} shading points, maps pay from {break_even}"
-            if exhaustive
-            else "random lights have no maps"
-        )
+        if not exhaustive:
+            return "raymarch", "random lights have no maps"
+        return cost.choose(cost.work(integrator, media[0], method, rays))
     return method, reason
 
 

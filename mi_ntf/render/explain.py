@@ -1,5 +1,6 @@
-"""What the ``nrf`` integrator will do with a scene, and why, before any ray is traced: ``mi-ntf explain``."""
+"""What the ``nrf`` integrator will do with a scene, why, and what that costs: ``mi-ntf explain``."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import mitsuba as mi
@@ -7,15 +8,17 @@ from rich.console import Console
 from rich.table import Table
 
 from ..core.errors import MiNtfError
-from ..infer.visibility.transmittance_map import channels
-from . import effects, lights, register
+from . import calibrate, cost, effects, lights, register
+from .measure import measure as watch
 
 
-def explain(scene: Path, parameters: dict[str, str]) -> dict:
+def explain(scene: Path, parameters: dict[str, str], measure: bool = False) -> dict:
     """Load `scene` (with `parameters` for its $names) and describe its render.
 
-    Returns ``field`` (file, placement), ``lights`` (kinds, count), ``effects``: name → ``{"on": bool, "why": str}``,
-    and ``memory_bytes`` of what is held beside the film. Raises MiNtfError where rendering would.
+    Returns ``fields`` (file, placement), ``lights`` (kinds, count), ``effects``: name → ``{"on": bool, "why": str}``;
+    ``constants``: where the prices of the machine are from; ``seconds``: predicted, by stage; ``memory_bytes`` of what
+    is held beside the film. With `measure`, measures the machine's prices and renders: ``measured``, see
+    :func:`mi_ntf.render.measure.measure`. Raises MiNtfError where rendering would.
     """
     if mi.variant() is None:
         mi.set_variant("llvm_ad_rgb")
@@ -25,88 +28,112 @@ def explain(scene: Path, parameters: dict[str, str]) -> dict:
     if not hasattr(integrator, "map_resolution"):
         raise MiNtfError(f'{scene}: its integrator is {integrator.class_name()}; explain reads <integrator type="nrf">')
     media = effects.find_media(loaded)
-    medium = media[0]
+    if measure:
+        calibrate.calibrate(media[0])
     sensor = loaded.sensors()[0]
-    width, height = (int(v) for v in sensor.film().size())
+    width, height = (int(v) for v in sensor.film().crop_size())
     spp = sensor.sampler().sample_count()
     light = lights.Lights(loaded, media, integrator.light_samples, integrator.environment_lights)
     found = effects.describe(loaded, integrator, sensor, spp, media, light)
-    table = light.table(medium.frame) if found.exhaustive else None
-    return {
+    count = light.table(media[0].frame).count
+    work = _works(integrator, media, found, width * height * spp, count, light)
+    report = {
         "scene": str(scene),
         "image": {"width": width, "height": height, "spp": spp},
-        "field": {
-            "file": medium.path,
-            "representation": medium.representation,
-            "center": medium.frame.origin.tolist(),
-            "radius": medium.frame.length,
-        },
-        "lights": {"emitters": list(found.emitters), "count": table.count if table else integrator.light_samples},
+        "fields": [{"file": m.path, "representation": m.representation, "center": m.frame.origin.tolist(),
+                    "radius": m.frame.length} for m in media],
+        "lights": {"emitters": list(found.emitters), "count": count, "drawn": _drawn(integrator, light)},
         "visibility": found.visibility,
-        "effects": _effects(loaded, found, table, integrator),
-        "memory_bytes": _memory(found, table, integrator, medium),
+        "effects": _effects(loaded, found, integrator, count),
+        "constants": "measured on this machine" if cost.measured() else "built in; --measure measures this machine's",
+        "points": sum(w.points for w in work),
+        "seconds": _sum(cost.seconds(w, cost.constants()) for w in work),
+        "memory_bytes": _memory(work),
     }
+    return report | ({"measured": watch(loaded, integrator, spp)} if measure else {})
 
 
-def _effects(scene, found, table, integrator) -> dict:
-    """Each effect: whether it takes part, and the reason."""
-    others = len(effects.ordinary_shapes(scene))
-    shadow = found.visibility != "none"
-    use_map = found.visibility == "transmittance_map"
-    unlit = table is not None and table.count == 0
-    return {
-        "visibility": {"on": shadow and not unlit, "why": f"{found.visibility}: {found.reason}"},
-        "every light at every point": {
-            "on": found.exhaustive,
-            "why": f"light_samples is {integrator.light_samples}",
-        },
-        "transmittance maps": {
-            "on": use_map,
-            "why": f"{table.count} lights of {integrator.map_resolution}² texels, source {integrator.map_source}"
-            if use_map and table
-            else f"{found.visibility} needs none",
-        },
-        "environment background": {
-            "on": found.background,
-            "why": "an environment is visible" if found.background else "no environment, or hide_emitters",
-        },
-        "shading": {"on": not unlit, "why": "no emitter has power" if unlit else "the scene has lights"},
-        "ordinary surfaces": {
-            "on": found.surfaces,
-            "why": f"{others} shapes beside the fields' bounds" if others else "there are none",
-        },
-        "multiple scattering": {"on": found.bounces, "why": f"max_depth is {integrator.max_depth}"},
-    }
+def _works(integrator, media: list, found, rays: int, count: int, light) -> list[cost.Work]:
+    """What each medium's part of the render comes to."""
+    method = found.visibility if found.needs_visibility else "none"
+    pairs = count + _drawn(integrator, light)
+    works = []
+    for medium, seen in zip(media, found.in_view, strict=True):
+        work = cost.work(integrator, medium, method, rays if seen else 0, pairs if found.lit else 0)
+        works.append(work if found.lit else replace(work, points=0))
+    return works
 
 
-def _memory(found, table, integrator, medium) -> dict:
-    """Bytes held during the render, by what holds them."""
+def _drawn(integrator, light) -> int:
+    """Lights that are drawn for each point."""
+    return integrator.light_samples or 2 * len(light.sampled)
+
+
+def _memory(works: list[cost.Work]) -> dict[str, int]:
     from .integrator import CHUNK
 
-    resolution = medium.field.grid.resolution
-    maps = 0
-    if found.visibility == "transmittance_map" and table:
-        components = medium.field.network.components if integrator.map_source == "network" else 1
-        maps = 4 * channels(components) * integrator.map_resolution**2 * table.count
-    return {
-        "field grid": 4 * resolution**3 + 32 * min(resolution, 128) ** 3,
-        "transmittance maps": maps,
-        # 20 floats a shading point, some ten points a ray at most on opaque fields.
-        "rays in flight": CHUNK * 10 * 80,
+    return _sum(cost.memory(replace(w, rays=max(w.rays, 1)), CHUNK) for w in works)
+
+
+def _sum(stages) -> dict:
+    total: dict = {}
+    for each in stages:
+        total = {name: total.get(name, 0) + value for name, value in each.items()}
+    return total
+
+
+def _effects(scene, found, integrator, count: int) -> dict:
+    """Each effect: whether it takes part, and the reason."""
+    use_map = found.needs_visibility and found.visibility in ("transmittance_map", "transmittance_volume")
+    others = len(effects.ordinary_shapes(scene))
+    unlit = "no emitter has power" if found.emitters else "there is no emitter"
+    answers = {
+        "visibility": (found.needs_visibility and found.visibility != "none", f"{found.visibility}: {found.reason}"),
+        "every light at every point": (found.exhaustive, f"light_samples is {integrator.light_samples}"),
+        "transmittance maps": (
+            use_map,
+            f"{count} lights of {integrator.map_resolution}² texels, source {integrator.map_source}"
+            if use_map else "the camera sees what the light sees" if found.collocated and not found.needs_visibility
+            else f"{found.visibility} needs none"),
+        "view transmittance for light": (
+            found.collocated, "all light comes from the camera" if found.collocated else "a light is elsewhere"),
+        "environment background": (
+            found.background, "an environment is visible" if found.background else "no environment, or hide_emitters"),
+        "shading": (found.lit, "the scene has lights" if found.lit else unlit),
+        "specular lobe": (
+            found.specular, "a field has one" if found.specular else "no field has one above the threshold"),
+        "fields in view": (any(found.in_view), f"{sum(found.in_view)} of {len(found.in_view)}"),
+        "ordinary surfaces": (
+            found.surfaces, f"{others} shapes beside the fields' bounds" if others else "there are none"),
+        "multiple scattering": (found.bounces, f"max_depth is {integrator.max_depth}"),
+        "gradients": (found.gradients, "a parameter is attached" if found.gradients else "no parameter is attached"),
     }
+    return {name: {"on": bool(on), "why": why} for name, (on, why) in answers.items()}
 
 
 def print_table(report: dict) -> None:
     """The report for a reader."""
     console = Console()
-    image, where = report["image"], report["field"]
+    console = console if console.is_terminal else Console(width=120)
+    image, real = report["image"], report.get("measured")
     console.print(
-        f"{report['scene']}: {image['width']}×{image['height']}, {image['spp']} samples a pixel", highlight=False
-    )
-    console.print(f"field {where['file']} as {where['representation']}", highlight=False)
+        f"{report['scene']}: {image['width']}×{image['height']}, {image['spp']} samples a pixel", highlight=False)
+    for field in report["fields"]:
+        console.print(f"field {field['file']} as {field['representation']}", highlight=False)
     table = Table("effect", "", "why")
     for name, effect in report["effects"].items():
         table.add_row(name, "yes" if effect["on"] else "–", effect["why"])
+    console.print(table)
+    stages = report["seconds"] | {"bounces": 0.0} if real and "bounces" in real["stages"] else report["seconds"]
+    table = Table("stage", "predicted", *(["measured"] if real else []),
+                  caption=f"prices of the machine: {report['constants']}; compilation is not counted")
+    for name, value in stages.items():
+        table.add_row(name, f"{value:.3g} s", *([f"{real['stages'][name]:.3g} s"] if real else []))
+    table.add_row("all", f"{sum(stages.values()):.3g} s", *([f"{real['wall_seconds']:.3g} s"] if real else []))
+    table.add_row("shading points", f"{report['points']:.3g}", *([f"{real['points']:.3g}"] if real else []))
     for name, size in report["memory_bytes"].items():
-        table.add_row(f"memory: {name}", "", f"{size / 2**20:.0f} MiB")
+        table.add_row(f"memory: {name}", f"{size / 2**20:.0f} MiB", *([""] if real else []))
+    if real:
+        table.add_row("memory: all", f"{sum(report['memory_bytes'].values()) / 2**20:.0f} MiB",
+                      f"{real['peak_bytes'] / 2**20:.0f} MiB")
     console.print(table)

@@ -1,6 +1,8 @@
 """One render, watched: the seconds that its stages really take, told apart by the loops in their kernels."""
 
+import os
 import time
+from contextlib import contextmanager
 
 import drjit as dr
 import mitsuba as mi
@@ -10,16 +12,31 @@ LOOPS = {"camera march": "camera march", "lights": "lights", "free flight": "bou
 they fetch reflectance, or are small."""
 
 
+@contextmanager
+def maps_made_anew():
+    """Within, no transmittance map is taken from a cache (:mod:`mi_ntf.render.map_cache`): what it costs is the
+    question."""
+    name = "MI_NTF_MAP_CACHE"
+    before = os.environ.get(name)
+    os.environ[name] = "off"
+    try:
+        yield
+    finally:
+        os.environ.pop(name)
+        if before is not None:
+            os.environ[name] = before
+
+
 def measure(scene, integrator, spp: int) -> dict:
-    """Render `scene` twice and report the second time, when every kernel is compiled.
+    """Render `scene` twice and report the second time, when every kernel is compiled. Maps are made anew.
 
     ``stages``: kernel seconds, as in :func:`mi_ntf.render.cost.seconds`; ``wall_seconds`` of the whole, Python and the
     film included; ``points``: shading points; ``peak_bytes``: most memory that Dr.Jit held.
     """
-    dr.eval(mi.render(scene, integrator=integrator, seed=1, spp=spp))
-    dr.sync_thread()
-    dr.detail.malloc_clear_statistics()
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+    with maps_made_anew(), dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.eval(mi.render(scene, integrator=integrator, seed=1, spp=spp))
+        dr.sync_thread()
+        dr.detail.malloc_clear_statistics()
         dr.kernel_history_clear()
         start = time.perf_counter()
         dr.eval(mi.render(scene, integrator=integrator, seed=0, spp=spp))

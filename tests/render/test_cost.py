@@ -21,7 +21,7 @@ WORK = cost.Work(rays=65536, points=300_000, lights=50, method="raymarch", texel
 def cache(variant, monkeypatch, tmp_path):
     mi_ntf.render.register()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    return tmp_path / "mi_ntf" / "cost.json"
+    return tmp_path / "mi-ntf" / "cost.json"
 
 
 def test_break_even_by_hand():
@@ -53,7 +53,9 @@ def test_maps_pay_at_once_where_each_step_is_a_query():
 
 def test_maps_never_pay_where_a_lookup_costs_more_than_a_march():
     assert cost.choose(replace(WORK, points=1e12), replace(KNOT, lookup=1000.0)) == (
-        "raymarch", "about 1e+12 shading points, maps pay from no number")
+        "raymarch",
+        "about 1e+12 shading points, maps pay from no number",
+    )
 
 
 def test_the_chosen_method_is_the_cheaper_one():
@@ -75,7 +77,7 @@ def test_constants_are_kept_for_the_machine(cache):
     assert cost.measured() is None and cost.constants() == cost.Constants()
     cost.remember(KNOT)
     assert cost.measured() == KNOT and cost.constants() == KNOT
-    (key, values), = json.loads(cache.read_text()).items()
+    ((key, values),) = json.loads(cache.read_text()).items()
     assert "llvm_ad_rgb" in key and values == asdict(KNOT)
     cache.write_text(json.dumps({"another machine": values}))
     assert cost.measured() is None

@@ -6,18 +6,35 @@ import mitsuba as mi
 import pytest
 
 from mi_ntf.core.errors import MiNtfError
+from mi_ntf.render import cost, measure
 from mi_ntf.render.explain import explain, print_table
 
 SCENE = Path(__file__).parents[2] / "scenes" / "statue" / "scene.xml"
 
 
+@pytest.fixture(autouse=True)
+def built_in_constants(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
+def with_integrator(folder: Path, properties: str) -> Path:
+    """The shipped scene under its point light, with more `properties` of the integrator."""
+    text = SCENE.read_text().replace("field.safetensors", str(SCENE.parent / "field.safetensors"))
+    text = text.replace('"light_$light.xml"', f'"{SCENE.parent}/light_point.xml"')
+    text = text.replace("sensor.xml", str(SCENE.parent / "sensor.xml"))
+    (folder / "scene.xml").write_text(text.replace('<integrator type="nrf">', f'<integrator type="nrf">{properties}'))
+    return folder / "scene.xml"
+
+
 def test_point_light_by_name():
     report = explain(SCENE, {"visibility": "raymarch", "light": "point", "res": "32"})
     assert report["visibility"] == "raymarch" and report["image"] == {"width": 32, "height": 32, "spp": 16}
-    assert report["lights"] == {"emitters": ["point"], "count": 1}
+    assert report["lights"] == {"emitters": ["point"], "count": 1, "drawn": 0}
     assert report["effects"]["visibility"] == {"on": True, "why": "raymarch: chosen by name"}
-    assert not report["effects"]["transmittance maps"]["on"] and report["memory_bytes"]["transmittance maps"] == 0
-    assert report["field"]["radius"] == pytest.approx(1.00276791)
+    assert not report["effects"]["transmittance maps"]["on"] and report["memory_bytes"]["maps or volumes"] == 0
+    assert report["fields"][0]["radius"] == pytest.approx(1.00276791)
+    assert report["seconds"]["maps or volumes"] == 0 < report["seconds"]["lights"]
+    assert "measured" not in report and report["constants"].startswith("built in")
 
 
 def test_auto_chooses_by_the_number_of_shading_points():
@@ -26,24 +43,71 @@ def test_auto_chooses_by_the_number_of_shading_points():
     assert few["visibility"] == "raymarch" and "shading points, maps pay from" in few["effects"]["visibility"]["why"]
     assert many["visibility"] == "transmittance_map" and many["effects"]["transmittance maps"]["on"]
     assert many["lights"]["count"] <= 512
-    assert many["memory_bytes"]["transmittance maps"] == 8 * 128**2 * many["lights"]["count"]
+    assert many["memory_bytes"]["maps or volumes"] == 8 * 128**2 * many["lights"]["count"]
+    assert many["seconds"]["maps or volumes"] > 0
+
+
+def test_auto_follows_the_measured_machine():
+    """Where a lookup costs more than a march, maps never pay."""
+    explain(SCENE, {"light": "env", "res": "256", "spp": "64"})  # registers the plugins
+    cost.remember(cost.Constants(lookup=1e6))
+    report = explain(SCENE, {"light": "env", "res": "256", "spp": "64"})
+    assert report["visibility"] == "raymarch" and report["constants"] == "measured on this machine"
+    assert "maps pay from no number" in report["effects"]["visibility"]["why"]
 
 
 def test_maps_of_mixtures_take_four_times_the_memory(tmp_path):
-    text = SCENE.read_text().replace("field.safetensors", str(SCENE.parent / "field.safetensors"))
-    text = text.replace('"light_$light.xml"', f'"{SCENE.parent}/light_point.xml"')
-    text = text.replace("sensor.xml", str(SCENE.parent / "sensor.xml"))
-    network = '<integrator type="nrf"><string name="map_source" value="network"/>'
-    (tmp_path / "scene.xml").write_text(text.replace('<integrator type="nrf">', network))
-    report = explain(tmp_path / "scene.xml", {"visibility": "transmittance_map"})
-    assert report["memory_bytes"]["transmittance maps"] == 4 * 8 * 128**2
+    scene = with_integrator(tmp_path, '<string name="map_source" value="network"/>')
+    report = explain(scene, {"visibility": "transmittance_map"})
+    assert report["memory_bytes"]["maps or volumes"] == 4 * 8 * 128**2
 
 
-def test_table_names_every_effect(capsys):
+def test_memory_of_maps_is_bounded(tmp_path):
+    """512 lights of 128 KiB each in runs of 4 MiB."""
+    scene = with_integrator(tmp_path, '<float name="map_memory" value="4"/>')
+    light = f'<include filename="{SCENE.parent}/light_point.xml"/>'
+    scene.write_text(scene.read_text().replace(light, '<emitter type="constant"/>'))
+    report = explain(scene, {"visibility": "transmittance_map"})
+    assert report["lights"]["count"] == 512 and report["memory_bytes"]["maps or volumes"] == 4 << 20
+
+
+def test_table_names_every_effect_and_stage(capsys):
     report = explain(SCENE, {"visibility": "none"})
     print_table(report)
     text = capsys.readouterr().out
     assert all(name.split()[0] in text for name in report["effects"])
+    assert all(name in text for name in report["seconds"])
+
+
+def test_measured_beside_predicted(capsys):
+    """The kernels' seconds are those of the whole render, but for Python and the film."""
+    parameters = {"visibility": "transmittance_map", "light": "point", "res": "32", "spp": "4"}
+    report = explain(SCENE, parameters, measure=True)
+    real = report["measured"]
+    assert set(real["stages"]) == set(report["seconds"]) and min(real["stages"].values()) > 0
+    assert 0.3 * real["wall_seconds"] < sum(real["stages"].values()) < 2.5 * real["wall_seconds"]  # on two threads
+    # The guess of the shading points is made for objects like this one.
+    assert 0.5 < real["points"] / report["points"] < 2
+    assert 0.5 < real["peak_bytes"] / sum(report["memory_bytes"].values()) < 2
+    assert cost.measured() is not None and report["constants"] == "measured on this machine"
+    print_table(report)
+    assert "measured" in capsys.readouterr().out
+
+
+def test_stages_by_the_loops_of_kernels():
+    class Text(str):
+        def getvalue(self):
+            return str(self)
+
+    def kernel(label, ms, size):
+        return {"ir": Text(f"; Symbolic loop: {label}\n") if label else None, "execution_time": ms, "size": size}
+
+    history = [kernel("ray profile", 8, 100), kernel("camera march", 4, 50), kernel("", 1, 50), kernel("lights", 2, 70),
+               kernel("camera march", 4, 50), kernel("lights", 2, 30)]  # fmt: skip
+    found = measure.by_stage(history)
+    assert found["points"] == 100
+    assert found["stages"] == pytest.approx(
+        {"maps or volumes": 8e-3, "camera march": 8e-3, "reflectance": 1e-3, "lights": 4e-3})
 
 
 def test_a_scene_without_our_integrator(tmp_path):
