@@ -1,8 +1,9 @@
 """Transmittance maps that are made once: kept in memory over frames, on disk over runs.
 
 A map's key is everything that its texels depend on: the field's content, grid and marching step, the lights' places,
-resolution, source and number of logistics. Files lie in ``$XDG_CACHE_HOME/mi-ntf/maps`` (default ``~/.cache``); the
-environment variable ``MI_NTF_MAP_CACHE`` switches: ``on`` (default), ``memory`` (no files), ``off``.
+resolution, source and number of logistics, and the program text that makes them. Files lie in
+``$XDG_CACHE_HOME/mi-ntf/maps`` (default ``~/.cache``); the environment variable ``MI_NTF_MAP_CACHE`` switches: ``on``
+(default), ``memory`` (no files), ``off``.
 """
 
 import hashlib
@@ -16,8 +17,6 @@ import numpy as np
 
 from ..core.errors import MiNtfError
 
-FORMAT = 1
-"""Raised when the meaning of the numbers in a texel, or the rays of a light, change."""
 LARGEST_FILE = 256 << 20
 FOLDER_LIMIT = 2 << 30
 """Bytes: larger maps are not written; the files used longest ago go when the folder is full."""
@@ -45,12 +44,22 @@ def _field_hash(path: str, _time: int, _size: int) -> str:
     return hashlib.sha256(Path(path).read_bytes()).hexdigest()
 
 
+@lru_cache(maxsize=1)
+def _program() -> str:
+    """Hash of the modules that texels come from: no map outlives a change of theirs."""
+    package = Path(__file__).parents[1]
+    digest = hashlib.sha256()
+    for file in sorted([*(package / "core").rglob("*.py"), *(package / "infer").rglob("*.py")]):
+        digest.update(file.read_bytes())
+    return digest.hexdigest()
+
+
 def key(medium, table, options, width: int) -> str:
     """Name of the map of `table`'s lights; `width`: numbers a texel."""
     grid = medium.field.grid
     facts = (
-        FORMAT, field_hash(medium.path), medium.representation, grid.resolution, options.step, options.map_resolution,
-        options.map_source, options.map_components, width, mi.variant(),
+        _program(), field_hash(medium.path), medium.representation, grid.resolution, options.step,
+        options.map_resolution, options.map_source, options.map_components, width, mi.variant(),
     )
     digest = hashlib.sha256(repr(facts).encode())
     for part in (table.where, table.is_point, grid.hull):

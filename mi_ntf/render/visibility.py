@@ -99,7 +99,8 @@ def build(method: str, medium, table, options: Options):
             table, options.map_resolution, depths, field.grid.hull, source.density, mi
         )
     network = method == "neural_transmittance" or options.map_source == "network"
-    step = options.step * (profile.FOR_NETWORKS if network else 1)
+    # Two logistics follow a ray closely enough for the march's own error to show.
+    step = options.step * (profile.FOR_NETWORKS if network else 1 / options.map_components)
     reader = profile.DepthProfile(source.density, field.grid, dr.opaque(mi.Float, step))
     if method == "neural_transmittance":
         return neural_transmittance.NeuralTransmittance(field.network, reader)

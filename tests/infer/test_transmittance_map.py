@@ -205,9 +205,9 @@ def test_many_lights_each_get_their_own_map(grid, network, reader, rng):
         np.testing.assert_allclose(look(together, x, name, k), look(alone, x, name), atol=1e-5)
 
 
-@pytest.mark.parametrize("slope", [1.0, 3.0])
+@pytest.mark.parametrize("slope", [0.6, 3.0])
 def test_slanted_skin_stays_sharp(grid, slope, rng):
-    """A plane at a slant under steep logistics: read at equal depth in the skin up to two texels' difference between the
+    """A plane at a slant under steep logistics: read at equal depth in the skin up to a texel's difference between the
     four rays; beyond that blurred by the texel, as the paper's rule has it."""
     side = np.cross(LIGHTS["sun"][0], [1.0, 0.0, 0.0])
     side /= np.linalg.norm(side)
@@ -221,4 +221,4 @@ def test_slanted_skin_stays_sharp(grid, slope, rng):
     x += (b + rng.uniform(-0.05, 0.05, 4000) - x @ LIGHTS["sun"][0])[:, None] * LIGHTS["sun"][0]
     truth = logistic.transmittance(ops, x @ LIGHTS["sun"][0], 100.0, slope * (x @ side))
     error = np.abs(look(tmap, x, "sun") - truth).max()
-    assert error < 2e-3 if slope == 1 else 0.02 < error < 0.3
+    assert error < 2e-3 if slope < 1 else 0.02 < error < 0.3

@@ -2,8 +2,10 @@
 section 6; Shafiei et al. 2021, section 3.3, with the slips of its algorithms corrected).
 
 A texel holds the parameters of one of the light's rays (:mod:`mi_ntf.infer.visibility.light_rays`), towards the light.
-A lookup evaluates the four nearest rays, on a surface at equal depth in its skin, and interpolates the four τ
-bilinearly, never (a, b).
+A lookup evaluates the four nearest rays, on a surface at equal depth in its skin, and interpolates the four √τ
+bilinearly, never (a, b). The paper interpolates τ. At silhouettes, where density falls off exponentially, that lets in
+too much light (on `statue` 2.9 % more at 128², 0.9 % at 256²), and a mean of logarithms too little; the mean of roots
+lies between and took the image's error from 5.4 to 3.8 % and from 2.4 to 2.0 % (one logistic, 20 lights).
 """
 
 from types import ModuleType
@@ -15,9 +17,9 @@ from ..lights import LightTable
 from .light_rays import LightRays
 from .map_source import Source
 
-SAME, APART = 2.0, 4.0
-"""Texels by which the centres of four neighbouring rays may differ to count as one surface, and as two. On `statue`
-under 50 lights, 256²: image error 1.8 → 1.5 % with one logistic, 1.0 → 0.9 % with two."""
+SAME, APART = 1.0, 2.0
+"""Texels by which the centres of four neighbouring rays may differ to count as one surface, and as two. On `statue`,
+256², 20 lights: two logistics err by 1.2 % without, 1.0 % with this, and by more where it reaches further."""
 
 
 def channels(components: int, weights: bool | None = None) -> int:
@@ -49,16 +51,14 @@ class TransmittanceMap:
         self.values = values
 
     def tau(self, x, wi, distance, index, active):
-        """Bilinear τ of the four nearest texel rays; 1 where light meets nothing."""
+        """The square of bilinear √τ of the four nearest texel rays; 1 where light meets nothing."""
         inside, size, found = self.rays.nearest(index, x, wi, distance, active)
         mixtures = [self._fetch(texel, inside) for _, texel, _ in found]
         shifts = _shifts(mixtures, [weight for weight, _, _ in found], size)
-        result = 0
-        for k in range(len(mixtures[0])):
-            terms = [(weight * m[k][0], m[k][1] * (t + shift - m[k][2]))
-                     for (weight, _, t), shift, m in zip(found, shifts, mixtures, strict=True)]
-            result += _four_logistics(*terms)
-        return dr.select(inside, dr.minimum(result, 1), 1)
+        root = 0
+        for (weight, _, t), shift, parts in zip(found, shifts, mixtures, strict=True):
+            root += weight * _root(t + shift, parts)
+        return dr.select(inside, dr.minimum(root * root, 1), 1)
 
     def _fetch(self, texel, active):
         if self.width == 2:
@@ -73,13 +73,15 @@ class TransmittanceMap:
             dr.scatter(values, row, texel if self.width == 2 else texel * len(mix) + k)
 
 
-def _four_logistics(*terms):
-    """Σ w S(z) of four ``(w, z)`` by one division: S(z) = 1/(1 + e^−z), and the product of four denominators is finite
-    for z ≥ −20, where S is 2e-9."""
-    w = [weight for weight, _ in terms]
-    e = [1 + dr.exp(-dr.clip(z, -20, 20)) for _, z in terms]
-    p, q = e[0] * e[1], e[2] * e[3]
-    return ((w[0] * e[1] + w[1] * e[0]) * q + (w[2] * e[3] + w[3] * e[2]) * p) * dr.rcp(p * q)
+def _root(t, mixture):
+    """√τ(t). Clipped where S is 2e-9, so that no product of denominators overflows."""
+    terms = [(w, 1 + dr.exp(dr.clip(a * (b - t), -20, 20))) for w, a, b in mixture]
+    total, below = terms[0]
+    if len(terms) == 1:
+        return dr.sqrt(total) * dr.rsqrt(below)
+    for w, e in terms[1:]:
+        total, below = total * e + w * below, below * e
+    return dr.sqrt(total / below)
 
 
 def _shifts(mixtures, weights, size):

@@ -16,7 +16,7 @@ from .. import ops
 LEVELS = (0.999, 0.97, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1, 0.03)
 """τ, seen from the light."""
 DEPTHS = tuple(-math.log(level) for level in LEVELS)
-STEPS = 6
+STEPS = 4
 CLEAR = -100.0
 _SLOPE = 2.1972245773362196  # logit(3/4) − logit(1/4)
 
