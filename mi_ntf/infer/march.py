@@ -145,45 +145,15 @@ def camera_samples(strands, maxt, step, offset, depth, shade=True, view=False) -
 
     Samples with w ≤ MIN_WEIGHT_RATE · step are left out.
     """
-    bundle = Bundle(strands, maxt)
-    t0, t1 = bundle.t0 - offset * step, bundle.t1
-    floats, uint = type(t0), dr.uint32_array_t(type(t0))
-    rays = dr.arange(uint, dr.width(t0))
-
-    def march(emit, state):
-        """One walk along the rays; `emit(hit, sample, state)` is called for each sample that counts."""
-
-        def body(k, transmittance, state, active):
-            begin, length = bundle.cell(t0 + floats(k) * step, step)
-            skip, sigmas = bundle.at(begin + 0.5 * length, active)
-            empty = skip > 0
-            sigma = sum(sigmas[1:], sigmas[0])
-            alpha = 1 - dr.exp(-sigma * length)
-            w = transmittance * alpha
-            hit = active & (w > MIN_WEIGHT_RATE * step)
-            lost = depth * alpha
-            rate = dr.rcp(dr.maximum(sigma, 1e-6))
-            shares = (w,) if bundle.single else tuple(w * s * rate for s in sigmas)
-            views = (transmittance * (1 - lost),) if view else ()
-            state = emit(hit, (begin - dr.log(1 - lost) * rate, *shares, *views), state)
-            transmittance = dr.select(active, transmittance - w, transmittance)
-            # Not in place: a state variable is the caller's own array, and the second walk starts from it again.
-            k = k + dr.select(empty, uint(skip / step) + 1, 1)
-            active = active & (t0 + floats(k) * step < t1) & (transmittance > MIN_TRANSMITTANCE)
-            return k, transmittance, state, active
-
-        return dr.while_loop(
-            state=(dr.zeros(uint, dr.width(t0)), dr.ones(floats, dr.width(t0)), state, bundle.active),
-            cond=lambda k, transmittance, state, active: active,
-            body=body,
-            label="camera march",
-        )
-
     # First walk: count. Second: write. Costs little beside shading and needs no guess of the capacity.
-    _, transmittance, (count,), _ = march(
-        lambda hit, sample, n: (n[0] + dr.select(hit, uint(1), 0),), (dr.zeros(uint, dr.width(t0)),)
-    )
-    transmittance = dr.select(transmittance > MIN_TRANSMITTANCE, transmittance, 0)
+    bundle = Bundle(strands, maxt)
+    floats, uint = type(bundle.t0), dr.uint32_array_t(type(bundle.t0))
+    rays = dr.arange(uint, dr.width(bundle.t0))
+
+    def tally(hit, sample, state):
+        return (state[0] + dr.select(hit, uint(1), 0),)
+
+    transmittance, (count,) = _walk(bundle, step, offset, depth, tally, (dr.zeros(uint, dr.width(rays)),))
     total = 0
     if shade:
         start = dr.prefix_sum(count)
@@ -193,14 +163,71 @@ def camera_samples(strands, maxt, step, offset, depth, shade=True, view=False) -
 
         def write(hit, sample, state):
             slot, *targets = state
-            for target, value in zip(targets, (rays, *sample), strict=True):
+            for target, value in zip(targets, (rays, *sample[: len(targets) - 1]), strict=True):
                 dr.scatter(target, value, slot, hit)
             return slot + dr.select(hit, uint(1), 0), *targets
 
-        _, _, (_, *out), _ = march(write, (start, *out))
+        _, (_, *out) = _walk(bundle, step, offset, depth, write, (start, *out))
         dr.eval(out, transmittance)
     weights = tuple(out[2 : 2 + len(strands)])
     return Samples(out[0], out[1], weights, out[-1] if view else None, transmittance)
+
+
+def camera_light(strands, maxt, step, offset, depth, reflect):
+    """The light of camera rays whose lights all shine from the camera, in one walk: the view's transmittance is theirs.
+
+    Arguments as :func:`camera_samples`; ``reflect(i, t, view)``: radiance, a 3-tuple, that the point of strand `i` at
+    `t`, `view` of whose light gets to the camera, reflects. Returns ``(radiance, transmittance)`` per ray.
+    """
+    bundle = Bundle(strands, maxt)
+
+    def shade(t, shares, view, *light):
+        for i, share in enumerate(shares):
+            light = [c + share * v for c, v in zip(light, reflect(i, t, view), strict=True)]
+        return tuple(light)
+
+    def add(hit, sample, state):
+        t, *shares, view = sample
+        # Few cells hold samples that count: the branch skips what the others would cost.
+        return dr.if_stmt((t, shares, view, *state), hit, shade, lambda t, shares, view, *light: light, label="shade")
+
+    zero = dr.zeros(type(bundle.t0), dr.width(bundle.t0))
+    transmittance, light = _walk(bundle, step, offset, depth, add, (zero, type(zero)(zero), type(zero)(zero)))
+    return light, transmittance
+
+
+def _walk(bundle, step, offset, depth, emit, state):
+    """One walk along the camera rays of `bundle`; ``emit(hit, sample, state)`` gives the next state and is called for
+    each cell, `hit` where it holds a sample that counts: t, the weight in each field, and the view's transmittance.
+    Returns ``(transmittance, state)``."""
+    t0, t1 = bundle.t0 - offset * step, bundle.t1
+    floats, uint = type(t0), dr.uint32_array_t(type(t0))
+
+    def body(k, transmittance, state, active):
+        begin, length = bundle.cell(t0 + floats(k) * step, step)
+        skip, sigmas = bundle.at(begin + 0.5 * length, active)
+        empty = skip > 0
+        sigma = sum(sigmas[1:], sigmas[0])
+        alpha = 1 - dr.exp(-sigma * length)
+        w = transmittance * alpha
+        lost = depth * alpha
+        rate = dr.rcp(dr.maximum(sigma, 1e-6))
+        shares = (w,) if bundle.single else tuple(w * s * rate for s in sigmas)
+        sample = begin - dr.log(1 - lost) * rate, *shares, transmittance * (1 - lost)
+        state = emit(active & (w > MIN_WEIGHT_RATE * step), sample, state)
+        transmittance = dr.select(active, transmittance - w, transmittance)
+        # Not in place: a state variable is the caller's own array, and the next walk starts from it again.
+        k = k + dr.select(empty, uint(skip / step) + 1, 1)
+        active = active & (t0 + floats(k) * step < t1) & (transmittance > MIN_TRANSMITTANCE)
+        return k, transmittance, state, active
+
+    _, transmittance, state, _ = dr.while_loop(
+        state=(dr.zeros(uint, dr.width(t0)), dr.ones(floats, dr.width(t0)), state, bundle.active),
+        cond=lambda k, transmittance, state, active: active,
+        body=body,
+        label="camera march",
+    )
+    return dr.select(transmittance > MIN_TRANSMITTANCE, transmittance, 0), state
 
 
 def free_flight(strands, maxt, step, offset, depth, which):

@@ -108,8 +108,9 @@ class Composition:
         table = whole.part(*self.runs[self.run]) if len(self.runs) > 1 else whole
         options = visibility.options(self.integrator)
         drawn = lights.method_for_drawn(found.visibility)
-        mapped = visibility.build(found.visibility, medium, table, options)
-        if drawn == found.visibility:
+        method = found.visibility if table.count else drawn  # maps of no light are no maps
+        mapped = visibility.build(method, medium, table, options)
+        if drawn == method:
             return Part(medium, whole, table, mapped, mapped)
         return Part(medium, whole, table, mapped, visibility.build(drawn, medium, table, options))
 
@@ -197,6 +198,10 @@ class Composition:
         found = self.effects
         strands, unit, step = self.strands(ray, self.in_view)
         maxt = dr.minimum(ray.maxt, hit.t) if hit is not None else ray.maxt
+        if found.collocated and not sums:
+            reflect = self._at_camera(strands)
+            total[:], transmittance = march.camera_light(strands, maxt / unit, step, offset, depth, reflect)
+            return transmittance
         wanted = found.lit or bool(sums and sums.needs_points)
         samples = march.camera_samples(
             strands, maxt / unit, step, offset, depth, shade=wanted, view=found.collocated
@@ -222,6 +227,18 @@ class Composition:
             for channel, value in zip(total, self.reflect(part, points, stream, view), strict=True):
                 dr.scatter_reduce(dr.ReduceOp.Add, channel, value * weight, index)
         return samples.transmittance
+
+    def _at_camera(self, strands):
+        """The `reflect` of :func:`mi_ntf.infer.march.camera_light` for the fields in view."""
+
+        def reflect(i, t, view):
+            part, strand = self.in_view[i], strands[i]
+            t = t if strand.rate is None else t * strand.rate
+            x = tuple(a + t * b for a, b in zip(strand.o, strand.d, strict=True))
+            points = shade.Points(x, tuple(-c for c in strand.d), part.source.reflectance(x))
+            return shade.reflect(points, part.table, Known(view), self.effects.specular)
+
+        return reflect
 
     def _bounces(self, ray, hit, transmittance, offset, total, stream):
         """Adds the light of surfaces that the camera sees, and of paths of more than one bounce."""
