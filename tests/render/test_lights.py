@@ -1,0 +1,195 @@
+"""Emitters as lights of the field: every kind of Mitsuba's against stock `volpath`, rows against Mitsuba's own
+sampling, orientation, and the noise of resampling."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers import scenes, ztest
+
+import mi_ntf.render
+from mi_ntf.core.architecture import Similarity
+from mi_ntf.infer import shade
+from mi_ntf.render import emitter_samples, lights
+from mi_ntf.render.frame import Frame
+
+SEEDS = 4
+MIDDLE = list(scenes.SIMILARITY.center)
+PLACE = (3.4, 3.0, 2.5)
+
+
+@pytest.fixture(autouse=True)
+def plugins(variant):
+    mi_ntf.render.register()
+
+
+@pytest.fixture(scope="module")
+def blobs(tmp_path_factory):
+    return scenes.write_blobs(tmp_path_factory.mktemp("field"), log_density=3.0)
+
+
+def emitter(kind: str) -> dict:
+    """One light of each kind, from the upper right front where it has a place."""
+    aim = mi.ScalarTransform4f().look_at(PLACE, MIDDLE, [0, 1, 0])
+    texture = {
+        "type": "bitmap",
+        "raw": True,
+        "bitmap": mi.Bitmap(np.tile(np.float32([[[1, 0.5, 2], [0.2, 1, 1]]]), (2, 1, 1))),
+    }
+    sky = {"type": "sunsky", "sun_direction": [0.6, 0.5, 0.7], "sky_scale": 4.0, "sun_aperture": 1.0}
+    lamp = {"type": "rectangle", "to_world": aim @ mi.ScalarTransform4f().scale(0.8)}
+    return {
+        "point": scenes.light("point"),
+        "directional": scenes.light("directional"),
+        "envmap": scenes.light("env"),
+        "constant": {"type": "constant", "radiance": {"type": "rgb", "value": [0.5, 0.6, 0.7]}},
+        "spot": {"type": "spot", "to_world": aim, "cutoff_angle": 16.0, "beam_width": 4.0, "intensity": 50.0},
+        "textured": {"type": "spot", "to_world": aim, "cutoff_angle": 20.0, "intensity": 50.0, "texture": texture},
+        "projector": {"type": "projector", "to_world": aim, "fov": 30.0, "irradiance": texture, "scale": 9.0},
+        "sunsky": {**sky, "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], -90)},
+        "area": {**lamp, "emitter": {"type": "area", "radiance": 12.0}},
+        "directionalarea": {**lamp, "emitter": {"type": "directionalarea", "radiance": 12.0}},
+    }[kind]  # fmt: skip
+
+
+def check_against_volpath(field, light: dict, label: str, **options):
+    """z-test of 3×3 block means at 12×12."""
+    # A few lights serve for skies as smooth as these.
+    ours = {"type": "nrf", "visibility": "raymarch", "samples": 512, "hide_emitters": True, "environment_lights": 72}
+    ours |= options
+    theirs = {"type": "volpath", "max_depth": 2, "hide_emitters": True}
+    images = [
+        [scenes.render(loaded, seed)[..., :3] for seed in range(SEEDS)]
+        for loaded in (
+            scenes.scene(field, ours, light, size=12, spp=8), scenes.scene(field, theirs, light, size=12, spp=96)
+        )
+    ]  # fmt: skip
+    ztest.check(*images, label, block=3)
+    return np.mean(images[0])
+
+
+@pytest.mark.parametrize(
+    "kind",
+    ["point", "spot", "textured", "directional", "constant", "envmap", "sunsky", "area", "projector"],
+)
+def test_every_emitter_equals_volpath(blobs, kind):
+    """All lights at every point, those of no finite set drawn: the picture that Mitsuba's path tracer converges to."""
+    assert check_against_volpath(blobs, {"light": emitter(kind)}, kind) > 0.01
+
+
+def test_directionalarea_is_as_dark_as_under_volpath(blobs):
+    """Mitsuba's direct lighting never finds it; only particle tracers do."""
+    assert check_against_volpath(blobs, {"light": emitter("directionalarea")}, "directionalarea") == 0
+
+
+@pytest.mark.parametrize("options", [{}, {"light_samples": 3}])
+def test_several_at_once(blobs, options):
+    """A scene that mixes rows with drawn lights, summed and sampled."""
+    mixed = {kind: emitter(kind) for kind in ("spot", "area", "constant")}
+    check_against_volpath(blobs, mixed, "mixed", **options)
+
+
+def identity() -> Frame:
+    return Frame(Similarity(), np.eye(4), 1.0)
+
+
+def points(n: int, copies: int, rng) -> shade.Points:
+    """`n` shading points, each `copies` times over: anywhere in the unit sphere, rough and glossy."""
+
+    def tile(v):
+        return mi.Float(np.tile(v.astype(np.float32), copies))
+
+    def unit():
+        v = rng.normal(size=(3, n))
+        return v / np.linalg.norm(v, axis=0)
+
+    x, normal = rng.uniform(-0.5, 0.5, (3, n)), unit()
+    towards = normal + 0.8 * unit()
+    wo = towards / np.linalg.norm(towards, axis=0)
+    roughness, specular = rng.uniform(0.3, 0.9, n), rng.uniform(0, 0.4, n)
+    albedo = rng.uniform(0.2, 0.8, (3, n))
+    x, wo, normal, albedo = (tuple(tile(c) for c in v) for v in (x, wo, normal, albedo))
+    return shade.Points(x, wo, (normal, albedo, tile(roughness), tile(specular)))
+
+
+def drawn(emitters: list, at, count: int) -> emitter_samples.EmitterSamples:
+    return emitter_samples.EmitterSamples(
+        emitters, [1.0] * len(emitters), identity(), at, dr.opaque(mi.UInt32, 7), count
+    )
+
+
+@pytest.mark.parametrize("kinds", [("envmap",), ("constant", "directional", "spot")])
+def test_resampled_lights_are_unbiased_and_quieter(kinds, rng, monkeypatch):
+    """Against the sum over all rows, unshadowed: means of 2000 draws at 64 points; and the noise of plain sampling."""
+    emitters = [mi.load_dict(emitter(kind)) for kind in kinds]
+    n, copies = 64, 2000
+    rows = lights.rows(list(zip(emitters, kinds, strict=True)), 8192)
+    state = rng.bit_generator.state
+    truth = np.array(shade.reflect(points(n, 1, rng), rows.table(identity()), None))
+    spread = {}
+    for candidates in (8, 1):
+        monkeypatch.setattr(emitter_samples, "CANDIDATES", candidates)
+        rng.bit_generator.state = state
+        at = points(n, copies, rng)
+        values = np.array(shade.reflect(at, drawn(emitters, at, 2), None)).reshape(3, copies, n)
+        deviation = values.std(axis=1)
+        z = (values.mean(axis=1) - truth) / (deviation / copies**0.5 + 2e-3 * truth.mean())  # rows are not points
+        assert np.abs(z).max() < 4.5 and np.abs(z.mean()) < 0.5, candidates
+        spread[candidates] = np.sqrt((deviation**2).mean() / (truth**2).mean())
+    print(kinds, "noise of 2 lights, resampled and plain:", spread[8], spread[1])
+    assert spread[8] < 0.6 * spread[1]
+
+
+def towards(emitter, p: np.ndarray, u=(0.5, 0.5)):
+    """Mitsuba's own sample of `emitter` at scene points (3, n): direction, weight (3, n), distance (n,)."""
+    it = dr.zeros(mi.Interaction3f, p.shape[1])
+    it.p = mi.Point3f(*p.astype(np.float32))
+    ds, weight = emitter.sample_direction(it, mi.Point2f(*u), True)
+    return tuple(np.broadcast_to(np.array(v), (*np.shape(v)[:-1], p.shape[1])) for v in (ds.d, weight, ds.dist))
+
+
+@pytest.mark.parametrize("kind", ["point", "spot", "directional"])
+def test_rows_of_single_lights_are_mitsubas_in_any_placement(kind, rng):
+    """Direction, irradiance and distance, from points of a field that is rotated, scaled and moved."""
+    place = mi.ScalarTransform4f().translate([1, 0.5, -1]).rotate([0.48, 0.8, 0.36], 70)
+    frame = Frame(scenes.SIMILARITY, np.array(place.matrix, np.float64), 0.7)
+    x = rng.uniform(-0.9, 0.9, (3, 400))
+    field_x = tuple(mi.Float(c.astype(np.float32)) for c in x)
+    loaded = mi.load_dict(emitter(kind))
+    table = lights.rows([(loaded, kind)], 1).table(frame)
+    wi, irradiance, distance = table.sample(dr.zeros(mi.UInt32, 400), field_x, True)
+    d, weight, dist = towards(loaded, np.array(frame.point_to_world(field_x)))
+    np.testing.assert_allclose(np.array(frame.direction_to_world(wi)), d, atol=2e-6)
+    # The spot's ramp between 4° and 16° divides float32 angles by 0.2.
+    np.testing.assert_allclose(np.array(irradiance), weight, rtol=1e-4, atol=1e-5 * weight.max())
+    assert weight.min() < 0.5 * weight.max() or kind == "directional"
+    if kind != "directional":
+        np.testing.assert_allclose(np.array(distance) * frame.length, dist, rtol=1e-5)
+
+
+def one_texel() -> dict:
+    image = np.zeros((16, 32, 3), np.float32)
+    image[5, 9] = (100, 50, 20)
+    return {"type": "envmap", "bitmap": mi.Bitmap(image), "scale": 2.5}
+
+
+@pytest.mark.parametrize("kind", ["texel", "envmap", "sunsky", "constant"])
+def test_environment_rows_shine_from_where_mitsuba_shines(kind):
+    """Total and vector irradiance, ∫ L dω and ∫ L ω dω, of the rows and by Mitsuba's own importance sampling."""
+    turned = mi.ScalarTransform4f().rotate([0.48, 0.8, -0.36], 50)
+    description = {**(one_texel() if kind == "texel" else emitter(kind))}
+    if kind in ("texel", "envmap"):
+        description["to_world"] = turned
+    if kind == "sunsky":
+        description["sun_aperture"] = 0.5358
+    loaded = mi.load_dict(description)
+    rows = lights.rows([(loaded, "envmap" if kind == "texel" else kind)], 512)
+    side = 512
+    u = (np.arange(side) + 0.5) / side
+    u, v = (mi.Float(c.ravel().astype(np.float32)) for c in np.meshgrid(u, u))
+    d, weight, _ = towards(loaded, np.zeros((3, side * side)), (u, v))
+    total, vector = weight.mean(axis=1), (weight[:, None] * d).mean(axis=2)
+    # A regular grid of 2¹⁸ samples; Mitsuba's eval is bilinear between texels, rows average 4 × 4 points of it.
+    np.testing.assert_allclose(rows.power.sum(axis=0), total, rtol=0.02)
+    np.testing.assert_allclose(rows.power.T @ rows.where, vector, atol=0.02 * total.max())
+    assert len(rows.power) <= 512
