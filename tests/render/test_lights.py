@@ -5,7 +5,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers import scenes, ztest
+from helpers import emitters, scenes, ztest
 
 import mi_ntf.render
 from mi_ntf.core.architecture import Similarity
@@ -15,7 +15,6 @@ from mi_ntf.render.frame import Frame
 
 SEEDS = 4
 MIDDLE = list(scenes.SIMILARITY.center)
-PLACE = (3.4, 3.0, 2.5)
 
 
 @pytest.fixture(autouse=True)
@@ -29,27 +28,7 @@ def blobs(tmp_path_factory):
 
 
 def emitter(kind: str) -> dict:
-    """One light of each kind, from the upper right front where it has a place."""
-    aim = mi.ScalarTransform4f().look_at(PLACE, MIDDLE, [0, 1, 0])
-    texture = {
-        "type": "bitmap",
-        "raw": True,
-        "bitmap": mi.Bitmap(np.tile(np.float32([[[1, 0.5, 2], [0.2, 1, 1]]]), (2, 1, 1))),
-    }
-    sky = {"type": "sunsky", "sun_direction": [0.6, 0.5, 0.7], "sky_scale": 4.0, "sun_aperture": 1.0}
-    lamp = {"type": "rectangle", "to_world": aim @ mi.ScalarTransform4f().scale(0.8)}
-    return {
-        "point": scenes.light("point"),
-        "directional": scenes.light("directional"),
-        "envmap": scenes.light("env"),
-        "constant": {"type": "constant", "radiance": {"type": "rgb", "value": [0.5, 0.6, 0.7]}},
-        "spot": {"type": "spot", "to_world": aim, "cutoff_angle": 16.0, "beam_width": 4.0, "intensity": 50.0},
-        "textured": {"type": "spot", "to_world": aim, "cutoff_angle": 20.0, "intensity": 50.0, "texture": texture},
-        "projector": {"type": "projector", "to_world": aim, "fov": 30.0, "irradiance": texture, "scale": 9.0},
-        "sunsky": {**sky, "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], -90)},
-        "area": {**lamp, "emitter": {"type": "area", "radiance": 12.0}},
-        "directionalarea": {**lamp, "emitter": {"type": "directionalarea", "radiance": 12.0}},
-    }[kind]  # fmt: skip
+    return emitters.emitter(kind, MIDDLE, scenes.SIMILARITY.radius)
 
 
 def check_against_volpath(field, light: dict, label: str, **options):
@@ -121,9 +100,9 @@ def drawn(emitters: list, at, count: int) -> emitter_samples.EmitterSamples:
 @pytest.mark.parametrize("kinds", [("envmap",), ("constant", "directional", "spot")])
 def test_resampled_lights_are_unbiased_and_quieter(kinds, rng, monkeypatch):
     """Against the sum over all rows, unshadowed: means of 2000 draws at 64 points; and the noise of plain sampling."""
-    emitters = [mi.load_dict(emitter(kind)) for kind in kinds]
+    made = [mi.load_dict(emitter(kind)) for kind in kinds]
     n, copies = 64, 2000
-    rows = lights.rows(list(zip(emitters, kinds, strict=True)), 8192)
+    rows = lights.rows(list(zip(made, kinds, strict=True)), 8192)
     state = rng.bit_generator.state
     truth = np.array(shade.reflect(points(n, 1, rng), rows.table(identity()), None))
     spread = {}
@@ -131,7 +110,7 @@ def test_resampled_lights_are_unbiased_and_quieter(kinds, rng, monkeypatch):
         monkeypatch.setattr(emitter_samples, "CANDIDATES", candidates)
         rng.bit_generator.state = state
         at = points(n, copies, rng)
-        values = np.array(shade.reflect(at, drawn(emitters, at, 2), None)).reshape(3, copies, n)
+        values = np.array(shade.reflect(at, drawn(made, at, 2), None)).reshape(3, copies, n)
         deviation = values.std(axis=1)
         z = (values.mean(axis=1) - truth) / (deviation / copies**0.5 + 2e-3 * truth.mean())  # rows are not points
         assert np.abs(z).max() < 4.5 and np.abs(z.mean()) < 0.5, candidates
