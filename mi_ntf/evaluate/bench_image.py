@@ -2,7 +2,7 @@
 
     python -m mi_ntf.evaluate.bench_image --size 600 --columns 50 --rows 10 [--repeats 3]
 
-prints JSON: seconds per render after a first one that compiles, and the peak memory of the process, which is why
+prints JSON: seconds per render after a small one that compiles, and the peak memory of the process, which is why
 measurements of memory run in a process of their own.
 """
 
@@ -63,16 +63,16 @@ def integrator(columns: int, rows: int, **options):
                          "environment_lights": lights, **options})
 
 
-def timed(scene, integrator_, repeats: int) -> list[float]:
-    """Wall seconds of each of `repeats` renders after one that compiles."""
+def timed(scene, integrator_, repeats: int, first: bool = True) -> list[float]:
+    """Wall seconds of each of `repeats` renders, after a `first` one that compiles."""
     found = []
-    for seed in range(repeats + 1):
+    for seed in range(repeats + first):
         dr.sync_thread()
         start = time.perf_counter()
         dr.eval(mi.render(scene, integrator=integrator_, seed=seed, spp=1))
         dr.sync_thread()
         found.append(time.perf_counter() - start)
-    return found[1:] if repeats else found
+    return found[first:]
 
 
 def in_own_process(size: int, columns: int, rows: int, repeats: int) -> dict:
@@ -97,8 +97,9 @@ def main() -> None:
     from .. import render
 
     render.register()
+    timed(under_sky(32, 4, 2), integrator(4, 2), 1)  # compiles: kernels hold neither the image's size nor the lights
     scene, nrf = under_sky(options.size, options.columns, options.rows), integrator(options.columns, options.rows)
-    found = timed(scene, nrf, options.repeats)
+    found = timed(scene, nrf, options.repeats, first=False)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
     print(json.dumps({"seconds": found, "peak_bytes": peak}))
 

@@ -18,7 +18,7 @@ def many_lights_rows(sizes: Sizes) -> list[Row]:
     columns, rows = sizes.many
     found = bench_image.in_own_process(sizes.image, columns, rows, 1)
     what = f"{sizes.image}² image, transmittance_map, {columns}×{rows} environment ({columns * rows} lights)"
-    details = {"seconds": found["seconds"], "process": "its own, after one render that compiles"}
+    details = {"seconds": found["seconds"], "process": "its own, after a small render that compiles"}
     return [row(what, found["seconds"][-1], "s", most=200, details=details),
             row(what + ", peak memory", found["peak_bytes"] / 2**30, "GiB", most=4)]
 
