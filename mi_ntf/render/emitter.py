@@ -47,7 +47,9 @@ def emitter_class() -> type:
         def __init__(self, props):
             self.visibility = props.get("visibility", "auto")
             if self.visibility not in AVAILABLE:
-                raise MiNtfError(f'ntf emitter: visibility is "{self.visibility}", expected one of {_text(AVAILABLE)}')
+                raise MiNtfError(
+                    f'ntf emitter: visibility is "{self.visibility}", expected one of {", ".join(AVAILABLE)}'
+                )
             nested = [props[name] for name in list(props.keys()) if name not in ("visibility", "to_world")]
             self.inner = _single([o for o in nested if isinstance(o, mi.Emitter)], "emitter", "a light to wrap")
             self.medium = _single([o for o in nested if getattr(o, "is_nrf", False)], "medium", "an nrf medium")
@@ -135,10 +137,6 @@ def emitter_class() -> type:
 def _is_far(emitter) -> bool:
     """Whether its light comes from infinity: an environment or a directional light."""
     return bool(mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite))
-
-
-def _text(names) -> str:
-    return ", ".join(names)
 
 
 def _single(objects: list, kind: str, what: str):

@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..infer.lights import LightTable
-from . import light_rows
+from . import light_gradients, light_rows
 from .emitter_samples import EmitterSamples
 from .frame import Frame
 
@@ -49,6 +49,7 @@ class Lights:
         self.light_samples = light_samples
         discrete = [(e, k) for e, k in zip(emitters, self.kinds, strict=True) if not light_samples and is_discrete(e)]
         self.rows = rows(discrete, environment_lights)
+        self._discrete = discrete, environment_lights
         pairs = [(e, w) for e, w in zip(emitters, scene.emitters(), strict=True) if light_samples or not is_discrete(e)]
         self.sampled = [e for e, _ in pairs if _shines(e)]
         self._weights = [outer.sampling_weight() for e, outer in pairs if _shines(e)]
@@ -79,7 +80,9 @@ class Lights:
 
     def table(self, frame: Frame) -> LightTable:
         """The discrete lights, in the field coordinates of `frame`."""
-        return self.rows.table(frame)
+        table = self.rows.table(frame)
+        light_gradients.attach(table, self.rows, *self._discrete, frame)
+        return table
 
     def sources(self, table: LightTable, frame: Frame, points, seed) -> list:
         """What to sum over at `points` (in the coordinates of `frame`): pairs of a source, which has ``count`` and
@@ -94,11 +97,6 @@ class Lights:
 def method_for_drawn(method: str) -> str:
     """The visibility method of drawn lights where `method` serves the table's: maps and volumes are made of rows."""
     return "raymarch" if method in ("transmittance_map", "transmittance_volume") else method
-
-
-def kinds(scene) -> list[str]:
-    """Plugin names of the scene's emitters."""
-    return [kind(e) for e in scene.emitters()]
 
 
 def kind(emitter) -> str:
@@ -146,8 +144,3 @@ def rows(emitters: list, environment_lights: int) -> light_rows.Rows:
         else light_rows.delta(e, k)
         for e, k in emitters
     ])  # fmt: skip
-
-
-def table(scene, frame: Frame, environment_lights: int) -> LightTable:
-    """The scene's discrete lights in the field coordinates of `frame`."""
-    return Lights(scene, (), 0, environment_lights).table(frame)
