@@ -55,8 +55,6 @@ def test_the_good_scene_renders(path):
         ({"integrator": '<string name="visiblity" value="none"/>'}, '"visiblity"'),
         ({"integrator": '<string name="visibility" value="raymarsh"/>'},
          'visibility is "raymarsh", expected one of raymarch, transmittance_volume'),
-        ({"integrator": '<string name="visibility" value="visibility_mlp"/>'},
-         "visibility visibility_mlp is not part of this version; choose one of"),
         ({"integrator": '<integer name="samples" value="3"/>'}, "samples is 3, expected 8 to 8192"),
         ({"integrator": '<string name="map_source" value="net"/>'},
          'map_source is "net", expected one of'),
@@ -73,8 +71,6 @@ def test_the_good_scene_renders(path):
         ({"medium": '<string name="filename" value="nowhere.safetensors"/>'}, "nowhere.safetensors does not exist"),
         ({"shape": '<float name="radius" value="0.3"/>'}, "give shape and medium the same placement"),
         ({"shape": '<point name="center" x="1.5" y="0" z="0"/>'}, "but the nrf medium inside it"),
-        ({"light": '<emitter type="point"><point name="position" x="0.3" y="0" z="0"/></emitter>',
-          "integrator": '<string name="visibility" value="transmittance_map"/>'}, "lies inside the captured object"),
     ],
 )  # fmt: skip
 def test_bad_input(path, named, text):
