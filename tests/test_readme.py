@@ -62,16 +62,16 @@ def test_commands_in_their_order(folder):
                 words[words.index(option) + 1] = value
         missing = {k: v for k, v in CAPTURE.items() if words[1] == "capture" and k not in words}
         extra = [word for pair in missing.items() for word in pair]
-        if words[0] == "mitsuba":
-            # `$res` of the shipped scenes; a swapped one is small by itself.
-            small = ["-D", "res=16"] if "scenes/" in words[-1] else []
-            words = [words[0], *small, *words[1:]]
+        if words[0] == "mitsuba" and "scenes/" in words[-1]:  # a swapped one is small by itself
+            words = [words[0], "-D", "res=16", *words[1:]]
+        if words[1] in ("explain", "bake"):
+            extra = ["-D", "res=16", "-D", "spp=1"]
         if words[1] == "info":
             assert "similarity" in check(*words, folder=folder)
         else:
             check(*words, *extra, folder=folder)
         ran.add(words[1] if words[0] == "mi-ntf" else "mitsuba")
-    assert ran == {"capture", "train", "swap", "mitsuba", "info", "compare"}
+    assert ran == {"capture", "train", "swap", "mitsuba", "info", "compare", "explain", "bake"}
 
 
 def test_names_in_the_table_are_the_plugins(folder):

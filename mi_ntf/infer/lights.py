@@ -35,6 +35,7 @@ class LightTable:
         rows = np.concatenate([self.where, flag, np.reshape(power, (-1, 3)), 0 * flag], axis=1)
         self._rows = dj.Float(rows.astype(np.float32).ravel())
         self._scale = dr.opaque(dj.Float, scale)
+        self.moving = False  # whether a light's place carries gradients
         columns = [] if cones is None else np.array(np.transpose(cones), np.float32, order="C")
         self._cones = [dj.Float(c) for c in columns] or None
 
@@ -45,6 +46,15 @@ class LightTable:
         part = LightTable(where[rows], power[rows], is_point[rows], scale, dj, None if cones is None else cones[rows])
         part.first, part.total = self.first + first, self.total
         return part
+
+    def attach(self, where, power) -> None:
+        """Let gradients flow to `where` and `power`, 3-tuples of arrays of a number a light. Their values stay."""
+        self.moving = dr.grad_enabled(where)
+        rows = self.dj.Float(self._rows)
+        first = 8 * dr.arange(self.dj.UInt32, self.count)
+        for offset, column in zip((0, 1, 2, 4, 5, 6), (*where, *power), strict=True):
+            dr.scatter(rows, column, first + offset)
+        self._rows = dr.replace_grad(self._rows, rows)
 
     def sample(self, index, x, active):
         """Light `index` seen from `x`: ``(wi, irradiance, distance)``.

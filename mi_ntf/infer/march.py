@@ -269,27 +269,36 @@ def optical_depth(density, grid, x, d, length, steps, active):
     outside.
 
     `steps` = (shortest, longest, growth): the step at distance t is growth · t between the two bounds. Shading points
-    lie inside the skin, where the depth is made, so steps are fine there and coarse far away. `offset` in [0, 1), per
-    ray, places each step's sample.
+    lie inside the skin, where the depth is made, so steps are fine there and coarse far away.
+
+    Derivatives by `x` and `d` are those of the densities along the ray; its ends, where there are none, stay.
     """
-    hit, _m, h = spheres.chord(ops, x, d)
-    here = spheres.coordinate(x, d)
-    begin, end = dr.maximum(-h - here, 0), dr.minimum(length, h - here)
+    attached = dr.grad_enabled(x, d)
+    still, along = dr.detach(x), dr.detach(d)
+    hit, _m, h = spheres.chord(ops, still, along)
+    here = spheres.coordinate(still, along)
+    begin, end = dr.maximum(-h - here, 0), dr.minimum(dr.detach(length), h - here)
     shortest, longest, growth = steps
-    inverse = safe_inverse(d)
+    inverse = safe_inverse(along)
 
     def body(t, depth, active):
         step = dr.minimum(dr.clip(growth * t, shortest, longest), end - t)
-        p = tuple(xi + t * di for xi, di in zip(x, d, strict=True))
+        p = tuple(xi + t * di for xi, di in zip(still, along, strict=True))
         skip = clear_distance(grid, p, inverse)
         empty = skip > 0
         at = t + 0.5 * step
         q = tuple(xi + at * di for xi, di in zip(x, d, strict=True))
         sigma = density(q)
-        depth = dr.select(active & ~empty, depth + sigma * step, depth)
+        depth = depth + dr.select(active & ~empty, sigma * step, 0)
         t = t + dr.select(empty, skip + 1e-4, step)
         return t, depth, active & (t < end - 1e-5) & (depth < MAX_OPTICAL_DEPTH)
 
     zero = dr.zeros(type(x[0]), dr.width(x[0]))
     state = (begin, zero, active & hit & (end > begin))
-    return dr.while_loop(state=state, cond=lambda t, depth, active: active, body=body, label="light march")[1]
+    return dr.while_loop(
+        state=state,
+        cond=lambda t, depth, active: active,
+        body=body,
+        label="light march",
+        max_iterations=-1 if attached else None,  # a sum
+    )[1]

@@ -7,7 +7,7 @@ from ..core.ops import dot
 from . import ops
 
 
-def reflect(points, lights, visibility, specular=True):
+def reflect(points, lights, visibility, specular=True, gradients=False):
     """Σ over lights of irradiance · τ · f, f the phase function of :func:`mi_ntf.core.microfacet.scattering`: the h(x,
     ω_o) of method.md, section 1.
 
@@ -16,31 +16,47 @@ def reflect(points, lights, visibility, specular=True):
     visibility  has ``tau`` (:mod:`mi_ntf.infer.visibility`); None: no shadow. The light then does not pass the skin
                 either, so a point reflects as a surface does, ρ ⟨n,ω_i⟩⁺
     specular    whether the field has a specular lobe; without, all its albedo is diffuse
+    gradients   whether a parameter is attached: the loop can then be differentiated in reverse. Transmittances are held
+                fixed unless the lights' own places are attached (``lights.moving``)
 
     Returns radiance per point, a 3-tuple. The loop over lights is symbolic: compile time and memory do not depend on
-    their number.
+    their number (but for moving lights, as Dr.Jit cannot differentiate one loop within another).
     """
     floats = type(points.x[0])
     uint = dr.uint32_array_t(floats)
-    count = dr.opaque(uint, lights.count)
+    moving = getattr(lights, "moving", False)
 
     def body(i, r, g, b):
         wi, irradiance, distance = lights.sample(i, points.x, True)
         diffuse, gloss = _lobes(wi, points, bool(visibility), specular)
         lit = diffuse > 0
-        tau = dr.select(lit, visibility.tau(points.x, wi, distance, i, lit), 0) if visibility else 1
+        tau = _tau(visibility, points.x, wi, distance, i, lit, gradients and not moving) if visibility else 1
         value = [k * diffuse + gloss for k in points.albedo] if specular else [k * diffuse for k in points.albedo]
         r, g, b = (c + e * v * tau for c, e, v in zip((r, g, b), irradiance, value, strict=True))
         return i + 1, r, g, b
 
     zero = dr.zeros(floats, dr.width(points.x[0]))
+    if moving:
+        light = zero, zero, zero
+        for i in range(lights.count):
+            light = body(dr.opaque(uint, i), *light)[1:]
+        return light
+    count = dr.opaque(uint, lights.count)
     _, r, g, b = dr.while_loop(
         state=(dr.zeros(uint, dr.width(zero)), zero, zero, zero),
         cond=lambda i, r, g, b: i < count,
         body=body,
         label="lights",
+        max_iterations=-1 if gradients else None,  # a sum
     )
     return r, g, b
+
+
+def _tau(visibility, x, wi, distance, index, lit, fixed: bool):
+    """The transmittance where `lit`, 0 elsewhere; without derivatives if `fixed`."""
+    if fixed:
+        wi, distance = dr.detach(wi), dr.detach(distance)
+    return dr.select(lit, visibility.tau(x, wi, distance, index, lit), 0)
 
 
 def _lobes(wi, points, skin: bool, specular: bool):

@@ -86,7 +86,7 @@ class Composition:
     def _runs(self) -> list:
         """Runs of the table's lights, (first, last), whose maps fit into memory together."""
         found = self.effects
-        if not self._media or not found.lit or not found.needs_visibility:
+        if not self._media or not found.lit or not found.needs_visibility or found.gradients:
             return [None]
         table = self.lights.table(self._media[0].frame)
         return visibility.parts(found.visibility, self._media, table, visibility.options(self.integrator))
@@ -108,6 +108,8 @@ class Composition:
         table = whole.part(*self.runs[self.run]) if len(self.runs) > 1 else whole
         options = visibility.options(self.integrator)
         drawn = lights.method_for_drawn(found.visibility)
+        if table.moving and drawn != "none":
+            drawn = "raymarch"  # the only one with derivatives
         method = found.visibility if table.count else drawn  # maps of no light are no maps
         mapped = visibility.build(method, medium, table, options)
         if drawn == method:
@@ -151,8 +153,10 @@ class Composition:
         for source, mapped in self.lights.sources(part.table, part.frame, points, stream):
             if self.run and not mapped:
                 continue
-            shadow = Known(view) if view is not None else self._shadow(part, "mapped" if mapped else "drawn")
-            light = shade.reflect(points, source, shadow, self.effects.specular)
+            # Maps and volumes stay where the lights were.
+            kind = "mapped" if mapped and not part.table.moving else "drawn"
+            shadow = Known(view) if view is not None else self._shadow(part, kind)
+            light = shade.reflect(points, source, shadow, self.effects.specular, self.effects.gradients)
             total = [a + b for a, b in zip(total, light, strict=True)]
         return total
 

@@ -124,7 +124,9 @@ def describe(scene, integrator, sensor, spp: int, media: list, light) -> Effects
     depth = integrator.max_depth
     lit = bool(light.rows.power.size or light.sampled) and not 0 <= depth < 2
     exhaustive = integrator.light_samples == 0
-    collocated = lit and integrator.visibility != "none" and _at_camera(light, sensor, media)
+    gradients = any(dr.grad_enabled(v) for _, v in mi.traverse(scene))
+    # Derivatives by a light's place need the light's own transmittance.
+    collocated = lit and not gradients and integrator.visibility != "none" and _at_camera(light, sensor, media)
     width, height = sensor.film().crop_size()
     method, reason = _method(integrator, width * height * spp, exhaustive, media)
     if collocated:
@@ -141,7 +143,7 @@ def describe(scene, integrator, sensor, spp: int, media: list, light) -> Effects
         surfaces=len(ordinary_shapes(scene)) > 0,
         specular=any(m.field.grid.gloss > MIN_GLOSS for m in media),
         bounces=lit and not 0 <= depth <= 2,
-        gradients=any(dr.grad_enabled(v) for _, v in mi.traverse(scene)),
+        gradients=gradients,
     )
 
 

@@ -39,14 +39,14 @@ class Rows:
         return LightTable(where, self.power, self.is_point, frame.length, mi, cones)
 
 
-def join(parts: list[Rows]) -> Rows:
-    """All of them, in order, without those that have no power."""
+def join(parts: list[Rows], dark: bool = False) -> Rows:
+    """All of them, in order, without those that have no power unless `dark`."""
     if not parts:
         return Rows(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, bool))
     where, power, is_point = (
         np.concatenate([getattr(p, name) for p in parts]) for name in ("where", "power", "is_point")
     )
-    lit = power.max(axis=1, initial=0) > 0
+    lit = (power.max(axis=1, initial=0) > 0) | dark
     cones = None
     if any(p.cones is not None for p in parts):
         cones = np.concatenate([np.tile(NO_CONE, (len(p.power), 1)) if p.cones is None else p.cones for p in parts])
@@ -82,8 +82,9 @@ def _look(emitter, p: np.ndarray):
     return *to_host, float(np.ravel(ds.dist)[0])
 
 
-def environment(emitter, kind: str, limit: int) -> Rows:
-    """At most `limit` directional lights for an ``envmap``, ``constant`` or ``sunsky``.
+def environment(emitter, kind: str, limit: int, dark: bool = False) -> Rows:
+    """At most `limit` directional lights for an ``envmap``, ``constant`` or ``sunsky``; with those without power if
+    `dark`.
 
     On a grid of twice as many columns as rows (no finer than the map itself), each with the irradiance of its texel,
     radiance × solid angle, from the direction of the texel's centre of radiance. The sun is a light of its own.
@@ -93,6 +94,23 @@ def environment(emitter, kind: str, limit: int) -> Rows:
         sun = _Sun(emitter)
         limit = max(1, limit - 1)
         parts.append(sun.rows)
+    world, solid_angle, (rows, columns) = texels(emitter, kind, limit)
+    n = SUBSAMPLES
+    radiance = _radiance(emitter, sun.avoid(world) if sun else world)
+    power = radiance * solid_angle[:, None]
+    weight = power.sum(axis=1) + 1e-12 * solid_angle
+
+    def by_texel(v):
+        return v.reshape(rows, n, columns, n, -1).sum(axis=(1, 3)).reshape(rows * columns, -1)
+
+    centre = by_texel(world * weight[:, None])
+    centre /= np.linalg.norm(centre, axis=1, keepdims=True)
+    return join([Rows(centre, by_texel(power), np.zeros(rows * columns, bool)), *parts], dark)
+
+
+def texels(emitter, kind: str, limit: int):
+    """``(world, solid_angle, (rows, columns))``: scene directions and solid angles of SUBSAMPLES² points of each of
+    `rows` × `columns` texels, at most `limit`, of an environment; by rows of points."""
     rows = max(1, int(np.sqrt(limit / 2)))
     columns = max(1, limit // rows)
     rotation = _rotation(emitter, kind)
@@ -105,18 +123,8 @@ def environment(emitter, kind: str, limit: int) -> Rows:
     theta, phi = (v.ravel() for v in np.meshgrid(theta, phi, indexing="ij"))
     # Mitsuba's parametrisation of the sphere: y up, u from −z around to +x.
     local = np.stack([np.sin(phi) * np.sin(theta), np.cos(theta), -np.cos(phi) * np.sin(theta)], axis=1)
-    world = local @ rotation.T
-    radiance = _radiance(emitter, sun.avoid(world) if sun else world)
     solid_angle = np.sin(theta) * (np.pi / rows / n) * (2 * np.pi / columns / n)
-    power = radiance * solid_angle[:, None]
-    weight = power.sum(axis=1) + 1e-12 * solid_angle
-
-    def by_texel(v):
-        return v.reshape(rows, n, columns, n, -1).sum(axis=(1, 3)).reshape(rows * columns, -1)
-
-    centre = by_texel(world * weight[:, None])
-    centre /= np.linalg.norm(centre, axis=1, keepdims=True)
-    return join([Rows(centre, by_texel(power), np.zeros(rows * columns, bool)), *parts])
+    return local @ rotation.T, solid_angle, (rows, columns)
 
 
 def _rotation(emitter, kind: str) -> np.ndarray:

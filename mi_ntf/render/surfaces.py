@@ -34,7 +34,8 @@ class Surfaces:
 
     def blocked(self, p, d, distance, active):
         """Whether a shape lies between `p` and the light at `distance` along `d`."""
-        return self._all.ray_test(mi.Ray3f(p, d, distance * (1 - mi.math.ShadowEpsilon), 0.0, []), active)
+        far = dr.detach(distance) * (1 - mi.math.ShadowEpsilon)
+        return self._all.ray_test(mi.Ray3f(dr.detach(p), dr.detach(d), far, 0.0, []), active)
 
     def direct(self, si, rng, active):
         """Reflected radiance of one emitter sample."""
