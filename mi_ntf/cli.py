@@ -157,6 +157,8 @@ class Explain:
         default_factory=tuple
     )
     """Value of $KEY in the scene."""
+    measure: bool = False
+    """Measure the prices of this machine, render, and set the real costs beside the predicted ones."""
     json: bool = False
     """Print JSON in place of a table."""
 
@@ -164,7 +166,7 @@ class Explain:
         parameters = _definitions(self.define)
         from mi_ntf.render.explain import explain, print_table
 
-        _report(explain(self.scene, parameters), self.json, print_table)
+        _report(explain(self.scene, parameters, self.measure), self.json, print_table)
 
 
 @dataclass

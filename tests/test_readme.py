@@ -75,7 +75,7 @@ def test_commands_in_their_order(folder):
 
 
 def test_names_in_the_table_are_the_plugins(folder):
-    from mi_ntf.infer.visibility import AVAILABLE
+    from mi_ntf.infer.visibility import METHODS
 
     rows = re.findall(r"^\| `(\w+)` \|", TEXT, re.M)
-    assert set(AVAILABLE) <= set(rows)
+    assert set(METHODS) <= set(rows)

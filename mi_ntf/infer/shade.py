@@ -6,6 +6,9 @@ from ..core import microfacet
 from ..core.ops import dot
 from . import ops
 
+EDGE = 0.02
+"""Cosines over which derivatives spread the jump of the phase function between light from below and from above."""
+
 
 def reflect(points, lights, visibility, specular=True, gradients=False):
     """Σ over lights of irradiance · τ · f, f the phase function of :func:`mi_ntf.core.microfacet.scattering`: the h(x,
@@ -31,6 +34,8 @@ def reflect(points, lights, visibility, specular=True, gradients=False):
         diffuse, gloss = _lobes(wi, points, bool(visibility), specular)
         lit = diffuse > 0
         tau = _tau(visibility, points.x, wi, distance, i, lit, gradients and not moving) if visibility else 1
+        if moving and visibility:
+            tau = tau * _edge(wi, points.normal)
         value = [k * diffuse + gloss for k in points.albedo] if specular else [k * diffuse for k in points.albedo]
         r, g, b = (c + e * v * tau for c, e, v in zip((r, g, b), irradiance, value, strict=True))
         return i + 1, r, g, b
@@ -50,6 +55,12 @@ def reflect(points, lights, visibility, specular=True, gradients=False):
         max_iterations=-1 if gradients else None,  # a sum
     )
     return r, g, b
+
+
+def _edge(wi, normal):
+    """1, with the slope of a ramp over EDGE: what the jump of the skin's lobes at the horizon adds to derivatives."""
+    cos = dot(normal, wi)
+    return dr.replace_grad(type(cos)(1), dr.select(dr.detach(cos) < EDGE, cos * (1 / EDGE), 0))
 
 
 def _tau(visibility, x, wi, distance, index, lit, fixed: bool):

@@ -16,7 +16,6 @@ import mitsuba as mi
 
 from .. import __version__
 from ..infer.visibility.raymarch import default_steps
-from ..infer.visibility.transmittance_map import channels
 
 FACING = 0.5
 """Share of (point, light) pairs whose light falls on the front, the others ask for no visibility."""
@@ -70,7 +69,6 @@ class Work:
     samples       cells across the unit sphere's diameter
     source        of maps: ``field`` or ``network``
     network       the field is its networks, not its grid, of `voxels`³
-    map_bytes     that maps may take at a time
     """
 
     rays: float
@@ -83,7 +81,6 @@ class Work:
     components: int = 1
     network: bool = False
     voxels: int = 192
-    map_bytes: float = math.inf
 
 
 def light_steps(samples: int) -> int:
@@ -140,7 +137,6 @@ def work(integrator, medium, method: str, rays: int, lights: int = 1) -> Work:
         texels=integrator.map_resolution**2, samples=integrator.samples, source=integrator.map_source,
         components=medium.field.network.components if network else integrator.map_components,
         network=medium.representation == "network", voxels=medium.field.grid.resolution,
-        map_bytes=integrator.map_memory * 2**20,
     )
 
 
@@ -159,12 +155,10 @@ def seconds(work: Work, c: Constants) -> dict[str, float]:
 
 
 def memory(work: Work, chunk: int) -> dict[str, int]:
-    """Bytes held at a time, `chunk` camera rays in flight."""
-    width = {"transmittance_map": channels(work.components), "transmittance_volume": work.samples}
+    """Bytes held at a time beside maps, `chunk` camera rays in flight."""
     share = work.points / max(work.rays, 1)
     return {
         "field grid": 4 * work.voxels**3 + 32 * min(work.voxels, 128) ** 3,
-        "maps or volumes": int(min(4 * width.get(work.method, 0) * work.texels * work.lights, work.map_bytes)),
         # 20 floats a shading point.
         "rays in flight": round(min(chunk, work.rays) * max(share, 1) * 80),
     }

@@ -7,7 +7,6 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.errors import MiNtfError
-from ..infer.visibility import AVAILABLE, METHODS
 from . import cost
 
 PINHOLES = ("PerspectiveCamera",)
@@ -150,15 +149,9 @@ def describe(scene, integrator, sensor, spp: int, media: list, light) -> Effects
 def _method(integrator, rays: int, exhaustive: bool, media: list) -> tuple[str, str]:
     """The visibility method that runs, and why."""
     method, reason = integrator.visibility, "chosen by name"
-    if method not in AVAILABLE:
+    if method in ("transmittance_map", "transmittance_volume") and not exhaustive:
         raise MiNtfError(
-            f"visibility {method} is not part of this version; choose one of {', '.join(AVAILABLE)}"
-            if method in METHODS
-            else f'visibility is "{method}", expected one of {", ".join(METHODS)}'
-        )
-    if method == "transmittance_map" and not exhaustive:
-        raise MiNtfError(
-            f"light_samples is {integrator.light_samples}, but visibility=transmittance_map holds one map for every "
+            f"light_samples is {integrator.light_samples}, but visibility={method} holds one map or volume for every "
             "light and sums all of them; remove light_samples or choose raymarch or neural_transmittance"
         )
     if method == "auto":

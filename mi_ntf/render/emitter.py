@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.errors import MiNtfError
-from ..infer.visibility import AVAILABLE
+from ..infer.visibility import METHODS
 from . import lights
 from .visibility import Options, build
 
@@ -46,9 +46,9 @@ def emitter_class() -> type:
 
         def __init__(self, props):
             self.visibility = props.get("visibility", "auto")
-            if self.visibility not in AVAILABLE:
+            if self.visibility not in METHODS:
                 raise MiNtfError(
-                    f'ntf emitter: visibility is "{self.visibility}", expected one of {", ".join(AVAILABLE)}'
+                    f'ntf emitter: visibility is "{self.visibility}", expected one of {", ".join(METHODS)}'
                 )
             nested = [props[name] for name in list(props.keys()) if name not in ("visibility", "to_world")]
             self.inner = _single([o for o in nested if isinstance(o, mi.Emitter)], "emitter", "a light to wrap")

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ..core.errors import MiNtfError
-from . import calibrate, cost, effects, lights, register
+from . import calibrate, cost, effects, lights, register, visibility
 from .measure import measure as watch
 
 
@@ -48,7 +48,7 @@ def explain(scene: Path, parameters: dict[str, str], measure: bool = False) -> d
         "constants": "measured on this machine" if cost.measured() else "built in; --measure measures this machine's",
         "points": sum(w.points for w in work),
         "seconds": _sum(cost.seconds(w, cost.constants()) for w in work),
-        "memory_bytes": _memory(work),
+        "memory_bytes": _memory(work) | {"maps or volumes": _held(integrator, media, found, light)},
     }
     return report | ({"measured": watch(loaded, integrator, spp)} if measure else {})
 
@@ -73,6 +73,16 @@ def _memory(works: list[cost.Work]) -> dict[str, int]:
     from .integrator import CHUNK
 
     return _sum(cost.memory(replace(w, rays=max(w.rays, 1)), CHUNK) for w in works)
+
+
+def _held(integrator, media: list, found, light) -> int:
+    """Bytes of the maps or volumes that are held at a time."""
+    if not (found.lit and found.needs_visibility):
+        return 0
+    table, options = light.table(media[0].frame), visibility.options(integrator)
+    first, last = visibility.parts(found.visibility, media, table, options)[0]
+    sizes = [visibility.size_per_light(found.visibility, medium, table, options) for medium in media]
+    return (last - first) * sum(sizes)
 
 
 def _sum(stages) -> dict:

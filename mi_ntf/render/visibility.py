@@ -49,10 +49,9 @@ def options(integrator) -> Options:
 def parts(method: str, media, table, options: Options) -> list:
     """``(first, last)`` of runs of lights whose maps or volumes, of all `media`, fit into `map_memory`; one run for
     methods that hold nothing per light. Raises MiNtfError where not even one light fits."""
-    if method not in ("transmittance_map", "transmittance_volume") or not table.count:
+    size = max(size_per_light(method, medium, table, options) for medium in media)
+    if not size or not table.count:
         return [(0, table.count)]
-    width = max(_numbers(method, medium, table, options) for medium in media)
-    size = 4 * width * options.map_resolution**2
     # Dr.Jit counts entries in 32 bits.
     count = int(min(options.map_memory * 2**20 / (size * len(media)), (2**32 - 1) / (size / 4)))
     if count < 1:
@@ -62,6 +61,13 @@ def parts(method: str, media, table, options: Options) -> list:
             "map_resolution"
         )
     return [(first, min(first + count, table.count)) for first in range(0, table.count, count)]
+
+
+def size_per_light(method: str, medium, table, options: Options) -> int:
+    """Bytes of one light's map or volume; 0 for methods that hold nothing per light."""
+    if method not in ("transmittance_map", "transmittance_volume"):
+        return 0
+    return 4 * _numbers(method, medium, table, options) * options.map_resolution**2
 
 
 def _numbers(method: str, medium, table, options: Options) -> int:
@@ -89,7 +95,7 @@ def build(method: str, medium, table, options: Options):
     if method == "none":
         return None
     if method == "raymarch":
-        steps = tuple(dr.opaque(mi.Float, s) for s in raymarch.default_steps(options.step))
+        steps = tuple(dr.opaque(mi.Float, s) for s in raymarch.default_steps(options.step, table.moving))
         return raymarch.RayMarch(source.density, field.grid, steps)
     if method == "visibility_mlp":
         return visibility_mlp.VisibilityMLP(field.network)

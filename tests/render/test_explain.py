@@ -1,9 +1,11 @@
 """`mi-ntf explain`: what is said is what is done."""
 
+import json
 from pathlib import Path
 
 import mitsuba as mi
 import pytest
+from helpers.programs import run_program
 
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.render import cost, measure
@@ -79,10 +81,13 @@ def test_table_names_every_effect_and_stage(capsys):
     assert all(name in text for name in report["seconds"])
 
 
-def test_measured_beside_predicted(capsys):
-    """The kernels' seconds are those of the whole render, but for Python and the film."""
-    parameters = {"visibility": "transmittance_map", "light": "point", "res": "32", "spp": "4"}
-    report = explain(SCENE, parameters, measure=True)
+def test_measured_beside_predicted(tmp_path, capsys):
+    """The kernels' seconds are those of the whole render, but for Python and the film. In a process of its own: Dr.Jit
+    counts the memory of all that lives in one."""
+    words = ("-Dvisibility=transmittance_map", "-Dlight=point", "-Dres=32", "-Dspp=4", "--measure", "--json")
+    done = run_program("mi-ntf", "explain", SCENE, *words, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
     real = report["measured"]
     assert set(real["stages"]) == set(report["seconds"]) and min(real["stages"].values()) > 0
     assert 0.3 * real["wall_seconds"] < sum(real["stages"].values()) < 2.5 * real["wall_seconds"]  # on two threads

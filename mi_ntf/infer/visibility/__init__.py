@@ -17,5 +17,3 @@ METHODS = (
     "auto",
 )
 """Every name that users may type."""
-AVAILABLE = METHODS
-"""Those that this version implements."""

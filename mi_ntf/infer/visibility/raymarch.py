@@ -16,8 +16,8 @@ class RayMarch:
         return dr.exp(-optical_depth(self.density, self.grid, x, wi, distance, self.steps, active))
 
 
-def default_steps(step: float) -> tuple[float, float, float]:
+def default_steps(step: float, gradients: bool = False) -> tuple[float, float, float]:
     """Steps from the camera march's cell length: finer beside the point, which lies in the skin that makes the depth, a
     fifth of the distance further off, and never longer than half an occupancy cell, which would jump over thin
-    parts."""
-    return 0.375 * step, max(step, 1 / 64), 0.2
+    parts. `gradients`: for derivatives, which see the slopes of a skin: 28 % off at that length, 2 % at 1/512."""
+    return 0.375 * step, 1 / 512 if gradients else max(step, 1 / 64), 0.2

@@ -1,0 +1,129 @@
+"""Derivatives of the image by the lights, against central differences over the same random numbers."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers import scenes
+
+import mi_ntf.render
+from mi_ntf.core.errors import MiNtfError
+
+WEIGHTS = [1.0, 0.6, -0.4]
+"""Of the colour channels in the scalar that is differentiated: none cancels another."""
+
+
+@pytest.fixture(autouse=True)
+def plugins(variant):
+    mi_ntf.render.register()
+
+
+@pytest.fixture(scope="module")
+def blobs(tmp_path_factory):
+    # Soft enough that shadows move by many cells' worth of depth before they are gone.
+    return scenes.write_blobs(tmp_path_factory.mktemp("field"), log_density=2.0, roughness=0.6)
+
+
+def setting(blobs, lights, visibility, **options):
+    integrator = {"type": "nrf", "visibility": visibility, "hide_emitters": True, "samples": 256, **options}
+    scene = scenes.scene(blobs, integrator, lights, size=12, spp=16)
+    return scene, mi.traverse(scene)
+
+
+def value(scene, parameters, seed=3):
+    """A weighted mean over the picture that prefers its upper right: no symmetry hides an error. Derivatives are taken
+    with the random numbers of seed 3, which may not be the picture's own."""
+    image = mi.render(scene, parameters, seed=seed, seed_grad=3 if seed != 3 else 4)[..., :3]
+    height, width = image.shape[:2]
+    y, x = np.mgrid[:height, :width]
+    weights = (1 + x / width - 0.5 * y / height)[..., None] * np.array(WEIGHTS)
+    return dr.mean(image * mi.TensorXf(weights.astype(np.float32)), axis=None)
+
+
+def forward(scene, parameters, name, direction, kind):
+    """The derivative of :func:`value` as `name` moves along `direction`."""
+    original = kind(parameters[name])
+    t = mi.Float(0)
+    dr.enable_grad(t)
+    parameters[name] = original + t * kind(direction)
+    parameters.update()
+    result = value(scene, parameters, 4)
+    dr.forward(t)
+    slope = float(dr.grad(result).array[0])
+    parameters[name] = original
+    parameters.update()
+    return slope
+
+
+def backward(scene, parameters, name, direction, kind):
+    original = kind(parameters[name])
+    attached = kind(original)
+    dr.enable_grad(attached)
+    parameters[name] = attached
+    parameters.update()
+    dr.backward(value(scene, parameters, 4))
+    slope = float(np.sum(np.array(dr.grad(attached), np.float64) * np.array(kind(direction), np.float64)))
+    parameters[name] = original
+    parameters.update()
+    return slope
+
+
+def differences(scene, parameters, name, direction, kind, step):
+    """The same by central differences."""
+    original, found = kind(parameters[name]), []
+    for sign in (1, -1):
+        parameters[name] = original + sign * step * kind(direction)
+        parameters.update()
+        found.append(float(value(scene, parameters).array[0]))
+    parameters[name] = original
+    parameters.update()
+    return (found[0] - found[1]) / (2 * step)
+
+
+@pytest.mark.parametrize("mode", [forward, backward])
+@pytest.mark.parametrize("visibility", ["raymarch", "transmittance_map"])
+def test_intensity(blobs, visibility, mode):
+    """The image is linear in it: the difference's rounding is all that may differ."""
+    scene, parameters = setting(blobs, {"light": scenes.light("point")}, visibility)
+    case = scene, parameters, "light.intensity.value", [1.0, 0.5, 0.2], mi.Color3f
+    assert mode(*case) == pytest.approx(differences(*case, 10.0), rel=1e-3)
+
+
+@pytest.mark.parametrize("mode", [forward, backward])
+@pytest.mark.parametrize(("light_samples", "rel"), [(0, 0.02), (2, 0.05)])
+def test_environment_texels(blobs, light_samples, rel, mode):
+    """A patch of texels brightens. Exhaustively, their centres of radiance move with them, which the derivative leaves
+    out (1.2 % here); drawn lights come from the old map in the one and from the new maps in the other (4 % noise)."""
+    lights = {"light": scenes.light("env")}
+    scene, parameters = setting(blobs, lights, "raymarch", environment_lights=32, light_samples=light_samples)
+    patch = np.zeros(parameters["light.data"].shape, np.float32)
+    patch[3:9, 16:26] = [1.0, 0.8, 0.5]
+    case = scene, parameters, "light.data", patch, mi.TensorXf
+    assert mode(*case) == pytest.approx(differences(*case, 0.05), rel=rel)
+
+
+@pytest.mark.parametrize("mode", [forward, backward])
+@pytest.mark.parametrize("visibility", ["raymarch", "neural_transmittance", "transmittance_map", "none"])
+def test_position(blobs, visibility, mode):
+    """The light's distance, its angle, its shadows and the horizon, where the phase function jumps, move. Maps and
+    networks stay: derivatives are the march's. Differences see its steps: from 0.05 to 0.1 they vary by 1 %."""
+    scene, parameters = setting(blobs, {"light": scenes.light("point")}, "raymarch")
+    case = scene, parameters, "light.position", [-0.3, -0.6, 1.0], mi.Point3f
+    truth = differences(*case, 0.1)
+    without, _ = setting(blobs, {"light": scenes.light("point")}, "none")
+    unshadowed = differences(without, mi.traverse(without), *case[2:], 0.1)
+    assert abs(truth - unshadowed) > 0.5 * abs(truth)  # shadows matter here
+    scene, parameters = setting(blobs, {"light": scenes.light("point")}, visibility)
+    expected = unshadowed if visibility == "none" else truth
+    assert mode(scene, parameters, *case[2:]) == pytest.approx(expected, rel=0.03)
+
+
+def test_many_moving_lights_are_refused(blobs):
+    many = {f"light_{i}": {"type": "point", "position": [3, 3, i / 10], "intensity": 2.0} for i in range(33)}
+    scene, parameters = setting(blobs, many, "raymarch")
+    position = mi.Point3f(parameters["light_0.position"])
+    dr.enable_grad(position)
+    parameters["light_0.position"] = position
+    parameters.update()
+    with pytest.raises((MiNtfError, RuntimeError), match="33 lights, expected 32"):
+        scene.integrator().render(scene)
