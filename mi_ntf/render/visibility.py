@@ -88,15 +88,15 @@ def _inside(table) -> bool:
 def build(method: str, medium, table, options: Options):
     """The visibility `method` (never ``auto``) of `medium`, in its field coordinates; None for ``none``.
 
-    `table`: the :class:`mi_ntf.infer.lights.LightTable` of the same coordinates, which maps and volumes are made for;
-    others do not read it.
+    `table`: the :class:`mi_ntf.infer.lights.LightTable` of the same coordinates, which maps and volumes are made for,
+    and whose moving lights a march follows more finely; None serves the others.
     """
     source, field = medium.source, medium.field
     if method == "none":
         return None
     if method == "raymarch":
-        steps = tuple(dr.opaque(mi.Float, s) for s in raymarch.default_steps(options.step, table.moving))
-        return raymarch.RayMarch(source.density, field.grid, steps)
+        steps = raymarch.default_steps(options.step, gradients=table is not None and table.moving)
+        return raymarch.RayMarch(source.density, field.grid, tuple(dr.opaque(mi.Float, s) for s in steps))
     if method == "visibility_mlp":
         return visibility_mlp.VisibilityMLP(field.network)
     if method == "transmittance_volume":
