@@ -156,11 +156,12 @@ def seconds(work: Work, c: Constants) -> dict[str, float]:
 
 def memory(work: Work, chunk: int) -> dict[str, int]:
     """Bytes held at a time beside maps, `chunk` camera rays in flight."""
-    share = work.points / max(work.rays, 1)
+    # Chunks are strips of pixels: those across the object hold more points than others.
+    share = work.points / max(work.rays, 1) * (2 if work.rays > chunk else 1)
     return {
         "field grid": 4 * work.voxels**3 + 32 * min(work.voxels, 128) ** 3,
-        # 20 floats a shading point.
-        "rays in flight": round(min(chunk, work.rays) * max(share, 1) * 80),
+        # Some 24 floats a shading point, in arrays that Dr.Jit rounds up to powers of two.
+        "rays in flight": round(min(chunk, work.rays) * max(share, 1) * 128),
     }
 
 

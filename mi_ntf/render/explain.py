@@ -108,7 +108,8 @@ def _effects(scene, found, integrator, count: int) -> dict:
         "view transmittance for light": (
             found.collocated, "all light comes from the camera" if found.collocated else "a light is elsewhere"),
         "environment background": (
-            found.background, "an environment is visible" if found.background else "no environment, or hide_emitters"),
+            found.background, "an environment is visible" if found.background else
+            "there is no environment" if scene.environment() is None else "emitters are hidden"),
         "shading": (found.lit, "the scene has lights" if found.lit else unlit),
         "specular lobe": (
             found.specular, "a field has one" if found.specular else "no field has one above the threshold"),

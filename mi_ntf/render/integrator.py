@@ -12,7 +12,7 @@ from . import aovs
 from .composition import Composition
 
 CHUNK = 1 << 18
-"""Camera rays in flight: bounds the memory at some hundred MiB whatever the image and the number of lights."""
+"""Camera rays in flight: bounds the memory at about half a GiB whatever the image and the number of lights."""
 
 
 def integrator_class() -> type:
@@ -24,9 +24,9 @@ def integrator_class() -> type:
         =================== ======= ===================================================================================
         parameter           type    meaning
         =================== ======= ===================================================================================
-        visibility          string  how light reaches a point: ``raymarch``, ``neural_transmittance``,
-                                    ``transmittance_map``, ``none``, or ``auto``, which picks the cheaper of the first
-                                    and third (default: auto)
+        visibility          string  how light reaches a point: ``raymarch``, ``transmittance_map``,
+                                    ``neural_transmittance``, ``transmittance_volume``, ``visibility_mlp``, ``none``,
+                                    or ``auto``, the cheaper of the first two (default: auto)
         samples             integer steps across the unit sphere's diameter (default: 384)
         light_samples       integer lights per shading point, drawn from Mitsuba's emitter sampling and resampled, from
                                     any emitters; 0: all lights, every environment texel one, and 2 drawn ones (1 of a
@@ -59,7 +59,11 @@ def integrator_class() -> type:
         shade and, from `max_depth` 3 on, light each other. Shadow rays of surfaces are marched where `visibility` is a
         method of maps or volumes. With ``none`` fields cast no shadows and receive none.
 
-        Does not support: media other than ``nrf``; spectral and polarised variants.
+        The image can be differentiated by the lights: power, an environment's texels, and, of at most 32 lights in the
+        scene, position and direction, whose shadows are then marched whatever the method.
+
+        Does not support: media other than ``nrf``; spectral and polarised variants; derivatives by the fields and by
+        environments that turn.
         """
 
         def __init__(self, props):

@@ -70,12 +70,13 @@ def test_sky_of_one_pixel_per_light():
 def test_speed_up_is_a_ratio_of_lines():
     """Per light, tables and shading add; the ratio at 500 lights is the row's."""
     costs = {"camera": 1e-6, "points": 2.0, "volume/192": 192e-6, "map": 1e-6, "ours": 1e-7, "shade/volume": 2e-9,
-             "shade/map": 1e-9}
+             "shade/map": 1e-9, "voxels": 7.0}
     rows = bench_paper.image_rows(costs, bench_measure.FULL)
     m2, shade = 360_000, 360_000 * 2
     slow = 0.36 + 500 * (m2 * 192e-6 + shade * 2e-9)
     fast = 0.36 + 500 * (m2 * 1e-6 + shade * 1e-9)
     assert rows[0].measured == pytest.approx(slow / fast)
+    assert rows[1].measured == pytest.approx(slow / (7 + 0.36 + 500 * (m2 * 1e-7 + shade * 1e-9)))
     d = rows[0].details
     assert d["volume_fixed_seconds"] + 500 * d["volume_lights_seconds"] == pytest.approx(slow)
     assert bench_figure.LIGHTS == 500
