@@ -1,6 +1,6 @@
-"""Marches through the field: along camera rays (weights) and towards lights (optical depth).
+"""Marches through the field along camera rays: the points that they shade, and free flight.
 
-Both skip empty space by the grid's clearance: inside the empty cube around a cell, no step has density. Positions stay
+They skip empty space by the grid's clearance: inside the empty cube around a cell, no step has density. Positions stay
 on one lattice per ray, so that skipping changes no value.
 """
 
@@ -18,8 +18,6 @@ MIN_WEIGHT_RATE = 0.02
 pixel per unit-sphere radius of depth. It is the tail of nearly spent rays, and the faint rim of a skin."""
 MIN_TRANSMITTANCE = 1e-3
 """Camera rays end here; what lies behind could add 0.1 %."""
-MAX_OPTICAL_DEPTH = 12.0
-"""Light rays end here: τ < 6e-6."""
 
 
 def clear_distance(grid, p, inverse_d):
@@ -262,43 +260,3 @@ def free_flight(strands, maxt, step, offset, depth, which):
         state=state, cond=lambda k, passed, t, index, active: active, body=body, label="free flight"
     )
     return dr.isfinite(t), t, index
-
-
-def optical_depth(density, grid, x, d, length, steps, active):
-    """∫ σ along x + t d for t in [0, length], clipped to the unit sphere; stops at MAX_OPTICAL_DEPTH. `x` may lie
-    outside.
-
-    `steps` = (shortest, longest, growth): the step at distance t is growth · t between the two bounds. Shading points
-    lie inside the skin, where the depth is made, so steps are fine there and coarse far away.
-
-    Derivatives by `x` and `d` are those of the densities along the ray; its ends, where there are none, stay.
-    """
-    attached = dr.grad_enabled(x, d)
-    still, along = dr.detach(x), dr.detach(d)
-    hit, _m, h = spheres.chord(ops, still, along)
-    here = spheres.coordinate(still, along)
-    begin, end = dr.maximum(-h - here, 0), dr.minimum(dr.detach(length), h - here)
-    shortest, longest, growth = steps
-    inverse = safe_inverse(along)
-
-    def body(t, depth, active):
-        step = dr.minimum(dr.clip(growth * t, shortest, longest), end - t)
-        p = tuple(xi + t * di for xi, di in zip(still, along, strict=True))
-        skip = clear_distance(grid, p, inverse)
-        empty = skip > 0
-        at = t + 0.5 * step
-        q = tuple(xi + at * di for xi, di in zip(x, d, strict=True))
-        sigma = density(q)
-        depth = depth + dr.select(active & ~empty, sigma * step, 0)
-        t = t + dr.select(empty, skip + 1e-4, step)
-        return t, depth, active & (t < end - 1e-5) & (depth < MAX_OPTICAL_DEPTH)
-
-    zero = dr.zeros(type(x[0]), dr.width(x[0]))
-    state = (begin, zero, active & hit & (end > begin))
-    return dr.while_loop(
-        state=state,
-        cond=lambda t, depth, active: active,
-        body=body,
-        label="light march",
-        max_iterations=-1 if attached else None,  # a sum
-    )[1]

@@ -10,9 +10,11 @@ The stock ``mitsuba`` program does this by itself through the bridge.
 """
 
 import difflib
+from pathlib import Path
 
 import mitsuba as mi
 
+from ..core.errors import MiNtfError
 from ..infer.backend import module
 
 MEDIUM_PROPERTIES = ("filename", "to_world", "scale", "representation", "resolution")
@@ -63,6 +65,19 @@ def register() -> None:
     if not _watching:
         _watching = True
         mi.detail.add_variant_callback(_on_variant)
+
+
+def load_scene(path: Path, parameters: dict[str, str]):
+    """The scene of an XML file, `parameters` for its $names, whose integrator is ``nrf``; the variant is
+    ``llvm_ad_rgb`` where none is set. Raises MiNtfError if the integrator is another."""
+    if mi.variant() is None:
+        mi.set_variant("llvm_ad_rgb")
+    register()
+    scene = mi.load_file(str(path), **parameters)
+    integrator = scene.integrator()
+    if not hasattr(integrator, "map_resolution"):
+        raise MiNtfError(f'{path}: its integrator is {integrator.class_name()}, expected <integrator type="nrf">')
+    return scene
 
 
 def _on_variant(_old: str, new: str) -> None:

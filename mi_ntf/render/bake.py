@@ -11,7 +11,6 @@ import json
 import os
 from pathlib import Path
 
-import mitsuba as mi
 import numpy as np
 import OpenEXR
 
@@ -28,16 +27,10 @@ def bake(scene: Path, output: Path, parameters: dict[str, str]) -> dict:
 
     Raises MiNtfError where the scene has several media, or no lights that maps can be made for.
     """
-    from . import effects, lights, register, visibility
+    from . import effects, lights, load_scene, visibility
 
-    if mi.variant() is None:
-        mi.set_variant("llvm_ad_rgb")
-    register()
-    loaded = mi.load_file(str(scene), **parameters)
-    integrator = loaded.integrator()
-    if not hasattr(integrator, "map_resolution"):
-        raise MiNtfError(f'{scene}: its integrator is {integrator.class_name()}; bake reads <integrator type="nrf">')
-    media = effects.find_media(loaded)
+    loaded = load_scene(scene, parameters)
+    integrator, media = loaded.integrator(), effects.find_media(loaded)
     if len(media) != 1:
         raise MiNtfError(f"{scene} has {len(media)} nrf media, and a map file belongs to one; bake them one by one")
     (medium,) = media

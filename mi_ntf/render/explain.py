@@ -3,12 +3,10 @@
 from dataclasses import replace
 from pathlib import Path
 
-import mitsuba as mi
 from rich.console import Console
 from rich.table import Table
 
-from ..core.errors import MiNtfError
-from . import calibrate, cost, effects, lights, register, visibility
+from . import calibrate, cost, effects, lights, load_scene, visibility
 from .measure import measure as watch
 
 
@@ -20,14 +18,8 @@ def explain(scene: Path, parameters: dict[str, str], measure: bool = False) -> d
     is held beside the film. With `measure`, measures the machine's prices and renders: ``measured``, see
     :func:`mi_ntf.render.measure.measure`. Raises MiNtfError where rendering would.
     """
-    if mi.variant() is None:
-        mi.set_variant("llvm_ad_rgb")
-    register()
-    loaded = mi.load_file(str(scene), **parameters)
-    integrator = loaded.integrator()
-    if not hasattr(integrator, "map_resolution"):
-        raise MiNtfError(f'{scene}: its integrator is {integrator.class_name()}; explain reads <integrator type="nrf">')
-    media = effects.find_media(loaded)
+    loaded = load_scene(scene, parameters)
+    integrator, media = loaded.integrator(), effects.find_media(loaded)
     if measure:
         calibrate.calibrate(media[0])
     sensor = loaded.sensors()[0]

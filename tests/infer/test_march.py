@@ -95,7 +95,7 @@ def test_optical_depth(grid, rng):
     length = -b + np.sqrt(b * b - (x * x).sum(1) + 1)
     truth = quadrature(grid.density, x, d, np.zeros(400), length, 4000)
     steps = tuple(mi.Float(s) for s in raymarch.default_steps(2 / 512))
-    ours = march.optical_depth(
+    ours = raymarch.optical_depth(
         grid.density,
         grid,
         arrays(x),
@@ -115,7 +115,7 @@ def test_optical_depth_of_a_uniform_sphere(slab):
     d = np.array([[1.0, 0, 0]] * 5)
     length = np.array([np.inf, np.inf, 0.25, np.inf, np.inf])
     steps = tuple(mi.Float(s) for s in raymarch.default_steps(2 / 384))
-    ours = march.optical_depth(
+    ours = raymarch.optical_depth(
         slab.density,
         slab,
         arrays(x),

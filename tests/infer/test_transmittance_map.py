@@ -9,11 +9,11 @@ from helpers import fields
 from mi_ntf.core import logistic, mixture, ops
 from mi_ntf.infer.grid import GridField
 from mi_ntf.infer.lights import LightTable
-from mi_ntf.infer.march import optical_depth
 from mi_ntf.infer.network import NetworkField
 from mi_ntf.infer.profile import DepthProfile
 from mi_ntf.infer.visibility.light_rays import DIRECTIONAL, FRUSTUM, SPHERE, frames
 from mi_ntf.infer.visibility.map_source import CLEAR, Source, field_source, network_source
+from mi_ntf.infer.visibility.raymarch import optical_depth
 from mi_ntf.infer.visibility.transmittance_map import TransmittanceMap
 
 BLOBS = [(-0.3, 0.0, 0.0), (0.35, 0.2, 0.1), (0.0, -0.45, 0.3)], [0.4, 0.25, 0.2]

@@ -7,8 +7,8 @@ from helpers import fields
 
 from mi_ntf.infer.grid import GridField
 from mi_ntf.infer.lights import LightTable
-from mi_ntf.infer.march import optical_depth
 from mi_ntf.infer.network import NetworkField
+from mi_ntf.infer.visibility.raymarch import optical_depth
 from mi_ntf.infer.visibility.transmittance_volume import TransmittanceVolume
 
 CUBE = np.stack(np.meshgrid(*[[-0.55, 0.55]] * 3), -1).reshape(-1, 3)

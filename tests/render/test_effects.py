@@ -9,6 +9,7 @@ from helpers import fields, scenes
 import mi_ntf.render
 from mi_ntf.core import field_file, microfacet
 from mi_ntf.infer import march, shade
+from mi_ntf.infer.visibility import raymarch
 from mi_ntf.render import composition, effects, visibility, walk
 
 EYE = [scenes.SIMILARITY.center[0] + 1.2, scenes.SIMILARITY.center[1] + 1.5, scenes.SIMILARITY.center[2] + 5]
@@ -68,7 +69,7 @@ def test_light_at_the_camera_needs_no_visibility(blobs, monkeypatch):
         general.setattr(effects, "_at_camera", lambda *_: False)
         marched, count = scenes.render(scene), operations(scene)
     forbid(monkeypatch, visibility, "build")
-    forbid(monkeypatch, march, "optical_depth")
+    forbid(monkeypatch, raymarch, "optical_depth")
     reused = scenes.render(scene)
     assert described(scene).collocated and "not needed" in described(scene).reason
     assert np.abs(reused - marched)[..., :3].mean() < 0.01 * marched[..., :3].mean()  # the two marches' steps

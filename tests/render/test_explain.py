@@ -118,6 +118,6 @@ def test_stages_by_the_loops_of_kernels():
 def test_a_scene_without_our_integrator(tmp_path):
     scene = tmp_path / "scene.xml"
     scene.write_text('<scene version="3.9.0"><integrator type="path"/></scene>')
-    with pytest.raises(MiNtfError, match="its integrator is PathIntegrator; explain reads"):
+    with pytest.raises(MiNtfError, match="its integrator is PathIntegrator, expected"):
         explain(scene, {})
     assert mi.variant() == "llvm_ad_rgb"

@@ -2,11 +2,16 @@
 
 import drjit as dr
 
-from ..march import optical_depth
+from ...core import spheres
+from .. import ops
+from ..march import clear_distance, safe_inverse
+
+MAX_OPTICAL_DEPTH = 12.0
+"""Light rays end here: τ < 6e-6."""
 
 
 class RayMarch:
-    """`steps`: see :func:`mi_ntf.infer.march.optical_depth`."""
+    """`steps`: see :func:`optical_depth`."""
 
     def __init__(self, density, grid, steps):
         self.density, self.grid, self.steps = density, grid, steps
@@ -25,3 +30,43 @@ def default_steps(step: float, gradients: bool = False) -> tuple[float, float, f
     """
     longest = 1 / 512 if gradients else max(step, min(3 * step, 1 / 64))
     return 0.375 * step, longest, min(0.2, 38.4 * step)
+
+
+def optical_depth(density, grid, x, d, length, steps, active):
+    """∫ σ along x + t d for t in [0, length], clipped to the unit sphere; stops at MAX_OPTICAL_DEPTH. `x` may lie
+    outside.
+
+    `steps` = (shortest, longest, growth): the step at distance t is growth · t between the two bounds. Shading points
+    lie inside the skin, where the depth is made, so steps are fine there and coarse far away.
+
+    Derivatives by `x` and `d` are those of the densities along the ray; its ends, where there are none, stay.
+    """
+    attached = dr.grad_enabled(x, d)
+    still, along = dr.detach(x), dr.detach(d)
+    hit, _m, h = spheres.chord(ops, still, along)
+    here = spheres.coordinate(still, along)
+    begin, end = dr.maximum(-h - here, 0), dr.minimum(dr.detach(length), h - here)
+    shortest, longest, growth = steps
+    inverse = safe_inverse(along)
+
+    def body(t, depth, active):
+        step = dr.minimum(dr.clip(growth * t, shortest, longest), end - t)
+        p = tuple(xi + t * di for xi, di in zip(still, along, strict=True))
+        skip = clear_distance(grid, p, inverse)
+        empty = skip > 0
+        at = t + 0.5 * step
+        q = tuple(xi + at * di for xi, di in zip(x, d, strict=True))
+        sigma = density(q)
+        depth = depth + dr.select(active & ~empty, sigma * step, 0)
+        t = t + dr.select(empty, skip + 1e-4, step)
+        return t, depth, active & (t < end - 1e-5) & (depth < MAX_OPTICAL_DEPTH)
+
+    zero = dr.zeros(type(x[0]), dr.width(x[0]))
+    state = (begin, zero, active & hit & (end > begin))
+    return dr.while_loop(
+        state=state,
+        cond=lambda t, depth, active: active,
+        body=body,
+        label="light march",
+        max_iterations=-1 if attached else None,  # a sum
+    )[1]
