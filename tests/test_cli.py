@@ -59,7 +59,8 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list:
         ),
         ("swap s.xml f.safetensors -o out.xml", (Path("s.xml"), Path("f.safetensors"), Path("out.xml")), {}),
         ("compare a.exr b.exr", (Path("a.exr"), Path("b.exr")), {}),
-        ("explain s.xml -D spp=4 -D visibility=none", (Path("s.xml"), {"spp": "4", "visibility": "none"}), {}),
+        ("explain s.xml -D spp=4 -D light=env", (Path("s.xml"), {"spp": "4", "light": "env"}, False), {}),
+        ("explain s.xml --measure", (Path("s.xml"), {}, True), {}),
         ("info f.safetensors", (Path("f.safetensors"),), {}),
     ],
 )
