@@ -80,3 +80,14 @@ def test_own_mesh_from_photographs_to_a_lit_image(tmp_path):
     image = read_image(tmp_path / "relit.exr")
     assert image.shape == (96, 96, 4)
     assert 0.03 < image[..., 3].mean() < 0.9 and image[..., :3].mean() > 1e-3  # an object, lit, before a background
+
+
+def test_three_fields_stand_in_one_picture(tmp_path):
+    """All three, of which one is turned, on a floor that they shade."""
+    _run("three_fields.py", "--out", tmp_path / "a.png", "--size", 32, "--spp", 4, "--max-depth", 2)
+    image = io.imread(tmp_path / "a.png").astype(float)
+    assert image.shape == (32, 48, 3)
+    statue, knot, globe = image[19, 24], image[22:30, 3:16].reshape(-1, 3), image[14, 42]
+    assert statue[0] > 1.5 * statue[2]  # the red robe
+    assert np.ptp(knot[:, 0] - knot[:, 2]) > 50  # red and blue bands
+    assert globe[1] > globe[2] or globe[2] > globe[0]  # land or sea

@@ -212,7 +212,7 @@ class Composition:
         )
         for part, strand, weight in zip(self.in_view, strands, samples.weights, strict=True):
             index, t, view = samples.ray, samples.t, samples.view
-            if len(strands) > 1:
+            if len(strands) > 1 and dr.width(index):
                 kept = dr.compress(weight > 0)
                 index, t, weight = (dr.gather(type(a), a, kept) for a in (index, t, weight))
                 view = dr.gather(mi.Float, view, kept) if view is not None else None

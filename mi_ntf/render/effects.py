@@ -97,14 +97,17 @@ def _check_bounds(medium, shapes) -> None:
     """The medium knows its own place; its one bounding shape must enclose the object there."""
     corners = np.stack(np.meshgrid(*zip(*medium.field.grid.bounds, strict=True), indexing="ij"), -1).reshape(-1, 3)
     world = np.array(medium.frame.point_to_world(corners.T.astype(np.float32)), dtype=np.float64).T
-    low, high, slack = world.min(0), world.max(0), 0.01 * medium.frame.length
+    # Matter lies in the unit sphere too, out of which the corners of a box may stick.
+    origin, radius = medium.frame.origin, medium.frame.length
+    low, high = np.maximum(world.min(0), origin - radius), np.minimum(world.max(0), origin + radius)
+    slack = 0.01 * radius
     for shape in shapes:
         box = shape.bbox()
         if (np.array(box.min).ravel() > low + slack).any() or (np.array(box.max).ravel() < high - slack).any():
             raise MiNtfError(
                 f"bounding shape {shape.id()} spans {_text(box.min)} to {_text(box.max)}, but the nrf medium inside it "
                 f"({medium.path}) has its object from {_text(low)} to {_text(high)}; give shape and medium the same "
-                f"placement (a sphere of centre {_text(medium.frame.origin)} and radius {medium.frame.length:.4g} fits)"
+                f"placement (a sphere of centre {_text(origin)} and radius {radius:.4g} fits)"
             )
     if len(shapes) > 1:
         raise MiNtfError(

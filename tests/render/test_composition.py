@@ -195,3 +195,15 @@ def test_a_foreign_medium_is_refused(blobs):
     with pytest.raises(Exception) as caught:
         scenes.render(scenes.scene(blobs, nrf(), {"light": scenes.light("point")}, size=8, spp=1, shapes=fog))
     assert "bounds a medium that is no nrf medium" in str(caught.value.__cause__ or caught.value)
+
+
+@pytest.mark.parametrize("floor", [None, DIFFUSE])
+def test_chunks_that_meet_nothing(blobs, monkeypatch, floor):
+    """A row of pixels at a time: the first see no matter at all."""
+    lights = {"light": scenes.light("directional")}
+    scene = scenes.scene(blobs, nrf(max_depth=3), lights, size=16, spp=16, shapes=room(blobs, floor))
+    whole = scenes.render(scene, 0)
+    monkeypatch.setattr("mi_ntf.render.integrator.CHUNK", 256)
+    rows = scenes.render(scene, 0)
+    assert (rows[0, :, :3] == 0).all()
+    np.testing.assert_allclose(rows.mean((0, 1)), whole.mean((0, 1)), rtol=0.05)  # other samples
