@@ -27,9 +27,10 @@ def plugins(variant):
     mi_ntf.render.register()
 
 
-def images(name: str, kind: str, size: int, methods) -> dict[str, np.ndarray]:
-    """The scene's field from its own camera, lit by one emitter: method → RGB; "fine" for marches of quarter steps."""
-    shipped = mi.load_file(str(SCENES / name / "scene.xml"), res=str(size))
+def images(name: str, kind: str, methods) -> dict[str, np.ndarray]:
+    """The scene's field from its own camera, 64² pixels, lit by one emitter: method → RGB; "fine" for marches of
+    quarter steps."""
+    shipped = mi.load_file(str(SCENES / name / "scene.xml"), res="64")
     (ball,) = shipped.shapes()
     light = emitters.emitter(kind, np.array(ball.bbox().center()), float(ball.bbox().extents()[0]) / 2)
     scene = mi.load_dict({"type": "scene", "sensor": shipped.sensors()[0], "ball": ball, "light": light})
@@ -46,8 +47,10 @@ def images(name: str, kind: str, size: int, methods) -> dict[str, np.ndarray]:
     return {"fine": fine} | {method: image(method) for method in methods}
 
 
-def check(name: str, kind: str, size: int) -> None:
-    found = images(name, kind, size, TOLERANCE)
+@pytest.mark.parametrize("name", ["statue", "globe", "knot"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_method_and_emitter(name, kind):
+    found = images(name, kind, TOLERANCE)
     truth = found.pop("fine")
     if kind == "directionalarea":  # direct lighting never finds it, in Mitsuba too
         assert not np.any(truth)
@@ -57,16 +60,3 @@ def check(name: str, kind: str, size: int) -> None:
         error = np.sqrt(((image - truth) ** 2).mean()) / max(bright, 1e-9)
         print(f"{name} {kind} {method}: {error:.2%}")
         assert error <= TOLERANCE[method], f"{method}: {error:.1%} of fine marches"
-
-
-@pytest.mark.parametrize("name", ["statue", "globe", "knot"])
-@pytest.mark.parametrize("kind", KINDS)
-def test_every_method_and_emitter(name, kind):
-    check(name, kind, 24)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["statue", "globe", "knot"])
-@pytest.mark.parametrize("kind", KINDS)
-def test_every_method_and_emitter_larger(name, kind):
-    check(name, kind, 64)
