@@ -17,10 +17,9 @@ import numpy as np
 from ..core import spheres
 from ..core.architecture import PAPER, Architecture, Header
 from ..infer import march, ops, shade
-from ..infer.lights import LightTable
 from ..infer.network import NetworkField
 from ..infer.profile import DepthProfile
-from ..render.calibrate import seconds
+from ..render.calibrate import seconds, table_of
 from .bench_measure import Row, Sizes, row
 from .transmittance import directions
 
@@ -162,7 +161,7 @@ def shading_costs(medium, points, sizes: Sizes) -> dict[str, float]:
     from ..render import visibility
 
     count = sizes.slow_lights
-    table = LightTable(directions(count), np.ones((count, 3)), np.zeros(count, bool), 1.0, mi)
+    table = table_of(directions(count))
     options = visibility.Options(2 / IMAGE_SAMPLES, sizes.map)
     built = {name: visibility.build(f"transmittance_{name}", medium, table, options) for name in ("volume", "map")}
     found = seconds({f"shade/{n}": (lambda v=v: shade.reflect(points, table, v)) for n, v in built.items()},

@@ -7,8 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..infer import shade
-from ..infer.lights import LightTable
-from ..render.calibrate import seconds
+from ..render.calibrate import seconds, table_of
 from . import bench_image, transmittance
 from .bench_measure import Row, Sizes, row
 
@@ -63,30 +62,41 @@ def collocated_rows(sizes: Sizes) -> list[Row]:
 
 
 def lookup_rows(medium, sizes: Sizes) -> list[Row]:
-    """Nanoseconds a point and light of the shading loop with the map, less the loop without; beside four bare
-    gathers."""
+    """Nanoseconds a point and light of the shading loop with the map, less the loop without, by kinds of lights and
+    maps; beside four bare gathers."""
     from ..render import visibility
 
     count, width = 10 * sizes.slow_lights, max(1 << 10, sizes.queries // 4)
-    table = LightTable(transmittance.directions(count), np.ones((count, 3)), np.zeros(count, bool), 1.0, mi)
-    tmap = visibility.build("transmittance_map", medium, table, visibility.Options(2 / 384, sizes.map))
-    rng = np.random.default_rng(0)
-    low, high = medium.field.grid.bounds
-    x = _floats(low + rng.uniform(size=(width, 3)) * (high - low))
-    wo = tuple(dr.full(mi.Float, c, width) for c in (0.0, 0.6, 0.8))
-    points = shade.Points(x, wo, medium.field.grid.reflectance(x))
-    dr.eval(points.normal, points.albedo, points.roughness, points.specular)
-    bare = Gathers(count, sizes.map)
-    found = seconds({"map": lambda: shade.reflect(points, table, tmap),
-                     "none": lambda: shade.reflect(points, table, _Everything()),
-                     "gathers": lambda: shade.reflect(points, table, bare)}, max(sizes.repeats, 3))
+    points, d = _inside(medium, width), transmittance.directions(count)
+    tables = {"": table_of(d), " of a point light": table_of(2.5 * d, True),
+              " of a light inside the sphere": table_of(0.5 * d, True)}
+    tables[" of two logistics"] = tables[""]
+    work = {"gathers": lambda: shade.reflect(points, tables[""], Gathers(count, sizes.map))}
+    for name, table in tables.items():
+        options = visibility.Options(2 / 384, sizes.map, map_components=2 if "two" in name else 1)
+        tmap = visibility.build("transmittance_map", medium, table, options)
+        work |= {f"map{name}": lambda table=table, tmap=tmap: shade.reflect(points, table, tmap),
+                 f"none{name}": lambda table=table: shade.reflect(points, table, _Everything())}
+    found = seconds(work, max(sizes.repeats, 3))
     ns = {k: 1e9 * v / (width * count) for k, v in found.items()}
-    lookup, gather = ns["map"] - ns["none"], ns["gathers"] - ns["none"]
-    return [
-        Row("map lookup in the shading loop, per point and light", lookup, "ns", "≤ 8 ns, or ≤ 2 × four gathers",
-            met=lookup <= 8 or lookup <= 2 * gather, details={k + "_ns": v for k, v in ns.items()}),
-        Row("four bare gathers at such a place, per point and light", gather, "ns"),
-    ]
+    gather = ns["gathers"] - ns["none"]
+    rows = [Row("four bare gathers where a map is looked up, per point and light", gather, "ns")]
+    for name in tables:
+        lookup = ns[f"map{name}"] - ns[f"none{name}"]
+        asked = {} if name else {"asked": "≤ 8 ns, or ≤ 2 × four gathers", "met": lookup <= 8 or lookup <= 2 * gather,
+                                 "details": {k + "_ns": v for k, v in ns.items()}}
+        rows.append(Row(f"lookup of a map{name} in the shading loop, per point and light", lookup, "ns", **asked))
+    return rows
+
+
+def _inside(medium, count: int) -> shade.Points:
+    """`count` shading points anywhere in the box around the object."""
+    low, high = medium.field.grid.bounds
+    x = _floats(low + np.random.default_rng(0).uniform(size=(count, 3)) * (high - low))
+    wo = tuple(dr.full(mi.Float, c, count) for c in (0.0, 0.6, 0.8))
+    points = shade.Points(x, wo, medium.field.grid.reflectance(x))
+    points.evaluate()
+    return points
 
 
 class _Everything:

@@ -59,7 +59,12 @@ def _table(count: int) -> LightTable:
     """`count` directional lights all around."""
     d = np.random.default_rng(0).normal(size=(count, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
-    return LightTable(d, np.ones((count, 3)), np.zeros(count, bool), 1.0, mi)
+    return table_of(d)
+
+
+def table_of(where: np.ndarray, is_point: bool = False) -> LightTable:
+    """Lights of power 1 at, or towards, `where` (n, 3), field coordinates."""
+    return LightTable(where, np.ones((len(where), 3)), np.full(len(where), is_point), 1.0, mi)
 
 
 def seconds(work: dict[str, Callable[[], Any]], repeats: int, pick=statistics.median) -> dict[str, float]:

@@ -84,7 +84,8 @@ class Composition:
             self.surfaces = Surfaces(scene, shapes, integrator.hide_emitters, self.transmittance)
 
     def _runs(self) -> list:
-        """Runs of the table's lights, (first, last), whose maps fit into memory together."""
+        """Runs of the table's lights, (first, last), whose maps fit into memory together; [None] for all at once, as
+        where maps are not made, or lights carry gradients, which parts of a table lose."""
         found = self.effects
         if not self._media or not found.lit or not found.needs_visibility or found.gradients:
             return [None]

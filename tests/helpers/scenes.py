@@ -39,6 +39,11 @@ def light(kind: str) -> dict:
     return {"type": "envmap", "bitmap": mi.Bitmap(image)}
 
 
+def nrf(visibility="raymarch", **options) -> dict:
+    """The integrator, without what shines in the picture."""
+    return {"type": "nrf", "visibility": visibility, "hide_emitters": True, **options}
+
+
 def film(size: int) -> dict:
     """Square RGBA film with a box filter: pixels are independent of each other."""
     return {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}, "pixel_format": "rgba"}

@@ -5,6 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import fields
+from helpers.jit import arrays
 
 from mi_ntf.infer import march
 from mi_ntf.infer.grid import GridField
@@ -12,10 +13,6 @@ from mi_ntf.infer.network import NetworkField
 from mi_ntf.infer.visibility import raymarch
 
 BLOBS = [(-0.3, 0.0, 0.0), (0.35, 0.2, 0.1), (0.0, -0.45, 0.3)], [0.35, 0.25, 0.2]
-
-
-def arrays(points):
-    return tuple(mi.Float(np.ascontiguousarray(c, np.float32)) for c in points.T)
 
 
 @pytest.fixture(scope="module")

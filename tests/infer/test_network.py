@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import fields
+from helpers.jit import arrays
 
 from mi_ntf.core import field_file, reference
 from mi_ntf.core.architecture import MEAN_FLOOR, Architecture, Encoding, Header, Network
@@ -40,10 +41,6 @@ def case(request, rng):
     if request.param == "frequency":
         return random_field(rng, Encoding("frequency", octaves=4))
     return shipped(request.param)
-
-
-def arrays(points):
-    return tuple(mi.Float(np.ascontiguousarray(c, np.float32)) for c in points.T)
 
 
 def close(ours, truth, tolerance=3e-5):

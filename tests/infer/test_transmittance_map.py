@@ -4,19 +4,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers import fields
+from helpers.jit import arrays
 
 from mi_ntf.core import logistic, mixture, ops
-from mi_ntf.infer.grid import GridField
 from mi_ntf.infer.lights import LightTable
-from mi_ntf.infer.network import NetworkField
-from mi_ntf.infer.profile import DepthProfile
 from mi_ntf.infer.visibility.light_rays import DIRECTIONAL, FRUSTUM, SPHERE, frames
 from mi_ntf.infer.visibility.map_source import CLEAR, Source, field_source, network_source
 from mi_ntf.infer.visibility.raymarch import optical_depth
 from mi_ntf.infer.visibility.transmittance_map import TransmittanceMap
 
-BLOBS = [(-0.3, 0.0, 0.0), (0.35, 0.2, 0.1), (0.0, -0.45, 0.3)], [0.4, 0.25, 0.2]
 LIGHTS = {
     "sun": (np.array([0.48, 0.6, 0.64]), False),
     "lamp": (np.array([1.5, 1.0, 2.0]), True),
@@ -25,26 +21,6 @@ LIGHTS = {
     "inside": (np.array([0.1, 0.5, -0.15]), True),
 }
 NEAR = ("inside",)
-
-
-def arrays(points):
-    return tuple(mi.Float(np.ascontiguousarray(c, np.float32)) for c in np.asarray(points, np.float64).T)
-
-
-@pytest.fixture(scope="module")
-def network():
-    mi.set_variant("llvm_ad_rgb")
-    return NetworkField(*fields.blobs(*BLOBS, log_density=4.5), mi)
-
-
-@pytest.fixture(scope="module")
-def grid(network):
-    return GridField(network, 96, mi)
-
-
-@pytest.fixture(scope="module")
-def reader(grid):
-    return DepthProfile(grid.density, grid, mi.Float(1 / 256))
 
 
 def table(*names):

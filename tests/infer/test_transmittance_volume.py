@@ -4,6 +4,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import fields
+from helpers.jit import arrays
 
 from mi_ntf.infer.grid import GridField
 from mi_ntf.infer.lights import LightTable
@@ -20,10 +21,6 @@ DEPTHS = 256
 @pytest.fixture
 def lights():
     return LightTable(WHERE, np.ones((3, 3)), IS_POINT, 1.0, mi)
-
-
-def arrays(points):
-    return tuple(mi.Float(np.ascontiguousarray(c, np.float32)) for c in np.asarray(points, np.float64).T)
 
 
 def look(volume, lights, x, k):

@@ -4,38 +4,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers import fields
+from helpers.jit import arrays
 
 from mi_ntf.core.errors import MiNtfError
-from mi_ntf.infer.grid import GridField
 from mi_ntf.infer.lights import LightTable
-from mi_ntf.infer.network import NetworkField
-from mi_ntf.infer.profile import DepthProfile
 from mi_ntf.infer.visibility import raymarch
 from mi_ntf.infer.visibility.neural_transmittance import NeuralTransmittance
 from mi_ntf.infer.visibility.visibility_mlp import VisibilityMLP
-
-BLOBS = [(-0.3, 0.0, 0.0), (0.35, 0.2, 0.1), (0.0, -0.45, 0.3)], [0.4, 0.25, 0.2]
-
-
-def arrays(points):
-    return tuple(mi.Float(np.ascontiguousarray(c, np.float32)) for c in np.asarray(points, np.float64).T)
-
-
-@pytest.fixture(scope="module")
-def network():
-    mi.set_variant("llvm_ad_rgb")
-    return NetworkField(*fields.blobs(*BLOBS, log_density=4.5), mi)
-
-
-@pytest.fixture(scope="module")
-def grid(network):
-    return GridField(network, 96, mi)
-
-
-@pytest.fixture(scope="module")
-def reader(grid):
-    return DepthProfile(grid.density, grid, mi.Float(1 / 256))
 
 
 def test_neural_transmittance_is_a_transmittance(network, reader, rng):

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from helpers import fields, scenes
 
-import mi_ntf.render
 from mi_ntf.core import field_file
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.render import aovs
@@ -13,11 +12,6 @@ from mi_ntf.render import aovs
 RADIUS, SIZE = 0.8, 16
 ALBEDO = (0.6, 0.5, 0.4)
 EVERY = "depth,normal,albedo,roughness,opacity,visibility,visibility_lights"
-
-
-@pytest.fixture(autouse=True)
-def plugins(variant):
-    mi_ntf.render.register()
 
 
 @pytest.fixture(scope="module")
@@ -162,10 +156,15 @@ def test_what_is_not_asked_for_is_not_traced(ball, monkeypatch):
 
     monkeypatch.setattr(aovs.Sums, "_visibility", refuse)
     monkeypatch.setattr(aovs.Sums, "add_surface", refuse)
-    layers(ball, "depth,albedo")
+    found, _ = layers(ball, "depth,albedo")
+    assert found["depth.T"].max() > 0
+    with pytest.raises(Exception, match="custom") as asked:
+        layers(ball, "visibility")
+    assert "traced" in str(asked.value.__cause__)
     monkeypatch.setattr(aovs.Sums, "add_field", refuse)
     monkeypatch.setattr(aovs, "Picture", refuse)
-    layers(ball, "")
+    found, _ = layers(ball, "")
+    assert list(found) == ["R", "G", "B", "A"] and found["R"].max() > 0
 
 
 @pytest.mark.parametrize(("text", "error"), [

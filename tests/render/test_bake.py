@@ -10,7 +10,6 @@ import OpenEXR
 import pytest
 from helpers import scenes
 
-import mi_ntf.render
 from mi_ntf import cli
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.infer.lights import LightTable
@@ -20,11 +19,6 @@ from mi_ntf.render import lights as lights_module
 WHERE = np.array([[0.48, 0.6, 0.64], [1.5, 1.0, 2.0], [0.1, 0.5, -0.1]])
 IS_POINT = np.array([False, True, True])
 OPTIONS = visibility.Options(2 / 128, 16)
-
-
-@pytest.fixture(autouse=True)
-def plugins(variant):
-    mi_ntf.render.register()
 
 
 @pytest.fixture(scope="module")

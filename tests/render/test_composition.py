@@ -5,22 +5,11 @@ import numpy as np
 import pytest
 from helpers import fields, scenes, ztest
 
-import mi_ntf.render
 from mi_ntf.core import field_file, microfacet, ops
 from mi_ntf.core.architecture import Similarity
 
 SEEDS = 4
 TURN = [-1.7, -0.75, 1.4]  # clear of the large sphere: where spheres overlap, volpath loses a medium
-
-
-@pytest.fixture(autouse=True)
-def plugins(variant):
-    mi_ntf.render.register()
-
-
-@pytest.fixture(scope="module")
-def blobs(tmp_path_factory):
-    return scenes.write_blobs(tmp_path_factory.mktemp("field"), log_density=3.0)
 
 
 def nrf(visibility="raymarch", **options):

@@ -5,8 +5,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import fields, scenes
+from helpers.scenes import nrf
 
-import mi_ntf.render
 from mi_ntf.core import field_file, microfacet
 from mi_ntf.infer import march, shade
 from mi_ntf.infer.visibility import raymarch
@@ -14,20 +14,6 @@ from mi_ntf.render import composition, effects, visibility, walk
 
 EYE = [scenes.SIMILARITY.center[0] + 1.2, scenes.SIMILARITY.center[1] + 1.5, scenes.SIMILARITY.center[2] + 5]
 """The pinhole of `scenes.scene`."""
-
-
-@pytest.fixture(autouse=True)
-def plugins(variant):
-    mi_ntf.render.register()
-
-
-@pytest.fixture(scope="module")
-def blobs(tmp_path_factory):
-    return scenes.write_blobs(tmp_path_factory.mktemp("field"), log_density=3.0)
-
-
-def nrf(visibility="raymarch", **options):
-    return {"type": "nrf", "visibility": visibility, "hide_emitters": True, **options}
 
 
 def lamp(position=EYE, intensity=60.0):

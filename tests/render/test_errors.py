@@ -14,11 +14,6 @@ SENSOR = f'<sensor type="perspective">{FILM}</sensor>'
 GOOD = '<string name="filename" value="{path}"/>'
 
 
-@pytest.fixture(autouse=True)
-def plugins(variant):
-    mi_ntf.render.register()
-
-
 @pytest.fixture(scope="module")
 def path(tmp_path_factory):
     folder = tmp_path_factory.mktemp("field")

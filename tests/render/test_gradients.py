@@ -6,16 +6,10 @@ import numpy as np
 import pytest
 from helpers import scenes
 
-import mi_ntf.render
 from mi_ntf.core.errors import MiNtfError
 
 WEIGHTS = [1.0, 0.6, -0.4]
 """Of the colour channels in the scalar that is differentiated: none cancels another."""
-
-
-@pytest.fixture(autouse=True)
-def plugins(variant):
-    mi_ntf.render.register()
 
 
 @pytest.fixture(scope="module")

@@ -6,26 +6,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import fields, scenes, ztest
+from helpers.scenes import nrf
 
-import mi_ntf.render
 from mi_ntf.core import field_file
 
 LIGHTS = ("directional", "point", "env")
 SEEDS = 4
-
-
-@pytest.fixture(autouse=True)
-def plugins(variant):
-    mi_ntf.render.register()
-
-
-@pytest.fixture(scope="module")
-def blobs(tmp_path_factory):
-    return scenes.write_blobs(tmp_path_factory.mktemp("field"), log_density=3.0)
-
-
-def nrf(visibility="raymarch", **options):
-    return {"type": "nrf", "visibility": visibility, "hide_emitters": True, **options}
 
 
 def renders(field, integrator, kind, spp, **options):

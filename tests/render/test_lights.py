@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from helpers import emitters, scenes, ztest
 
-import mi_ntf.render
 from mi_ntf.core.architecture import Similarity
 from mi_ntf.infer import shade
 from mi_ntf.render import emitter_samples, lights
@@ -15,16 +14,6 @@ from mi_ntf.render.frame import Frame
 
 SEEDS = 4
 MIDDLE = list(scenes.SIMILARITY.center)
-
-
-@pytest.fixture(autouse=True)
-def plugins(variant):
-    mi_ntf.render.register()
-
-
-@pytest.fixture(scope="module")
-def blobs(tmp_path_factory):
-    return scenes.write_blobs(tmp_path_factory.mktemp("field"), log_density=3.0)
 
 
 def emitter(kind: str) -> dict:

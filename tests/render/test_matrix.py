@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from helpers import emitters
 
-import mi_ntf.render
 from mi_ntf.infer.visibility import raymarch
 
 SCENES = Path(__file__).parents[2] / "scenes"
@@ -20,11 +19,6 @@ TOLERANCE = {
 }
 """Relative RMSE of the image."""
 KINDS = ("point", "spot", "directional", "constant", "envmap", "sunsky", "area", "projector", "directionalarea")
-
-
-@pytest.fixture(autouse=True)
-def plugins(variant):
-    mi_ntf.render.register()
 
 
 def images(name: str, kind: str, methods) -> dict[str, np.ndarray]:

@@ -5,20 +5,9 @@ import numpy as np
 import pytest
 from helpers import scenes, ztest
 
-import mi_ntf.render
 from mi_ntf.core.errors import MiNtfError
 
 SEEDS = 4
-
-
-@pytest.fixture(autouse=True)
-def plugins(variant):
-    mi_ntf.render.register()
-
-
-@pytest.fixture(scope="module")
-def blobs(tmp_path_factory):
-    return scenes.write_blobs(tmp_path_factory.mktemp("field"), log_density=3.0)
 
 
 def field(path) -> dict:

@@ -54,7 +54,7 @@ LEVELS = (1e-3, math.log(4 / 3), math.log(2), math.log(4))
 
 def field_source(profile, components: int = 1) -> Source:
     """`map_source=field`: march the field once per ray, from the light inwards. One logistic follows in closed form
-    from τ's quartiles, two by least squares on eleven levels of τ."""
+    from τ's quartiles, two by least squares on twelve levels of τ."""
 
     def one(o, d, end):
         hit, _m, h = spheres.chord(ops, o, d)
