@@ -46,16 +46,19 @@ def lobes(ops, wi, wo, n, roughness):
 
 
 def scattering(ops, wi, wo, n, roughness):
-    """The two lobes of the field's phase function f = ρ (⟨n,ω_i⟩⁺ + ⟨n,ω_o⟩⁺), light from above only; as :func:`lobes`.
+    """The two lobes of the field's phase function f = ρ (⟨n,ω_i⟩ + ⟨n,ω_o⟩), 0 unless both cosines are positive; as
+    :func:`lobes`.
 
     Why the sum: a half space of any density profile that scatters once with f returns f ⟨n,ω_i⟩/(⟨n,ω_i⟩ + ⟨n,ω_o⟩)
     (Lommel and Seeliger; Chandrasekhar 1960, section 6), because the light too is dimmed on its way through the skin to
     the scattering point. With this f that is ρ ⟨n,ω_i⟩: an opaque field looks like the surface, from all sides and
     under all lights. With the paper's ρ ⟨n,ω_i⟩ alone it would lose half of the light and fade towards grazing light. f
-    is reciprocal, as a phase function has to be.
+    is reciprocal over the whole sphere, as a phase function has to be. Nothing goes to below the horizon: such light
+    would scatter again in the skin that it has just left, and every further bounce would add energy that the surface
+    does not have.
     """
     cos_i, cos_o, gloss = _cosines(ops, wi, wo, n, roughness)
-    both = ops.where(cos_i > 0, cos_i + cos_o, 0.0 * cos_i)
+    both = ops.where(ops.minimum(cos_i, cos_o) > 0, cos_i + cos_o, 0.0 * cos_i)
     return both * INV_PI, gloss * both
 
 

@@ -129,13 +129,12 @@ def camera_cost(sensor, medium, paper: PaperField, sizes: Sizes):
     o, d, far = _view_rays(sensor, medium.frame, sizes.pixels)
     middle = dr.full(mi.Float, 0.5, dr.width(far))
     step = dr.opaque(mi.Float, 2 / IMAGE_SAMPLES)
-    strand = march.Strand(paper.density, medium.field.grid, o, d)
+    strand = march.Strand(paper.density, medium.field.grid, o, d, step)
     last = []
 
     def view():
-        found = march.camera_samples([strand], far, step, middle, middle)
-        along = tuple(dr.gather(mi.Float, c, found.ray) for c in d)
-        x = tuple(dr.gather(mi.Float, a, found.ray) + found.t * b for a, b in zip(o, along, strict=True))
+        found = march.camera_samples([strand], far, middle, middle)
+        x, along = found.place(0, found.ray, found.t)
         p = shade.Points(x, tuple(-c for c in along), paper.reflectance(x))
         last[:] = [p]
         return [*p.x, *p.wo, *p.normal, *p.albedo, p.roughness, p.specular]

@@ -5,7 +5,7 @@ on one lattice per ray, so that skipping changes no value.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 
@@ -41,14 +41,6 @@ def safe_inverse(d):
     return tuple(dr.rcp(dr.select(dr.abs(c) < 1e-8, dr.select(c < 0, -1e-8, 1e-8), c)) for c in d)
 
 
-def camera_interval(o, d, maxt):
-    """``(active, t0, t1)``: the part of the ray o + t d, 0 ≤ t ≤ maxt, inside the unit sphere."""
-    hit, m, h = spheres.chord(ops, o, d)
-    tm = spheres.coordinate(tuple(a - b for a, b in zip(m, o, strict=True)), d)
-    t0, t1 = dr.maximum(tm - h, 0), dr.minimum(tm + h, maxt)
-    return hit & (t1 > t0), t0, t1
-
-
 @dataclass(frozen=True)
 class Strand:
     """A ray in the coordinates of one field that it may cross.
@@ -56,6 +48,7 @@ class Strand:
     density  callable, field density at a point
     grid     whose empty space is skipped
     o, d     origin and unit direction, 3-tuples, field coordinates
+    step     length of the march's cells, field units
     rate     field units per unit of the ray's parameter t; None: t is in these field units (a ray of one strand)
     """
 
@@ -63,43 +56,86 @@ class Strand:
     grid: object
     o: tuple
     d: tuple
+    step: object
     rate: object = None
 
 
 class Bundle:
-    """A ray with its strands through all fields: where densities overlap, they add."""
+    """A ray with its strands through all fields: where densities overlap, they add.
 
-    def __init__(self, strands, maxt):
-        self.strands, self.single = strands, len(strands) == 1
-        self.inverse = [safe_inverse(s.d) for s in strands]
-        self.intervals = []
-        self.active, self.t0, self.t1 = False, dr.inf, -dr.inf
+    Inside a bundle t counts from `base`, where the ray enters the first of their spheres: cameras and lights may be
+    10⁴ radii away, where float32 tells no two cells apart. Cells are as long as the finest field asks whose sphere
+    they lie in, and begin `offset` of a cell's length before it.
+
+    base      where t = 0 lies on the ray
+    end       where it leaves the last sphere, or ends
+    strands   with origins at t = 0
+    """
+
+    def __init__(self, strands, maxt, offset):
+        self.single = len(strands) == 1
+        self.active, self.base = False, dr.inf
+        chords = []
         for s in strands:
             rate = 1 if s.rate is None else s.rate
-            hit, t0, t1 = camera_interval(s.o, s.d, maxt * rate)
-            t0, t1 = t0 / rate, t1 / rate
-            self.intervals.append((t0, t1))
+            hit, m, h = spheres.chord(ops, s.o, s.d)
+            # From the middle of the chord, which keeps its digits where the origin is far.
+            middle = spheres.coordinate(tuple(a - b for a, b in zip(m, s.o, strict=True)), s.d)
+            enter = dr.maximum(-h, -middle)
+            hit = hit & (h > enter) & ((middle + enter) < maxt * rate)
             self.active = hit | self.active
-            self.t0 = dr.minimum(self.t0, dr.select(hit, t0, dr.inf))
-            self.t1 = dr.maximum(self.t1, dr.select(hit, t1, -dr.inf))
-        self.t0, self.t1 = (dr.select(self.active, t, 0) for t in (self.t0, self.t1))
+            self.base = dr.minimum(self.base, dr.select(hit, (middle + enter) / rate, dr.inf))
+            chords.append((hit, m, h, middle, enter, rate))
+        self.base = dr.select(self.active, self.base, 0)
+        self.strands, self.intervals, self.cells, self.begins = [], [], [], []
+        self.end = dr.zeros(type(self.base), dr.width(self.base))
+        for s, (hit, m, h, middle, enter, rate) in zip(strands, chords, strict=True):
+            # t' of t = 0, without a difference of large numbers where there is one strand.
+            at = enter if self.single else dr.select(hit, self.base * rate - middle, 0)
+            origin = tuple(a + at * b for a, b in zip(m, s.d, strict=True))
+            self.strands.append(replace(s, o=origin))
+            begin, end = (enter - at) / rate, dr.minimum((h - at) / rate, maxt - self.base)
+            self.intervals.append((dr.select(hit, begin, dr.inf), dr.select(hit, end, -dr.inf)))
+            self.end = dr.select(hit, dr.maximum(self.end, end), self.end)
+            self.cells.append(s.step / rate)
+            self.begins.append(dr.select(hit, begin - offset * self.cells[-1], dr.inf))
+        self.begin = self.begins[0]
+        for other in self.begins[1:]:
+            self.begin = dr.minimum(self.begin, other)
+        self.begin = dr.select(self.active, self.begin, 0)
+        self.inverse = [safe_inverse(s.d) for s in strands]
+
+    def step(self, t):
+        """Length of the cell that begins at `t`: the finest field's here, up to where a finer one's cells begin."""
+        if self.single:
+            return self.cells[0]
+        length = dr.inf
+        for (_, end), cell, begin in zip(self.intervals, self.cells, self.begins, strict=True):
+            ahead = dr.maximum(begin - t, cell)
+            length = dr.minimum(length, dr.select(t < end, dr.select(t < begin, ahead, cell), dr.inf))
+        return dr.select(length < dr.inf, length, self.cells[0])
 
     def cell(self, t, step):
         """Begin and length of the cell at `t`, cut off where the ray begins and ends (a surface may be there)."""
-        begin = dr.maximum(t, self.t0)
-        return begin, dr.minimum(t + step, self.t1) - begin
+        begin = dr.maximum(t, 0)
+        return begin, dr.minimum(t + step, self.end) - begin
+
+    def point(self, i: int, t):
+        """The point at `t` in the coordinates of field `i`."""
+        s = self.strands[i]
+        along = t if s.rate is None else t * s.rate
+        return tuple(a + along * b for a, b in zip(s.o, s.d, strict=True))
 
     def at(self, t, active):
         """``(skip, sigmas)``: how far the ray is clear of all matter from `t` on, 0 in an occupied cell; each field's
         density there, per unit of t."""
         skips, places = [], []
-        for s, inverse, (t0, t1) in zip(self.strands, self.inverse, self.intervals, strict=True):
-            along = t if s.rate is None else t * s.rate
-            p = tuple(oi + along * di for oi, di in zip(s.o, s.d, strict=True))
+        for i, (s, inverse, (begin, end)) in enumerate(zip(self.strands, self.inverse, self.intervals, strict=True)):
+            p = self.point(i, t)
             skip = clear_distance(s.grid, p, inverse)
             if not self.single:
-                inside, ahead = (t >= t0) & (t < t1), dr.maximum(self.t1 - t, 1e-6)
-                skip = dr.select(inside, skip / s.rate, dr.select(t < t0, dr.minimum(t0 - t, ahead), ahead))
+                inside, ahead = (t >= begin) & (t < end), dr.maximum(self.end - t, 1e-6)
+                skip = dr.select(inside, skip / s.rate, dr.select(t < begin, dr.minimum(begin - t, ahead), ahead))
             skips.append(skip)
             places.append(p)
         sigmas = [
@@ -111,26 +147,66 @@ class Bundle:
             skip = dr.minimum(skip, other)
         return skip, sigmas
 
+    def counts(self, shares, step):
+        """Whether a sample of these weights is worth shading: that of some field, in its own unit."""
+        hit = False
+        for s, share in zip(self.strands, shares, strict=True):
+            hit = (share > MIN_WEIGHT_RATE * step * (1 if s.rate is None else s.rate)) | hit
+        return hit
+
 
 @dataclass(frozen=True)
 class Samples:
-    """Shading points of camera rays, in no particular order: `ray` index, distance `t`, the weight in each field
-    (`weights`, one array a field, sum w), `view`: transmittance from the camera to the very point, or None;
-    `transmittance`, per ray: of the whole ray."""
+    """Shading points of camera rays, those of one ray side by side, as it meets them.
 
+    ray            index of each point's ray
+    t              its place, from where its bundle begins (`bundle`)
+    weights        its weight in each field, one array a field; their sum is w
+    view           transmittance from the camera to the very point, or None
+    transmittance  per ray: of the whole ray
+    first, count   per ray: where its points begin, and how many they are
+    """
+
+    bundle: Bundle
     ray: object
     t: object
     weights: tuple
     view: object
     transmittance: object
+    first: object
+    count: object
+
+    def place(self, i: int, ray, t):
+        """``(x, d)``: points at `t` of the rays `ray`, and the rays' directions, in the coordinates of field `i`."""
+        s = self.bundle.strands[i]
+        d = tuple(dr.gather(type(t), c, ray) for c in s.d)
+        along = t if s.rate is None else t * s.rate
+        return tuple(dr.gather(type(t), a, ray) + along * b for a, b in zip(s.o, d, strict=True)), d
+
+    def totals(self, values: list, gradients: bool = False) -> list:
+        """Σ over each ray's points of each of `values`, per ray: in one order, unlike atomic sums. `gradients`: the
+        values are attached."""
+        count = self.count
+
+        def body(k, sums):
+            return k + 1, [s + dr.gather(type(s), v, self.first + k, k < count)
+                           for s, v in zip(sums, values, strict=True)]  # fmt: skip
+
+        n = dr.width(count)
+        return dr.while_loop(
+            state=(dr.zeros(type(count), n), [dr.zeros(type(self.t), n) for _ in values]),
+            cond=lambda k, sums: k < count,
+            body=body,
+            label="samples of a ray",
+            max_iterations=-1 if gradients else None,  # a sum
+        )[1]
 
 
-def camera_samples(strands, maxt, step, offset, depth, shade=True, view=False) -> Samples:
+def camera_samples(strands, maxt, offset, depth, shade=True, view=False) -> Samples:
     """Shading points of camera rays, compacted.
 
     strands   of each ray, one for each field
     maxt      where each ray ends (a surface, or infinity)
-    step      cell length, in units of t
     offset    per ray, uniform in [0, 1): where its lattice of cells begins
     depth     per ray, uniform in [0, 1): where in its cell a sample lies, as a quantile of the light lost in that cell
     shade     whether there is use for the samples; otherwise only `transmittance` is found
@@ -141,47 +217,51 @@ def camera_samples(strands, maxt, step, offset, depth, shade=True, view=False) -
     vary within a cell, above all the light's own transmittance, are averaged with the right weights: the expectation
     over `depth` is exact for constant σ_j. Up to that point the cell lets 1 − depth·α_j through.
 
-    Samples with w ≤ MIN_WEIGHT_RATE · step are left out.
+    Samples that weigh at most MIN_WEIGHT_RATE times their cell's length in every field are left out.
     """
     # First walk: count. Second: write. Costs little beside shading and needs no guess of the capacity.
-    bundle = Bundle(strands, maxt)
-    floats, uint = type(bundle.t0), dr.uint32_array_t(type(bundle.t0))
-    rays = dr.arange(uint, dr.width(bundle.t0))
+    bundle = Bundle(strands, maxt, offset)
+    floats, uint = type(bundle.base), dr.uint32_array_t(type(bundle.base))
+    rays = dr.arange(uint, dr.width(bundle.base))
 
     def tally(hit, sample, state):
         return (state[0] + dr.select(hit, uint(1), 0),)
 
-    transmittance, (count,) = _walk(bundle, step, offset, depth, tally, (dr.zeros(uint, dr.width(rays)),))
-    total = 0
+    transmittance, (count,) = _walk(bundle, offset, depth, tally, (dr.zeros(uint, dr.width(rays)),))
+    total, start = 0, dr.zeros(uint, dr.width(rays))
     if shade:
         start = dr.prefix_sum(count)
         total = int(dr.sum(count)[0])
     out = dr.zeros(uint, total), *(dr.zeros(floats, total) for _ in range(1 + len(strands) + view))
     if total:
+        end = start + count
 
         def write(hit, sample, state):
             slot, *targets = state
+            # The two walks are two kernels, which a compiler may round differently: a sample that only this one finds
+            # has no slot.
+            hit = hit & (slot < end)
             for target, value in zip(targets, (rays, *sample[: len(targets) - 1]), strict=True):
                 dr.scatter(target, value, slot, hit)
             return slot + dr.select(hit, uint(1), 0), *targets
 
-        _, (_, *out) = _walk(bundle, step, offset, depth, write, (start, *out))
-        dr.eval(out, transmittance)
+        _, (_, *out) = _walk(bundle, offset, depth, write, (uint(start), *out))
+        dr.eval(out, transmittance, start, count)
     weights = tuple(out[2 : 2 + len(strands)])
-    return Samples(out[0], out[1], weights, out[-1] if view else None, transmittance)
+    return Samples(bundle, out[0], out[1], weights, out[-1] if view else None, transmittance, start, count)
 
 
-def camera_light(strands, maxt, step, offset, depth, reflect):
+def camera_light(strands, maxt, offset, depth, reflect):
     """The light of camera rays whose lights all shine from the camera, in one walk: the view's transmittance is theirs.
 
-    Arguments as :func:`camera_samples`; ``reflect(i, t, view)``: radiance, a 3-tuple, that the point of strand `i` at
-    `t`, `view` of whose light gets to the camera, reflects. Returns ``(radiance, transmittance)`` per ray.
+    Arguments as :func:`camera_samples`; ``reflect(i, x, view)``: radiance, a 3-tuple, that the point `x` of strand
+    `i`, `view` of whose light gets to the camera, reflects. Returns ``(radiance, transmittance)`` per ray.
     """
-    bundle = Bundle(strands, maxt)
+    bundle = Bundle(strands, maxt, offset)
 
     def shade(t, shares, view, *light):
         for i, share in enumerate(shares):
-            light = [c + share * v for c, v in zip(light, reflect(i, t, view), strict=True)]
+            light = [c + share * v for c, v in zip(light, reflect(i, bundle.point(i, t), view), strict=True)]
         return tuple(light)
 
     def add(hit, sample, state):
@@ -189,22 +269,21 @@ def camera_light(strands, maxt, step, offset, depth, reflect):
         # Few cells hold samples that count: the branch skips what the others would cost.
         return dr.if_stmt((t, shares, view, *state), hit, shade, lambda t, shares, view, *light: light, label="shade")
 
-    zero = dr.zeros(type(bundle.t0), dr.width(bundle.t0))
-    transmittance, light = _walk(bundle, step, offset, depth, add, (zero, type(zero)(zero), type(zero)(zero)))
+    zero = dr.zeros(type(bundle.base), dr.width(bundle.base))
+    transmittance, light = _walk(bundle, offset, depth, add, (zero, type(zero)(zero), type(zero)(zero)))
     return light, transmittance
 
 
-def _walk(bundle, step, offset, depth, emit, state):
+def _walk(bundle, offset, depth, emit, state):
     """One walk along the camera rays of `bundle`; ``emit(hit, sample, state)`` gives the next state and is called for
     each cell, `hit` where it holds a sample that counts: t, the weight in each field, and the view's transmittance.
     Returns ``(transmittance, state)``."""
-    t0, t1 = bundle.t0 - offset * step, bundle.t1
-    floats, uint = type(t0), dr.uint32_array_t(type(t0))
+    floats = type(bundle.base)
 
-    def body(k, transmittance, state, active):
-        begin, length = bundle.cell(t0 + floats(k) * step, step)
+    def body(t, transmittance, state, active):
+        step = bundle.step(t)
+        begin, length = bundle.cell(t, step)
         skip, sigmas = bundle.at(begin + 0.5 * length, active)
-        empty = skip > 0
         sigma = sum(sigmas[1:], sigmas[0])
         alpha = 1 - dr.exp(-sigma * length)
         w = transmittance * alpha
@@ -212,51 +291,57 @@ def _walk(bundle, step, offset, depth, emit, state):
         rate = dr.rcp(dr.maximum(sigma, 1e-6))
         shares = (w,) if bundle.single else tuple(w * s * rate for s in sigmas)
         sample = begin - dr.log(1 - lost) * rate, *shares, transmittance * (1 - lost)
-        state = emit(active & (w > MIN_WEIGHT_RATE * step), sample, state)
+        state = emit(active & bundle.counts(shares, step), sample, state)
         transmittance = dr.select(active, transmittance - w, transmittance)
-        # Not in place: a state variable is the caller's own array, and the next walk starts from it again.
-        k = k + dr.select(empty, uint(skip / step) + 1, 1)
-        active = active & (t0 + floats(k) * step < t1) & (transmittance > MIN_TRANSMITTANCE)
-        return k, transmittance, state, active
+        t = t + _onward(skip, step)
+        active = active & (t < bundle.end) & (transmittance > MIN_TRANSMITTANCE)
+        return t, transmittance, state, active
 
     _, transmittance, state, _ = dr.while_loop(
-        state=(dr.zeros(uint, dr.width(t0)), dr.ones(floats, dr.width(t0)), state, bundle.active),
-        cond=lambda k, transmittance, state, active: active,
+        state=(floats(bundle.begin), dr.ones(floats, dr.width(bundle.base)), state, bundle.active),
+        cond=lambda t, transmittance, state, active: active,
         body=body,
         label="camera march",
     )
     return dr.select(transmittance > MIN_TRANSMITTANCE, transmittance, 0), state
 
 
-def free_flight(strands, maxt, step, offset, depth, which):
+def _onward(skip, step):
+    """From one cell to the next, or beyond all whose middles are as `skip` says clear: whole cells, so that skipping
+    changes no other cell."""
+    return dr.select(skip > 0, step * (dr.floor(skip / step) + 1), step)
+
+
+def free_flight(strands, maxt, offset, depth, which):
     """Where rays end in the fields if they pass the optical depth `depth` (for free flight −ln(1 − u)).
 
     Arguments as :func:`camera_samples`; `which`, uniform in [0, 1), says whose matter it is where several overlap.
-    Returns ``(hit, t, index)``: whether a ray ends before `maxt`, where, and the strand's index. Linear depth within
-    cells.
+    Returns ``(hit, t, index, bundle)``: whether a ray ends before `maxt`, where (t of `bundle`), and the strand's
+    index. Linear depth within cells.
     """
-    bundle = Bundle(strands, maxt)
-    t0, t1 = bundle.t0 - offset * step, bundle.t1
-    floats, uint = type(t0), dr.uint32_array_t(type(t0))
+    bundle = Bundle(strands, maxt, offset)
+    floats, uint = type(bundle.base), dr.uint32_array_t(type(bundle.base))
 
-    def body(k, passed, t, index, active):
-        begin, length = bundle.cell(t0 + floats(k) * step, step)
+    def body(t, passed, end, index, active):
+        step = bundle.step(t)
+        begin, length = bundle.cell(t, step)
         skip, sigmas = bundle.at(begin + 0.5 * length, active)
         sigma = sum(sigmas[1:], sigmas[0])
         after = passed + sigma * length
         hit = active & (after >= depth) & (sigma > 0)
-        t = dr.select(hit, begin + (depth - passed) / dr.maximum(sigma, 1e-6), t)
+        end = dr.select(hit, begin + (depth - passed) / dr.maximum(sigma, 1e-6), end)
         rest = which * sigma
         for sigma_i in sigmas[:-1]:
             rest = rest - sigma_i
             index = dr.select(hit & (rest >= 0), index + 1, index)
-        k = k + dr.select(skip > 0, uint(skip / step) + 1, 1)
-        active = active & ~hit & (t0 + floats(k) * step < t1)
-        return k, after, t, index, active
+        t = t + _onward(skip, step)
+        active = active & ~hit & (t < bundle.end)
+        return t, after, end, index, active
 
-    n = dr.width(t0)
-    state = (dr.zeros(uint, n), dr.zeros(floats, n), dr.full(floats, dr.inf, n), dr.zeros(uint, n), bundle.active)
+    n = dr.width(bundle.base)
+    begin = floats(bundle.begin)
+    state = (begin, dr.zeros(floats, n), dr.full(floats, dr.inf, n), dr.zeros(uint, n), bundle.active)
     _, _, t, index, _ = dr.while_loop(
-        state=state, cond=lambda k, passed, t, index, active: active, body=body, label="free flight"
+        state=state, cond=lambda t, passed, end, index, active: active, body=body, label="free flight"
     )
-    return dr.isfinite(t), t, index
+    return dr.isfinite(t), t, index, bundle

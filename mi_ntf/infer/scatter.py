@@ -12,8 +12,8 @@ from . import ops
 
 
 def evaluate(wi, wo, reflectance):
-    """``(value, pdf)`` of light from `wi` scattered to `wo`: the phase function ρ (⟨n,ω_i⟩⁺ + ⟨n,ω_o⟩⁺) (3-tuple, 1/sr)
-    and the density of :func:`sample`."""
+    """``(value, pdf)`` of light from `wi` scattered to `wo`: the phase function ρ (⟨n,ω_i⟩ + ⟨n,ω_o⟩) (3-tuple, 1/sr)
+    and the density of :func:`sample`, both 0 for a viewer below the horizon."""
     normal, albedo, roughness, specular = reflectance
     diffuse, gloss = microfacet.scattering(ops, wi, wo, normal, roughness)
     value = tuple((1 - specular) * k * diffuse + specular * gloss for k in albedo)

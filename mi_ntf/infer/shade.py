@@ -75,7 +75,8 @@ def _lobes(wi, points, skin: bool, specular: bool):
     if not specular:
         cos = dr.maximum(dot(points.normal, wi), 0)
         if skin:
-            cos = dr.select(cos > 0, cos + dr.maximum(dot(points.normal, points.wo), 0), 0)
+            above = dot(points.normal, points.wo)
+            cos = dr.select((cos > 0) & (above > 0), cos + above, 0)
         return cos * microfacet.INV_PI, None
     model = microfacet.scattering if skin else microfacet.lobes
     diffuse, gloss = model(ops, wi, points.wo, points.normal, points.roughness)

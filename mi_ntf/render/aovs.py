@@ -21,6 +21,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.errors import MiNtfError
+from .camera import Camera, Reconstruction
 
 CHANNELS = {
     "depth": ("T",), "normal": ("X", "Y", "Z"), "albedo": ("R", "G", "B"), "roughness": ("Y",), "opacity": ("Y",),
@@ -155,10 +156,12 @@ class Sums:
 class Picture:
     """Sums over pixels, beside the film's own block, until each pixel's expectation can be taken."""
 
-    def __init__(self, film, wanted: tuple[str, ...], lights: int):
+    def __init__(self, camera: Camera, wanted: tuple[str, ...], lights: int):
         self.wanted, self.lights = wanted, lights
         self.names = channel_names(wanted, lights)
+        film = camera.film
         self.block = mi.ImageBlock(film.crop_size(), film.crop_offset(), len(self.names) + 2, film.rfilter())
+        self._pixels = Reconstruction(self.block, camera)
 
     def sums(self, rays: int, run: int, lights: tuple[int, int] | None) -> Sums | None:
         """For camera rays lit by the run `run` of lights (first, last), None: all of them; None where a later run has
@@ -167,12 +170,9 @@ class Picture:
             return None
         return Sums(self.wanted, self.lights, rays, lights[0] if lights else 0, run > 0)
 
-    def put(self, position, sums: Sums) -> None:
-        """Add the rays' sums at their film positions."""
-        values = sums.values()
-        dr.eval(values, position)
-        self.block.put(position, values)
-        dr.eval(self.block.tensor())
+    def put(self, first: int, position, sums: Sums) -> None:
+        """Add the rays' sums, as :meth:`mi_ntf.render.camera.Reconstruction.add`."""
+        self._pixels.add(first, position, sums.values())
 
     def write_to(self, block) -> None:
         """Fill the extra channels of the film's `block`, which hold 0 so far. The film divides all by the sum of its

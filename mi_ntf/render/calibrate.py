@@ -90,9 +90,7 @@ def _points(grid) -> shade.Points:
     found = _camera(grid)
     lane = dr.arange(mi.UInt32, WIDTH) % dr.opaque(mi.UInt32, max(dr.width(found.t), 1))
     ray, t = dr.gather(mi.UInt32, found.ray, lane), dr.gather(mi.Float, found.t, lane)
-    o, d = _rays(grid)
-    along = tuple(dr.gather(mi.Float, c, ray) for c in d)
-    x = tuple(dr.gather(mi.Float, a, ray) + t * b for a, b in zip(o, along, strict=True))
+    x, along = found.place(0, ray, t)
     points = shade.Points(x, tuple(-c for c in along), grid.reflectance(x))
     dr.eval(points.x, points.wo, points.normal, points.albedo, points.roughness, points.specular)
     return points
@@ -101,8 +99,8 @@ def _points(grid) -> shade.Points:
 def _camera(grid) -> march.Samples:
     o, d = _rays(grid)
     middle = dr.full(mi.Float, 0.5, WIDTH)
-    return march.camera_samples([march.Strand(grid.density, grid, o, d)], mi.Float(dr.inf),
-                                dr.opaque(mi.Float, 2 / SAMPLES), middle, middle)
+    strand = march.Strand(grid.density, grid, o, d, dr.opaque(mi.Float, 2 / SAMPLES))
+    return march.camera_samples([strand], mi.Float(dr.inf), middle, middle)
 
 
 def _rays(grid):

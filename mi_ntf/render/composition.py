@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
+from ..core.errors import MiNtfError
 from ..infer import march, shade
 from . import effects, lights, visibility
 from .surfaces import Surfaces
@@ -85,12 +86,21 @@ class Composition:
 
     def _runs(self) -> list:
         """Runs of the table's lights, (first, last), whose maps fit into memory together; [None] for all at once, as
-        where maps are not made, or lights carry gradients, which parts of a table lose."""
+        where maps are not made. Raises MiNtfError where derivatives need more maps at once than fit."""
         found = self.effects
-        if not self._media or not found.lit or not found.needs_visibility or found.gradients:
+        if not self._media or not found.lit or not found.needs_visibility:
             return [None]
         table = self.lights.table(self._media[0].frame)
-        return visibility.parts(found.visibility, self._media, table, visibility.options(self.integrator))
+        options = visibility.options(self.integrator)
+        runs = visibility.parts(found.visibility, self._media, table, options)
+        if found.gradients and len(runs) > 1:
+            size = sum(visibility.size_per_light(found.visibility, m, table, options) for m in self._media)
+            raise MiNtfError(
+                f"map_memory is {options.map_memory:.4g} MiB, but derivatives need the maps of all {table.count} "
+                f"lights at once, {size * table.count / 2**20:.4g} MiB ({found.visibility}); raise map_memory or "
+                "choose visibility=raymarch, which holds none"
+            )
+        return [None] if found.gradients else runs
 
     def select(self, run: int) -> None:
         """Prepare the lights of run `run`: the first adds all else that shines as well, later ones these lights alone,
@@ -126,27 +136,28 @@ class Composition:
         return tau
 
     def strands(self, ray, parts):
-        """``(strands, unit, step)`` of scene rays through `parts`: t counts in `unit`, scene lengths."""
-        unit = parts[0].frame.length
+        """``(strands, unit)`` of scene rays through `parts`: t counts in `unit`, scene lengths."""
         several = len(parts) > 1
+        unit = min(p.frame.length for p in parts)
         result = [
             march.Strand(
                 p.source.density,
                 p.medium.field.grid,
                 p.frame.point_to_field(ray.o),
                 p.frame.direction_to_field(ray.d),
+                dr.opaque(mi.Float, 2 / self.integrator.samples),
                 dr.opaque(mi.Float, unit / p.frame.length) if several else None,
             )
             for p in parts
         ]
-        finest = min(p.frame.length for p in parts) / unit
-        return result, unit, dr.opaque(mi.Float, finest * 2 / self.integrator.samples)
+        return result, unit
 
     def fly(self, ray, maxt, offset, depth, which):
-        """:func:`mi_ntf.infer.march.free_flight` of scene rays through all fields."""
-        strands, unit, step = self.strands(ray, self.parts)
-        hit, t, index = march.free_flight(strands, maxt / unit, step, offset, depth, which)
-        return hit, t * unit, index
+        """:func:`mi_ntf.infer.march.free_flight` of scene rays through all fields: ``(hit, t, index)``, t in scene
+        lengths from the ray's origin."""
+        strands, unit = self.strands(ray, self.parts)
+        hit, t, index, bundle = march.free_flight(strands, maxt / unit, offset, depth, which)
+        return hit, (bundle.base + t) * unit, index
 
     def reflect(self, part: Part, points, stream, view=None):
         """Radiance that `points` of `part` reflect from all lights; `view`: their transmittance, if lights share it."""
@@ -201,46 +212,49 @@ class Composition:
     def _fields(self, ray, hit, offset, depth, total, stream, sums):
         """Adds the light that fields scatter once; returns the transmittance of the rays."""
         found = self.effects
-        strands, unit, step = self.strands(ray, self.in_view)
-        maxt = dr.minimum(ray.maxt, hit.t) if hit is not None else ray.maxt
+        strands, unit = self.strands(ray, self.in_view)
+        maxt = (dr.minimum(ray.maxt, hit.t) if hit is not None else ray.maxt) / unit
         if found.collocated and not sums:
-            reflect = self._at_camera(strands)
-            total[:], transmittance = march.camera_light(strands, maxt / unit, step, offset, depth, reflect)
+            total[:], transmittance = march.camera_light(strands, maxt, offset, depth, self._at_camera(strands))
             return transmittance
         wanted = found.lit or bool(sums and sums.needs_points)
-        samples = march.camera_samples(
-            strands, maxt / unit, step, offset, depth, shade=wanted, view=found.collocated
-        )
-        for part, strand, weight in zip(self.in_view, strands, samples.weights, strict=True):
-            index, t, view = samples.ray, samples.t, samples.view
-            if len(strands) > 1 and dr.width(index):
-                kept = dr.compress(weight > 0)
-                index, t, weight = (dr.gather(type(a), a, kept) for a in (index, t, weight))
-                view = dr.gather(mi.Float, view, kept) if view is not None else None
-            if not dr.width(index):
-                continue
-            distance, t = t * unit, t if strand.rate is None else t * strand.rate
-            along = tuple(dr.gather(mi.Float, c, index) for c in strand.d)
-            x = tuple(dr.gather(mi.Float, a, index) + t * b for a, b in zip(strand.o, along, strict=True))
-            points = shade.Points(x, tuple(-c for c in along), part.source.reflectance(x))
-            points.evaluate()
-            if sums:
-                shadow = Known(view) if view is not None else self._shadow(part, "mapped")
-                sums.add_field(part.frame, points, index, distance, weight, part.table, shadow)
-            if not found.lit:
-                continue
-            for channel, value in zip(total, self.reflect(part, points, stream, view), strict=True):
-                dr.scatter_reduce(dr.ReduceOp.Add, channel, value * weight, index)
+        samples = march.camera_samples(strands, maxt, offset, depth, shade=wanted, view=found.collocated)
+        light = [dr.zeros(mi.Float, dr.width(samples.t)) for _ in range(3)]
+        for i, part in enumerate(self.in_view):
+            self._field(i, part, samples, unit, light, stream, sums)
+        if found.lit and dr.width(samples.t):
+            total[:] = samples.totals(light, found.gradients)
         return samples.transmittance
+
+    def _field(self, i: int, part: Part, samples, unit: float, light, stream, sums) -> None:
+        """Adds what the samples in the field `part`, strand `i`, reflect to `light`, an array of a float a sample for
+        each channel."""
+        weight, kept = samples.weights[i], None
+        index, t, view = samples.ray, samples.t, samples.view
+        if len(self.in_view) > 1 and dr.width(index):
+            kept = dr.compress(weight > 0)
+            index, t, weight = (dr.gather(type(a), a, kept) for a in (index, t, weight))
+            view = dr.gather(mi.Float, view, kept) if view is not None else None
+        if not dr.width(index):
+            return
+        x, along = samples.place(i, index, t)
+        points = shade.Points(x, tuple(-c for c in along), part.source.reflectance(x))
+        points.evaluate()
+        if sums:
+            shadow = Known(view) if view is not None else self._shadow(part, "mapped")
+            distance = (dr.gather(mi.Float, samples.bundle.base, index) + t) * unit
+            sums.add_field(part.frame, points, index, distance, weight, part.table, shadow)
+        if self.effects.lit:
+            for channel, value in zip(light, self.reflect(part, points, stream, view), strict=True):
+                where = dr.arange(mi.UInt32, dr.width(t)) if kept is None else kept
+                dr.scatter_reduce(dr.ReduceOp.Add, channel, value * weight, where, mode=dr.ReduceMode.NoConflicts)
 
     def _at_camera(self, strands):
         """The `reflect` of :func:`mi_ntf.infer.march.camera_light` for the fields in view."""
 
-        def reflect(i, t, view):
-            part, strand = self.in_view[i], strands[i]
-            t = t if strand.rate is None else t * strand.rate
-            x = tuple(a + t * b for a, b in zip(strand.o, strand.d, strict=True))
-            points = shade.Points(x, tuple(-c for c in strand.d), part.source.reflectance(x))
+        def reflect(i, x, view):
+            part = self.in_view[i]
+            points = shade.Points(x, tuple(-c for c in strands[i].d), part.source.reflectance(x))
             return shade.reflect(points, part.table, Known(view), self.effects.specular)
 
         return reflect

@@ -102,6 +102,7 @@ def _check_bounds(medium, shapes) -> None:
     low, high = np.maximum(world.min(0), origin - radius), np.minimum(world.max(0), origin + radius)
     slack = 0.01 * radius
     for shape in shapes:
+        _check_bsdf(shape)
         box = shape.bbox()
         if (np.array(box.min).ravel() > low + slack).any() or (np.array(box.max).ravel() < high - slack).any():
             raise MiNtfError(
@@ -113,6 +114,17 @@ def _check_bounds(medium, shapes) -> None:
         raise MiNtfError(
             f"{len(shapes)} bounding shapes ({', '.join(s.id() for s in shapes)}) share one nrf medium, which can "
             "agree with one placement only; give each shape a medium of its own with its own to_world"
+        )
+
+
+def _check_bsdf(shape) -> None:
+    """A bound is no surface: rays enter the medium as if it were not there."""
+    flags, names = shape.bsdf().flags(), ("Diffuse", "Glossy", "DeltaReflection", "DeltaTransmission")
+    if any(mi.has_flag(flags, getattr(mi.BSDFFlags, name)) for name in names):
+        raise MiNtfError(
+            f"bounding shape {shape.id()} has a {shape.bsdf().class_name()} BSDF, but a shape that bounds an nrf "
+            'medium is no surface; give it <bsdf type="null"/> (the default is diffuse), and add a surface such as '
+            "glass as a shape of its own around it"
         )
 
 

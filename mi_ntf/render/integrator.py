@@ -9,6 +9,7 @@ import mitsuba as mi
 from ..core.errors import MiNtfError
 from ..infer.visibility import METHODS
 from . import aovs
+from .camera import Camera, Reconstruction
 from .composition import Composition
 
 CHUNK = 1 << 18
@@ -123,54 +124,59 @@ def _whole(props, name: str, default: int, low: int, high: int) -> int:
 
 def _render(self, scene, sensor, seed: int, spp: int, develop: bool):
     """Camera rays in chunks of pixels → radiance and opacity → film."""
+    if dr.flag(dr.JitFlag.FreezingScope):
+        raise MiNtfError(
+            "nrf integrator: dr.freeze cannot record a render whose number of shading points is known only while it "
+            "runs; call mi.render outside of frozen functions (its kernels are cached all the same)"
+        )
     start = time.monotonic()
-    film = sensor.film()
-    sampler = sensor.sampler().clone()
-    if spp:
-        sampler.set_sample_count(spp)
-    spp = sampler.sample_count()
-    sampler.set_samples_per_wavefront(spp)
-    size = mi.ScalarVector2u(film.crop_size()) + (2 * film.rfilter().border_size() if film.sample_border() else 0)
-    pixels = size.x * size.y
-    composition = Composition(scene, self, sensor, spp)
+    camera = Camera(sensor, spp)
+    film = camera.film
+    composition = Composition(scene, self, sensor, camera.spp)
     picture = None
     if self.aovs:
         self.lights_seen = len(composition.lights.rows.power)
-        picture = aovs.Picture(film, self.aovs, self.lights_seen)
+        picture = aovs.Picture(camera, self.aovs, self.lights_seen)
     film.prepare(picture.names if picture else [])
     block = film.create_block()
     block.set_offset(film.crop_offset())
-    per_chunk = max(1, CHUNK // spp)
+    pixels = Reconstruction(block, camera)
     # Lights in runs whose maps fit into memory, and for each the same camera rays.
-    for run, first in itertools.product(range(len(composition.runs)), range(0, pixels, per_chunk)):
+    chunks = range(0, camera.count, max(1, CHUNK // camera.spp))
+    for run, first in itertools.product(range(len(composition.runs)), chunks):
         if self.should_stop() or (self.timeout > 0 and time.monotonic() - start > self.timeout):
-            mi.Log(mi.LogLevel.Warn, f"nrf integrator: stopped after {first} of {pixels} pixels")
+            _stop(pixels, run, first, len(composition.runs))
             break
         composition.select(run)
-        count = min(per_chunk, pixels - first)
+        count = min(chunks.step, camera.count - first)
         # Another stream for each chunk and seed; opaque, so that no seed is compiled into a kernel.
         stream = mi.sample_tea_32(_opaque(seed), dr.opaque(mi.UInt32, first))[0]
-        sampler.seed(stream, count * spp)
-        pixel = dr.arange(mi.UInt32, count * spp) // dr.opaque(mi.UInt32, spp) + dr.opaque(mi.UInt32, first)
-        ray, weight, position = _camera_rays(sensor, film, sampler, pixel, size.x)
-        sums = picture and picture.sums(dr.width(ray.o), run, composition.runs[run])
+        ray, weight, position = camera.rays(first, count, stream)
+        sums = picture and picture.sums(dr.width(ray), run, composition.runs[run])
         with composition.lights.bare():
-            radiance, opacity = composition.trace(ray, sampler, stream, sums)
-        value = radiance * weight
-        channels = (
-            [value.x, value.y, value.z]
-            + ([0.0 if run else opacity] if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else [])
-            + [0.0 if run else 1.0]
-        )
+            radiance, opacity = composition.trace(ray, camera.sampler, stream, sums)
+        alpha = [opacity] if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else []
+        once = [*alpha, dr.ones(mi.Float, dr.width(ray))]
+        pixels.add(first, position, [*(radiance * weight), *([None] * len(once) if run else once)])
         if sums:
-            picture.put(position, sums)
-        channels += [0.0] * len(picture.names if picture else [])
-        block.put(position, [mi.Float(c) for c in channels])
-        dr.eval(block.tensor())
+            picture.put(first, position, sums)
     if picture:
         picture.write_to(block)
     film.put_block(block)
     return film.develop() if develop else mi.TensorXf()
+
+
+def _stop(pixels: Reconstruction, run: int, first: int, runs: int) -> None:
+    """Rendering ends before source pixel `first` of `run`: pixels that not all runs of lights have reached stay
+    empty."""
+    last = run == runs - 1
+    if runs > 1:
+        pixels.keep(first if last else 0)
+    mi.Log(
+        mi.LogLevel.Warn,
+        f"nrf integrator: stopped after {first if last else 0} of {pixels.camera.count} pixels"
+        + ("" if last else f", in run {run + 1} of {runs} of the lights: more map_memory needs fewer runs"),
+    )
 
 
 def _opaque(seed):
@@ -178,18 +184,3 @@ def _opaque(seed):
     value = mi.UInt32(seed)
     dr.make_opaque(value)
     return value
-
-
-def _camera_rays(sensor, film, sampler, pixel, width: int):
-    """Primary rays of the given pixel indices, their weights and film positions (as Mitsuba's own integrators do)."""
-    border = film.rfilter().border_size() if film.sample_border() else 0
-    y = pixel // dr.opaque(mi.UInt32, width)
-    corner = mi.Vector2f(mi.Float(pixel - y * width), mi.Float(y)) - border + mi.Vector2f(film.crop_offset())
-    inside = corner + sampler.next_2d()
-    scaled = (inside - mi.Vector2f(film.crop_offset())) / mi.Vector2f(film.crop_size())
-    aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
-    moment = mi.Float(sensor.shutter_open())
-    if sensor.shutter_open_time() > 0:
-        moment += sampler.next_1d() * sensor.shutter_open_time()
-    ray, weight = sensor.sample_ray(moment, 0.0, mi.Point2f(scaled), aperture)
-    return ray, weight, corner if film.rfilter().is_box_filter() else inside

@@ -159,12 +159,13 @@ def test_phase_function_is_the_reflectance_times_both_cosines(wi, wo, s, roughne
 
 
 @given(sphere, sphere, st.floats(0.15, 1))
-def test_phase_function_scatters_light_from_above_alone(wi, wo, roughness):
+def test_phase_function_scatters_from_above_to_above_alone_and_is_reciprocal(wi, wo, roughness):
     diffuse, specular = microfacet.scattering(ops, wi, wo, N, roughness)
-    if wi[2] <= 0:
+    if min(wi[2], wo[2]) <= 0:
         assert diffuse == 0 and specular == 0
     else:
-        assert diffuse == pytest.approx((wi[2] + max(wo[2], 0)) / np.pi) and specular >= 0
+        assert diffuse == pytest.approx((wi[2] + wo[2]) / np.pi) and specular >= 0
+    assert microfacet.scattering(ops, wo, wi, N, roughness) == pytest.approx((diffuse, specular), rel=1e-11)
 
 
 @pytest.mark.parametrize("cosines", [(1.0, 1.0), (0.2, 0.9), (0.95, 0.1)])

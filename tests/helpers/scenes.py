@@ -49,6 +49,17 @@ def film(size: int) -> dict:
     return {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}, "pixel_format": "rgba"}
 
 
+def ball(field: Path, similarity=SIMILARITY, **medium) -> dict:
+    """The object of `field` in a sphere of null BSDF."""
+    return {
+        "type": "sphere",
+        "center": list(similarity.center),
+        "radius": similarity.radius,
+        "bsdf": {"type": "null"},
+        "interior": {"type": "nrf", "filename": str(field), **medium},
+    }
+
+
 def scene(
     field: Path | None,
     integrator: dict,
@@ -59,10 +70,12 @@ def scene(
     medium=None,
     shapes=None,
     sampler="independent",
+    film_options=None,
 ):
-    """The object in a sphere of null BSDF, seen from the front; `lights`: name → emitter dict."""
+    """The object in a sphere of null BSDF, seen from the front; `lights`: name → emitter dict; `film_options`: beside
+    those of :func:`film`."""
     to_world = mi.ScalarTransform4f
-    center, radius = list(SIMILARITY.center), SIMILARITY.radius
+    center = list(SIMILARITY.center)
     look = to_world().look_at(origin=[center[0] + 1.2, center[1] + 1.5, center[2] + 5], target=center, up=[0, 1, 0])
     result = {
         "type": "scene",
@@ -71,20 +84,14 @@ def scene(
             "type": "perspective",
             "fov": 28,
             "to_world": look,
-            "film": film(size),
+            "film": {**film(size), **(film_options or {})},
             "sampler": {"type": sampler, "sample_count": spp},
         },
         **lights,
         **(shapes or {}),
     }
     if field is not None:
-        result["ball"] = {
-            "type": "sphere",
-            "center": center,
-            "radius": radius,
-            "bsdf": {"type": "null"},
-            "interior": {"type": "nrf", "filename": str(field), **(medium or {})},
-        }
+        result["ball"] = ball(field, **(medium or {}))
     return mi.load_dict(result)
 
 

@@ -49,9 +49,8 @@ def test_transmittance_and_weights(grid, rng):
     o, d = rays(rng, 300)
     step = 2 / 2048
     samples = march.camera_samples(
-        [march.Strand(grid.density, grid, arrays(o), arrays(d))],
+        [march.Strand(grid.density, grid, arrays(o), arrays(d), mi.Float(step))],
         mi.Float(np.full(300, 1e9)),
-        mi.Float(step),
         mi.Float(rng.random(300)),
         mi.Float(rng.random(300)),
     )
@@ -63,7 +62,7 @@ def test_transmittance_and_weights(grid, rng):
     # What MIN_WEIGHT_RATE leaves out, and MIN_TRANSMITTANCE.
     np.testing.assert_allclose(sums, 1 - np.array(transmittance), atol=6e-3)
     assert (np.array(w) > march.MIN_WEIGHT_RATE * step).all()
-    x = o[np.array(index)] + np.array(t)[:, None] * d[np.array(index)]
+    x = np.array(samples.place(0, index, t)[0]).T
     assert np.linalg.norm(x, axis=1).max() < 1
 
 
@@ -72,13 +71,13 @@ def test_samples_follow_free_flight(slab, rng):
     n, sigma = 20000, 1.5
     o, d = np.tile([[0.0, 0.0, 3.0]], (n, 1)), np.tile([[0.0, 0.0, -1.0]], (n, 1))
     samples = march.camera_samples(
-        [march.Strand(slab.density, slab, arrays(o), arrays(d))],
+        [march.Strand(slab.density, slab, arrays(o), arrays(d), mi.Float(0.25))],
         mi.Float(np.full(n, 1e9)),
-        mi.Float(0.25),
         mi.Float(rng.random(n)),
         mi.Float(rng.random(n)),
     )
-    w, t = np.array(samples.weights[0], np.float64), np.array(samples.t, np.float64)
+    w, t = np.array(samples.weights[0], np.float64), 2 + np.array(samples.t, np.float64)
+    np.testing.assert_allclose(np.array(samples.bundle.base), 2)
     assert w.sum() / n == pytest.approx(1 - np.exp(-2 * sigma), rel=4e-3)  # voxels at the surface, 1/128 wide
     mean = 2 + 1 / sigma - 2 * np.exp(-2 * sigma) / (1 - np.exp(-2 * sigma))
     # Coarse steps of an eighth of the chord, yet no bias: that is what the random depth inside a step is for.
@@ -134,11 +133,10 @@ def test_skipping_changes_nothing(grid, rng):
     o, d = rays(rng, 200)
     arguments = (
         mi.Float(np.full(200, 1e9)),
-        mi.Float(2 / 300),
         mi.Float(rng.random(200)),
         mi.Float(rng.random(200)),
     )
-    strands = [[march.Strand(grid.density, g, arrays(o), arrays(d))] for g in (grid, Everywhere)]
+    strands = [[march.Strand(grid.density, g, arrays(o), arrays(d), mi.Float(2 / 300))] for g in (grid, Everywhere)]
     fast, slow = ((s.ray, s.t, *s.weights) for s in (march.camera_samples(k, *arguments) for k in strands))
     order = [np.lexsort((np.array(r[1]), np.array(r[0]))) for r in (fast, slow)]
     for a, b in zip(fast, slow, strict=True):
@@ -150,9 +148,8 @@ def test_rays_that_miss():
     empty = GridField(NetworkField(*fields.empty(), mi), 32, mi)
     o, d = np.array([[0, 0, 3.0], [5.0, 0, 3.0]]), np.array([[0, 0, -1.0], [0, 0, -1.0]])
     samples = march.camera_samples(
-        [march.Strand(empty.density, empty, arrays(o), arrays(d))],
+        [march.Strand(empty.density, empty, arrays(o), arrays(d), mi.Float(0.01))],
         mi.Float([1e9, 1e9]),
-        mi.Float(0.01),
         mi.Float([0.3, 0.3]),
         mi.Float([0.5, 0.5]),
     )
@@ -167,12 +164,12 @@ def test_overlapping_fields_add(rng):
     axis = np.tile([[0.0, 0.0, -1.0]], (n, 1))
     # Scene units are those of the dense ball; the thin one is twice its size, its centre 1.2 behind the other's.
     strands = [
-        march.Strand(dense.density, dense, arrays(np.tile([[0, 0, 3.0]], (n, 1))), arrays(axis), mi.Float(1.0)),
-        march.Strand(thin.density, thin, arrays(np.tile([[0, 0, 2.1]], (n, 1))), arrays(axis), mi.Float(0.5)),
+        march.Strand(f.density, f, arrays(np.tile([[0, 0, z]], (n, 1))), arrays(axis), mi.Float(0.01), mi.Float(rate))
+        for f, z, rate in ((dense, 3.0, 1.0), (thin, 2.1, 0.5))
     ]
-    step, far = mi.Float(0.01), mi.Float(np.full(n, 1e9))
+    far = mi.Float(np.full(n, 1e9))
     u = [mi.Float(rng.random(n)) for _ in range(4)]
-    samples = march.camera_samples(strands, far, step, u[0], u[1])
+    samples = march.camera_samples(strands, far, u[0], u[1])
     # The dense ball fills t in [2, 4], the thin one [2.2, 6.2] at density 0.3.
     t = np.linspace(2, 6.2, 42001)
     sigma = np.stack([np.where(t < 4, 0.5, 0), np.where(t > 2.2, 0.3, 0)])
@@ -181,11 +178,11 @@ def test_overlapping_fields_add(rng):
     got = [np.array(w, np.float64).sum() / n for w in samples.weights]
     np.testing.assert_allclose(got, truth, rtol=0.01)  # voxels at the spheres' surfaces, 1/64 wide
     np.testing.assert_allclose(np.array(samples.transmittance), np.exp(-passed[-1]), rtol=0.02)
-    hit, where, index = march.free_flight(strands, far, step, u[0], -dr.log(1 - u[2]), u[3])
-    hit, where, index = (np.array(a) for a in (hit, where, index))
+    hit, where, index, bundle = march.free_flight(strands, far, u[0], -dr.log(1 - u[2]), u[3])
+    hit, where, index = (np.array(a) for a in (hit, bundle.base + where, index))
     noise = 4 * np.sqrt(0.25 / n)
     assert [(hit & (index == i)).mean() for i in (0, 1)] == pytest.approx(list(truth), abs=noise)
     assert where[hit].mean() == pytest.approx((sigma.sum(0) * np.exp(-passed) * t).sum() / (
         sigma.sum(0) * np.exp(-passed)).sum(), abs=4 * where[hit].std() / np.sqrt(n))
     cut = mi.Float(np.full(n, 3.0))
-    assert np.array(march.camera_samples(strands, cut, step, u[0], u[1]).t).max() <= 3.0
+    assert np.array(march.camera_samples(strands, cut, u[0], u[1]).t).max() <= 1.0

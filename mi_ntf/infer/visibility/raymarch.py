@@ -7,7 +7,8 @@ from .. import ops
 from ..march import clear_distance, safe_inverse
 
 MAX_OPTICAL_DEPTH = 12.0
-"""Light rays end here: τ < 6e-6."""
+"""Light rays end here, and count as blocked: a lamp that shines through at τ = 6e-6 would light what is outside an
+opaque lantern, if it is strong enough."""
 
 
 class RayMarch:
@@ -18,8 +19,9 @@ class RayMarch:
         self.density, self.grid, self.steps = density, grid, steps
 
     def tau(self, x, wi, distance, index, active):
-        """exp(−∫σ) from `x` to the light."""
-        return dr.exp(-optical_depth(self.density, self.grid, x, wi, distance, self.steps, active))
+        """exp(−∫σ) from `x` to the light, 0 where the march ended before it."""
+        depth = optical_depth(self.density, self.grid, x, wi, distance, self.steps, active)
+        return dr.select(depth < MAX_OPTICAL_DEPTH, dr.exp(-depth), 0)
 
 
 def default_steps(step: float, gradients: bool = False) -> tuple[float, float, float]:
@@ -44,19 +46,22 @@ def optical_depth(density, grid, x, d, length, steps, active):
     """
     attached = dr.grad_enabled(x, d)
     still, along = dr.detach(x), dr.detach(d)
-    hit, _m, h = spheres.chord(ops, still, along)
+    # Places are t' of the chord, small numbers also where `x` lies far outside.
+    hit, m, h = spheres.chord(ops, still, along)
     here = spheres.coordinate(still, along)
-    begin, end = dr.maximum(-h - here, 0), dr.minimum(dr.detach(length), h - here)
+    begin, end = dr.maximum(-h, here), dr.minimum(here + dr.detach(length), h)
     shortest, longest, growth = steps
     inverse = safe_inverse(along)
 
     def body(t, depth, active):
-        step = dr.minimum(dr.clip(growth * t, shortest, longest), end - t)
-        p = tuple(xi + t * di for xi, di in zip(still, along, strict=True))
+        step = dr.minimum(dr.clip(growth * (t - here), shortest, longest), end - t)
+        p = tuple(mi + t * di for mi, di in zip(m, along, strict=True))
         skip = clear_distance(grid, p, inverse)
         empty = skip > 0
         at = t + 0.5 * step
-        q = tuple(xi + at * di for xi, di in zip(x, d, strict=True))
+        q = tuple(mi + at * di for mi, di in zip(m, along, strict=True))
+        if attached:
+            q = tuple(dr.replace_grad(a, xi + (at - here) * di) for a, xi, di in zip(q, x, d, strict=True))
         sigma = density(q)
         depth = depth + dr.select(active & ~empty, sigma * step, 0)
         t = t + dr.select(empty, skip + 1e-4, step)

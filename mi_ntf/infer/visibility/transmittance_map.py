@@ -74,8 +74,10 @@ class TransmittanceMap:
 
 
 def _root(t, mixture):
-    """√τ(t). Clipped where S is 2e-9, so that no product of denominators overflows."""
-    terms = [(w, 1 + dr.exp(dr.clip(a * (b - t), -20, 20))) for w, a, b in mixture]
+    """√τ(t). Clipped where S is 4e-18 (of more than two logistics, more), so that no product of denominators
+    overflows."""
+    top = min(40.0, 80.0 / len(mixture))
+    terms = [(w, 1 + dr.exp(dr.clip(a * (b - t), -20, top))) for w, a, b in mixture]
     total, below = terms[0]
     if len(terms) == 1:
         return dr.sqrt(total) * dr.rsqrt(below)
