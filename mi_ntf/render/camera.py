@@ -129,10 +129,11 @@ class Reconstruction:
         """Set to 0 the pixels that samples of source pixels from `done` on would reach."""
         tensor, reach, border = self.block.tensor(), self._reach, self.camera.border
         height, width, channels = tensor.shape
-        pixel = dr.arange(mi.UInt32, height * width * channels) // channels
+        entry = dr.arange(mi.UInt32, height * width * channels)
+        pixel = entry // channels
         y = pixel // width
         x = pixel - y * width
         size = self.camera.count // self.camera.width
         last = dr.minimum(y + border + reach, size - 1) * self.camera.width
         last += dr.minimum(x + border + reach, self.camera.width - 1)
-        tensor.array = dr.select(last < done, tensor.array, 0)
+        dr.scatter(tensor.array, mi.Float(0), entry, last >= done)

@@ -196,3 +196,14 @@ def test_chunks_that_meet_nothing(blobs, monkeypatch, floor):
     rows = scenes.render(scene, 0)
     assert (rows[0, :, :3] == 0).all()
     np.testing.assert_allclose(rows.mean((0, 1)), whole.mean((0, 1)), rtol=0.05)  # other samples
+
+
+@pytest.mark.parametrize("bsdf", [{"type": "dielectric"}, {"type": "diffuse"}, {"type": "thindielectric"}, None])
+def test_a_bound_that_is_a_surface_is_refused(blobs, bsdf):
+    """A statue in a glass ball whose shape is the glass: volpath would refract there, so nothing must be drawn
+    silently without."""
+    loaded = scenes.scene(None, nrf(), {"light": scenes.light("point")}, size=8, spp=1, shapes={
+        "ball": {k: v for k, v in (scenes.ball(blobs) | {"bsdf": bsdf}).items() if v}})  # fmt: skip
+    with pytest.raises(Exception) as caught:
+        scenes.render(loaded)
+    assert "medium is no surface" in str(caught.value.__cause__ or caught.value)
