@@ -1,13 +1,13 @@
 """Field files: one ``.safetensors`` with a JSON header, checked against a skeleton. No pickle is ever read."""
 
 import json
-import os
 from pathlib import Path
 
 import numpy as np
 import safetensors
 import safetensors.numpy
 
+from . import files
 from .architecture import Header, header_from_json
 from .errors import MiNtfError
 
@@ -25,12 +25,7 @@ def save(path: str | Path, header: Header, tensors: dict[str, np.ndarray], dtype
         data: dict[str, np.ndarray] = {
             k: np.ascontiguousarray(v, dtype if ".planes." in k else np.float32) for k, v in tensors.items()}
     _check(f"{path} as {np.dtype(dtype).name}", header, data)
-    if not Path(path).absolute().parent.is_dir():
-        raise MiNtfError(f"cannot write {path}: folder {Path(path).parent} does not exist; create it first")
-    temporary = Path(f"{path}.part")
-    safetensors.numpy.save_file(data, temporary, metadata={_KEY: json.dumps(header.to_json())})
-    temporary.chmod(0o644)  # safetensors makes files for their owner alone
-    os.replace(temporary, path)
+    files.write(path, safetensors.numpy.save(data, metadata={_KEY: json.dumps(header.to_json())}))
 
 
 def load(path: str | Path) -> tuple[Header, dict[str, np.ndarray]]:

@@ -8,13 +8,13 @@ where it suits them, its integrator are kept. The one file of `data` that uses M
 
 import hashlib
 import json
-import os
 import time
 from pathlib import Path
 
 import numpy as np
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from mi_ntf.core import files
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.data import schema
 from mi_ntf.data.bounds import bounding_sphere
@@ -126,15 +126,16 @@ def _open_manifest(out: Path, settings: dict) -> None:
     """Note the settings in `capture.json`, or hold them against those of the run that this one resumes."""
     path = out / "capture.json"
     if path.exists():
-        before = json.loads(path.read_text())
+        try:
+            before = dict(json.loads(path.read_bytes()))
+        except (TypeError, ValueError):
+            raise MiNtfError(f"{path} is no JSON object; delete the folder to capture anew") from None
         for key, value in settings.items():
             if before.get(key) != value:
                 raise MiNtfError(f"{path}: this folder was captured with {key} = {before.get(key)}, now {key} = "
                                  f"{value}; use another folder, delete this one, or give the former value to resume")
         return
-    temporary = path.with_suffix(".json.tmp")
-    temporary.write_text(json.dumps(settings, indent=1) + "\n")
-    os.replace(temporary, path)
+    files.write(path, json.dumps(settings, indent=1) + "\n")
 
 
 def _plan(counts: dict[str, int], center: np.ndarray, radius: float, seed: int) -> dict[str, list[schema.Frame]]:
@@ -170,7 +171,7 @@ def capture(scene: Path, out: Path, *, views: int = 100, size: int = 128, test_v
     angle = float(2.0 * np.arcsin(1.0 / DISTANCE))
     studio = _studio(shapes, integrator, angle, size)
     counts = {"train": views, "val": max(4, views // 20), "test": test_views}
-    out.mkdir(parents=True, exist_ok=True)
+    files.make_folder(out)
     _open_manifest(out, {"scene": Path(scene).name, "object": _fingerprint(studio),
                          "integrator": " ".join(str(studio.integrator()).split()), "views": views, "size": size,
                          "test_views": test_views, "spp": spp, "seed": seed})
@@ -183,7 +184,7 @@ def capture(scene: Path, out: Path, *, views: int = 100, size: int = 128, test_v
             path = out / frame.file
             if path.exists():
                 continue
-            path.parent.mkdir(exist_ok=True)
+            files.make_folder(path.parent)
             params["sensor.to_world"] = mi.Transform4f(mi.Matrix4f(schema.mitsuba_to_opengl(frame.c2w).tolist()))
             params["light.position"] = mi.Point3f(frame.light_pos.tolist())
             params["light.intensity.value"] = mi.Color3f(frame.light_intensity.tolist())

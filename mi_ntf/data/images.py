@@ -7,11 +7,11 @@
 Pillow and OpenEXR are imported where they are needed.
 """
 
-import os
 from pathlib import Path
 
 import numpy as np
 
+from mi_ntf.core import files
 from mi_ntf.core.errors import MiNtfError
 
 SUFFIXES = (".png", ".exr", ".jpg", ".jpeg")
@@ -124,11 +124,10 @@ def mask_places(root: Path, name: str) -> list[Path]:
 
 
 def write_exr(path: Path, rgba: np.ndarray) -> None:
-    """Write linear premultiplied RGBA (H, W, 4) as a half-float EXR, through a temporary name in the same folder."""
+    """Write linear premultiplied RGBA (H, W, 4) as a half-float EXR, whole or not at all."""
     import OpenEXR
 
-    temporary = path.with_suffix(".tmp.exr")
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with OpenEXR.File(header, {"RGBA": np.ascontiguousarray(rgba, dtype=np.float16)}) as file:
-        file.write(str(temporary))
-    os.replace(temporary, path)
+        with files.replacing(path) as temporary:
+            file.write(str(temporary))

@@ -15,17 +15,19 @@ EXR. Lengths are those of the captured world. What else is read, and how: `reade
 where no renderer is installed.
 """
 
+import hashlib
+import itertools
 import json
-import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
+from mi_ntf.core import files
 from mi_ntf.data.images import read_image, write_exr
 
-__all__ = ["SPLITS", "Found", "Frame", "Split", "Transforms", "View", "focal_length", "mitsuba_to_opengl",
-           "pixel_rays", "read_image", "write_exr", "write_transforms"]
+__all__ = ["SPLITS", "Found", "Frame", "Split", "Transforms", "View", "fingerprint", "focal_length",
+           "mitsuba_to_opengl", "pixel_rays", "read_image", "write_exr", "write_transforms"]
 
 SPLITS = ("train", "val", "test")
 
@@ -102,7 +104,7 @@ class Split:
 
 
 def write_transforms(folder: Path, split: str, transforms: Transforms) -> Path:
-    """Write `transforms_<split>.json` (through a temporary name) and return its path."""
+    """Write `transforms_<split>.json` (whole or not at all) and return its path."""
     data = {
         "camera_angle_x": transforms.angle_x, "w": transforms.w, "h": transforms.h,
         "unit_sphere": {"center": transforms.center.tolist(), "radius": transforms.radius},
@@ -110,10 +112,23 @@ def write_transforms(folder: Path, split: str, transforms: Transforms) -> Path:
                     "pl_intensity": f.light_intensity.tolist()} for f in transforms.frames],
     }
     path = Path(folder) / f"transforms_{split}.json"
-    temporary = path.with_suffix(".json.tmp")
-    temporary.write_text(json.dumps(data, indent=1) + "\n")
-    os.replace(temporary, path)
+    files.write(path, json.dumps(data, indent=1) + "\n")
     return path
+
+
+def fingerprint(splits: dict[str, Split]) -> dict[str, str]:
+    """Hashes of all that `splits` hold, by what it is: tells changed data from the same ones, in whatever files."""
+    parts = {"photographs or masks": ("images",), "cameras": ("c2w", "focal", "principal"),
+             "lights": ("light_pos", "light_intensity"), "the object's sphere": ("center", "radius")}
+    found = {}
+    for what, names in parts.items():
+        digest = hashlib.sha256()
+        for split, name in itertools.product(sorted(splits), names):
+            value = np.ascontiguousarray(getattr(splits[split], name))
+            digest.update(f"{split} {name} {value.dtype} {value.shape}".encode())
+            digest.update(value)
+        found[what] = digest.hexdigest()
+    return found
 
 
 def focal_length(angle_x: float, w: int) -> float:

@@ -15,6 +15,7 @@ import mitsuba as mi
 from rich.console import Console
 from rich.table import Table
 
+from ..core import files
 from ..render import calibrate, cost, register
 from ..render.measure import maps_made_anew
 from . import bench_image, bench_paper, bench_product
@@ -44,8 +45,8 @@ def bench(quick: bool = False, out: Path | None = None, say: Callable[[str], Non
     if out is not None:
         from . import bench_figure
 
-        out.mkdir(parents=True, exist_ok=True)
-        (out / "bench.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+        files.make_folder(out)
+        files.write(out / "bench.json", json.dumps(report, indent=1) + "\n")
         bench_figure.draw(report, out / "bench.png")
     return report
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..core import files
 from .bench_paper import LIGHTS
 
 
@@ -17,9 +18,8 @@ def draw(report: dict, path: Path) -> None:
     details = [r["details"] for r in report["rows"]]
     _times(left, next(d for d in details if "intercept_seconds" in d))
     _speed_up(right, [r for r in report["rows"] if "volume_lights_seconds" in r["details"]])
-    temporary = path.with_name(path.stem + ".part.png")
-    figure.savefig(temporary, dpi=110)
-    temporary.replace(path)
+    with files.replacing(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=110)
 
 
 def _times(axes, measured: dict) -> None:

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mi_ntf.core import files
 from mi_ntf.core.errors import MiNtfError
 
 from .compare import compare_arrays, read_image
@@ -114,9 +115,8 @@ def picture(path: Path, shots: list[Shot], references: dict[str, np.ndarray], me
                                      f"to raymarch {m['relative_rmse_to_raymarch']:.1%}", fontsize=9)
         scale = ScalarMappable(Normalize(0, ERROR_SCALE), "inferno")
         figure.colorbar(scale, cax=bottom[0].inset_axes([0.7, 0.1, 0.06, 0.8]), label="error / RMS of the reference")
-    temporary = path.with_name(path.stem + ".part.png")
-    figure.savefig(temporary, dpi=110)
-    temporary.replace(path)
+    with files.replacing(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=110)
 
 
 def report(out: Path, shots: list[Shot], references: dict[str, np.ndarray], note: str) -> str:
@@ -132,8 +132,7 @@ def report(out: Path, shots: list[Shot], references: dict[str, np.ndarray], note
     measured = [s.measure(references[s.light], marched[s.light]) for s in shots]
     text = table(measured, note)
     for name, content in [("table.md", text), ("metrics.json", json.dumps(measured, indent=1) + "\n")]:
-        (out / (name + ".part")).write_text(content, encoding="utf-8")
-        (out / (name + ".part")).replace(out / name)
+        files.write(out / name, content)
     picture(out / "comparison.png", shots, references, measured)
     return text
 
@@ -155,7 +154,7 @@ def demo(out: Path = Path("out/demo"), scene: str = "statue", spp: int = 16,
     if not (folder / "scene.xml").is_file():
         raise MiNtfError(f"{folder / 'scene.xml'} does not exist; run the demo in a checkout, on a scene of scenes/")
     references = {light: _reference(folder, light) for light in LIGHTS}
-    out.mkdir(parents=True, exist_ok=True)
+    files.make_folder(out)
     command, note = program()
     console = Console()
     console.print(f"{folder / 'scene.xml'}: {note}")

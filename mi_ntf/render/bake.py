@@ -3,20 +3,21 @@
 A multi-part file, one part a light, float32 channels ``a`` and ``b`` (one logistic) or ``w0 a0 b0 w1 a1 b1`` (mixtures;
 see :mod:`mi_ntf.core.mixture`), the light's rays along rows and columns as in
 :mod:`mi_ntf.infer.visibility.light_rays`. The attribute ``mi_ntf`` of each part is JSON: the field's hash, the light's
-place in field coordinates and how the map was made.
+place in field coordinates, how the map was made and a hash of its texels.
 """
 
 import dataclasses
+import hashlib
 import json
-import os
+import math
 from pathlib import Path
 
 import numpy as np
 import OpenEXR
 
+from ..core import files
 from ..core.errors import MiNtfError
 from ..infer.visibility.light_rays import frames
-from . import map_cache
 
 ATTRIBUTE = "mi_ntf"
 
@@ -29,6 +30,7 @@ def bake(scene: Path, output: Path, parameters: dict[str, str]) -> dict:
     """
     from . import effects, lights, load_scene, visibility
 
+    files.check(output)
     loaded = load_scene(scene, parameters)
     integrator, media = loaded.integrator(), effects.find_media(loaded)
     if len(media) != 1:
@@ -46,9 +48,8 @@ def bake(scene: Path, output: Path, parameters: dict[str, str]) -> dict:
 
 
 def write(path: Path, medium, table, options, maps) -> None:
-    """Write `maps`, one after the other those of all lights of `table`, atomically."""
-    if not path.absolute().parent.is_dir():
-        raise MiNtfError(f"cannot write {path}: folder {path.parent} does not exist; create it first")
+    """Write `maps`, one after the other those of all lights of `table`. Raises MiNtfError, and leaves no half file,
+    where that cannot be done."""
     shapes = [_shape(row, options.map_resolution)
               for row in frames(table, medium.field.grid.hull, options.map_resolution)]
     window = np.zeros(2, np.int32), np.array(shapes, np.int32).max(0)[::-1] - 1
@@ -58,53 +59,115 @@ def write(path: Path, medium, table, options, maps) -> None:
             k = len(parts)
             lines, columns = shapes[k]
             texels = values[: lines * columns].reshape(lines, columns, tmap.width)
+            about = _description(medium, options) | _light(table, k) | {"texels": _digest(texels)}
             header = {
                 "name": f"light {k}", "type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION,
-                "displayWindow": window, ATTRIBUTE: json.dumps(_description(medium, options) | _light(table, k)),
+                "displayWindow": window, ATTRIBUTE: json.dumps(about),
             }
             channels = {name: np.ascontiguousarray(texels[..., c]) for c, name in _names(tmap.width).items()}
             parts.append(OpenEXR.Part(header, channels))
-    temporary = path.with_name(f".{path.name}.part.exr")
-    OpenEXR.File(parts).write(str(temporary))
-    os.replace(temporary, path)
+    with files.replacing(path) as temporary:
+        OpenEXR.File(parts).write(str(temporary))
 
 
 def read(path: Path, medium, table, options, width: int) -> np.ndarray:
     """The numbers of the map that `path` holds, for a :class:`TransmittanceMap` of `table`'s lights, `width` a texel.
 
     Raises MiNtfError, naming file and scene, where it was made from another field, for other lights or with other
-    settings.
+    settings, or where it does not hold what was written.
     """
     if not path.is_file():
         raise MiNtfError(f"map_file {path} does not exist; make it with `mi-ntf bake SCENE.xml -o {path.name}`")
-    try:
-        parts = OpenEXR.File(str(path)).parts
-    except RuntimeError as error:
-        raise MiNtfError(f"map_file {path} is no EXR file ({error}); make it with `mi-ntf bake`") from None
-    if len(parts) != table.total:
-        raise MiNtfError(f"map_file {path} holds {len(parts)} lights, the scene has {table.total}; bake it anew")
-    wanted = _description(medium, options)
-    values = np.zeros((table.count, options.map_resolution**2, width), np.float32)
-    parts = parts[table.first : table.first + table.count]
-    rows = frames(table, medium.field.grid.hull, options.map_resolution)
-    for k, (part, row) in enumerate(zip(parts, rows, strict=True)):
-        if ATTRIBUTE not in part.header:
-            raise MiNtfError(f"map_file {path} is an EXR file of another program; make it with `mi-ntf bake`")
-        found = json.loads(part.header[ATTRIBUTE])
-        _compare(path, k, found, wanted | _light(table, k))
-        lines, columns = _shape(row, options.map_resolution)
-        for c, name in _names(width).items():
-            values[k, : lines * columns, c] = part.channels[name].pixels.reshape(-1)
+    headers = _parts(path, header_only=True)  # sizes are judged before memory is taken for them
+    if len(headers) != table.total:
+        raise MiNtfError(f"map_file {path} holds {len(headers)} lights, the scene has {table.total}; bake it anew")
+    mine = slice(table.first, table.first + table.count)
+    shapes = [_shape(row, options.map_resolution)
+              for row in frames(table, medium.field.grid.hull, options.map_resolution)]
+    digests = []
+    for k, (part, shape) in enumerate(zip(headers[mine], shapes, strict=True)):
+        about = _about(path, k, part)
+        _compare(path, k, about, _description(medium, options) | _light(table, k))
+        if _size(part) != shape:
+            raise _damaged(path, k, f"is {_size(part)} texels, expected {shape}")
+        digests.append(about.get("texels"))
+    largest = options.map_resolution**2
+    for k, part in enumerate(headers):
+        if math.prod(_size(part)) * len(part.header["channels"]) > largest * max(width, 4):
+            raise _damaged(path, k, f"is {_size(part)} texels of {len(part.header['channels'])} channels")
+    values = np.zeros((table.count, largest, width), np.float32)
+    for k, (part, digest) in enumerate(zip(_parts(path)[mine], digests, strict=True)):
+        texels = _texels(path, k, part, width, shapes[k])
+        if _digest(texels) != digest:
+            raise _damaged(path, k, "holds other texels than were written")
+        values[k, : shapes[k][0] * shapes[k][1]] = texels.reshape(-1, width)
     return values.ravel()
+
+
+def _parts(path: Path, header_only: bool = False) -> list:
+    try:
+        return OpenEXR.File(str(path), header_only=header_only).parts
+    except Exception as error:  # the library has many kinds
+        raise MiNtfError(f"map_file {path} is no EXR file ({error}); make it with `mi-ntf bake`") from None
+
+
+def _size(part) -> tuple[int, int]:
+    """Lines and columns, by the header."""
+    (left, top), (right, bottom) = (corner.tolist() for corner in part.header["dataWindow"])
+    return bottom - top + 1, right - left + 1
+
+
+def _damaged(path: Path, k: int, fault: str) -> MiNtfError:
+    return MiNtfError(f"map_file {path}, light {k}: {fault}; the file is damaged, bake it anew")
+
+
+def _about(path: Path, k: int, part) -> dict:
+    """The attribute of light `k`."""
+    if ATTRIBUTE not in part.header:
+        raise MiNtfError(f"map_file {path} is an EXR file of another program; make it with `mi-ntf bake`")
+    try:
+        found = json.loads(part.header[ATTRIBUTE])
+    except (TypeError, ValueError, RecursionError):
+        found = None
+    if not isinstance(found, dict):
+        raise _damaged(path, k, f"its attribute {ATTRIBUTE} is no JSON object")
+    return found
+
+
+def _texels(path: Path, k: int, part, width: int, shape: tuple[int, int]) -> np.ndarray:
+    """(lines, columns, width) float32."""
+    names = _names(width)
+    if set(part.channels) != set(names.values()):
+        raise _damaged(path, k, f"has channels {', '.join(sorted(part.channels))}, expected "
+                                + ", ".join(names.values()))
+    texels = np.zeros((*shape, width), np.float32)
+    for c, name in names.items():
+        pixels = part.channels[name].pixels
+        if pixels.shape != shape or pixels.dtype != np.float32:
+            raise _damaged(path, k, f"channel {name} is {pixels.dtype} of shape {pixels.shape}")
+        texels[..., c] = pixels
+    return texels
+
+
+def _digest(texels: np.ndarray) -> str:
+    return hashlib.sha256(np.ascontiguousarray(texels, "<f4")).hexdigest()
 
 
 def _compare(path: Path, k: int, found: dict, wanted: dict) -> None:
     for name, value in wanted.items():
         other = found.get(name)
-        same = np.allclose(other, value, rtol=1e-5, atol=1e-6) if name == "where" and other else other == value
-        if not same:
+        if not _same(other, value):
             raise MiNtfError(f"map_file {path}, light {k}: {name} is {other}, the scene's is {value}; "
                              "bake it anew or render with the settings it was baked with")
+
+
+def _same(a, b) -> bool:
+    """Alike in type and value; floating point up to rounding."""
+    if type(a) is not type(b):
+        return False
+    if isinstance(b, list):
+        return len(a) == len(b) and all(map(_same, a, b))
+    return math.isclose(a, b, rel_tol=1e-5, abs_tol=1e-6) if isinstance(b, float) else a == b
 
 
 def _components(medium, options) -> int:
@@ -112,9 +175,10 @@ def _components(medium, options) -> int:
 
 
 def _description(medium, options) -> dict:
-    return {"field": map_cache.field_hash(medium.path), "representation": medium.representation,
+    return {"field": medium.field.digest, "representation": medium.representation,
             "grid": medium.field.grid.resolution, "map_resolution": options.map_resolution,
-            "map_source": options.map_source, "map_components": _components(medium, options)}
+            "map_source": options.map_source, "map_components": _components(medium, options),
+            "samples": 2 / options.step}
 
 
 def _light(table, k: int) -> dict:

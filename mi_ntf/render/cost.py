@@ -4,9 +4,9 @@ Constants are measured by :mod:`mi_ntf.render.calibrate`, which `mi-ntf explain 
 render reads them from the user's cache, or takes those of two cores of 2024.
 """
 
+import ctypes
 import json
 import math
-import os
 import platform
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -16,6 +16,10 @@ import mitsuba as mi
 
 from .. import __version__
 from ..infer.visibility.raymarch import default_steps
+from . import user_cache
+
+CACHE = "cost.json"
+"""Where constants are kept, in the user's cache."""
 
 FACING = 0.5
 """Share of (point, light) pairs whose light falls on the front, the others ask for no visibility."""
@@ -169,15 +173,23 @@ def _with(work: Work, method: str) -> Work:
     return Work(**(asdict(work) | {"method": method}))
 
 
-def cache_file() -> Path:
-    """Where constants are kept."""
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(home) / "mi-ntf" / "cost.json"
-
-
 def machine() -> str:
-    """What constants hold for: this version, processor, threads and variant."""
-    return f"{__version__} · {processor()} · {dr.thread_count()} threads · {mi.variant()}"
+    """What constants hold for: this version and variant, and what computes: processor and threads, or graphics card."""
+    hardware = graphics_card() if mi.variant().startswith("cuda") else f"{processor()} · {dr.thread_count()} threads"
+    return f"{__version__} · {hardware} · {mi.variant()}"
+
+
+def graphics_card() -> str:
+    """The name of the CUDA device that Dr.Jit computes on, the first that the driver shows; neutral where none is."""
+    name = ctypes.create_string_buffer(256)
+    device = ctypes.c_int()
+    try:
+        driver = ctypes.CDLL("libcuda.so.1")
+        found = (driver.cuInit(0) or driver.cuDeviceGet(ctypes.byref(device), 0)
+                 or driver.cuDeviceGetName(name, len(name), device)) == 0
+    except (OSError, AttributeError):  # no driver, or no such function in it
+        found = False
+    return name.value.decode(errors="replace").strip() if found and name.value else "CUDA device"
 
 
 def processor() -> str:
@@ -195,26 +207,21 @@ def constants() -> Constants:
 
 def measured() -> Constants | None:
     """This machine's constants, None where they are not in the cache."""
-    found = _read().get(machine(), {})
-    complete = isinstance(found, dict) and {f.name for f in fields(Constants)} == set(found)
-    return Constants(**found) if complete and all(isinstance(v, (int, float)) for v in found.values()) else None
+    found = _read().get(machine())
+    if not isinstance(found, dict) or {f.name for f in fields(Constants)} != set(found):
+        return None
+    prices = all(type(v) in (int, float) and 0 < v < 1e12 for v in found.values())  # up to minutes
+    return Constants(**found) if prices else None
 
 
 def remember(found: Constants) -> None:
     """Keep `found` for this machine. A cache that cannot be written is no fault of the caller's work."""
-    path = cache_file()
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_suffix(f".{os.getpid()}.part")
-        temporary.write_text(json.dumps(_read() | {machine(): asdict(found)}, indent=1), encoding="utf-8")
-        temporary.replace(path)
-    except OSError as error:
-        mi.Log(mi.LogLevel.Warn, f"cannot keep the machine's constants in {path}: {error}")
+    user_cache.write(CACHE, json.dumps(_read() | {machine(): asdict(found)}, indent=1))
 
 
 def _read() -> dict:
     try:
-        found = json.loads(cache_file().read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        found = json.loads(user_cache.read(CACHE) or b"{}")
+    except (ValueError, RecursionError):  # no JSON, no text, or nested without end
         return {}
     return found if isinstance(found, dict) else {}

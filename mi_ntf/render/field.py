@@ -1,10 +1,12 @@
 """Fields in memory: read and baked once, whoever asks."""
 
+import hashlib
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
 import mitsuba as mi
+import numpy as np
 
 from ..core import field_file
 from ..core.architecture import Header
@@ -15,17 +17,20 @@ from ..infer.network import NetworkField
 
 @dataclass(frozen=True)
 class LoadedField:
-    """A field file in both representations."""
+    """A field file in both representations. `digest`: hash of the networks that were read, whatever has become of the
+    file since."""
 
     header: Header
     network: NetworkField
     grid: GridField
+    digest: str
 
 
 def load(path: str, resolution: int) -> LoadedField:
-    """Read `path` and bake it at `resolution`³; cached by path, modification time, resolution and variant."""
+    """Read `path` and bake it at `resolution`³; cached by path, the file's identity and time, resolution and
+    variant."""
     stat = Path(path).stat() if Path(path).is_file() else None
-    return _load(path, stat and (stat.st_mtime_ns, stat.st_size), resolution, mi.variant())
+    return _load(path, stat and (stat.st_mtime_ns, stat.st_size, stat.st_ino), resolution, mi.variant())
 
 
 @lru_cache(maxsize=4)
@@ -33,4 +38,13 @@ def _load(path: str, _stamp: tuple | None, resolution: int, variant: str) -> Loa
     dj = module(variant)
     header, tensors = field_file.load(path)
     network = NetworkField(header, tensors, dj)
-    return LoadedField(header, network, GridField(network, resolution, dj))
+    return LoadedField(header, network, GridField(network, resolution, dj), _digest(header, tensors))
+
+
+def _digest(header: Header, tensors: dict) -> str:
+    """SHA-256 of the architecture and the tensors in memory, hexadecimal."""
+    digest = hashlib.sha256(repr(header.architecture).encode())
+    for name, value in sorted(tensors.items()):
+        digest.update(name.encode())
+        digest.update(np.ascontiguousarray(value))
+    return digest.hexdigest()

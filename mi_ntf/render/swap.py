@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
+from mi_ntf.core import files
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.core.field_file import load_header
 
@@ -36,10 +37,8 @@ def swap(scene: Path, field: Path, out: Path) -> None:
     _move_paths(root, scene.parent, out.parent, defaults)
     root.insert(0, ET.Comment(f" The meshes of {scene.name} as the field {field.name}; written by `mi-ntf swap`. "))
     ET.indent(root, "    ")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    temporary = out.with_name(out.name + ".part")
-    temporary.write_text(ET.tostring(root, encoding="unicode") + "\n", encoding="utf-8")
-    temporary.replace(out)
+    files.make_folder(out.parent)
+    files.write(out, ET.tostring(root, encoding="unicode") + "\n")
 
 
 def _parse(path: Path) -> ET.Element:

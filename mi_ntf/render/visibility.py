@@ -126,4 +126,7 @@ def build(method: str, medium, table, options: Options):
         return make(bake.read(path, medium, table, options, width))
     if not options.cache:
         return make()
-    return map_cache.cached(map_cache.key(medium, table, options, width), make, make)
+    name = map_cache.key(medium, table, options, width, step)
+    # Of several runs of lights, each needs all of the memory, and none of their maps comes again in this picture.
+    limit = options.map_memory * 2**20 if table.count == table.total else 0
+    return map_cache.cached(name, make, table.count * options.map_resolution**2 * width, limit)

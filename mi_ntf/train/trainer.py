@@ -11,9 +11,10 @@ from pathlib import Path
 
 import torch
 
-from ..core import field_file
+from ..core import field_file, files
 from ..core.architecture import Header
 from ..core.errors import MiNtfError
+from ..data.schema import fingerprint
 from . import checkpoint, device, evaluate, held_out, networks, parallel
 from .config import HierarchicalConfig, TrainConfig, configured, transmittance_alone
 from .descent import Descent
@@ -56,6 +57,8 @@ def train(dataset: Path, out: Path, *, preset: str = "fast", minutes: float | No
     if not (limit > 0 and math.isfinite(limit)):
         raise MiNtfError(f"--{'minutes' if steps is None else 'steps'} is {limit:g}; it must be positive")
     with device.chosen(), parallel.processes():
+        if parallel.first():
+            files.check(out)
         torch.set_num_threads(_threads() if steps is None and parallel.count() == 1 else 1)
         kind = _HierarchicalRun if isinstance(config, HierarchicalConfig) else _Run
         run = kind(Path(dataset), Path(out), config, preset,
@@ -81,9 +84,10 @@ class _Loop(Descent):
         self.log = Log(tensorboard if parallel.first() else None)
         super().__init__(dataset, config, minutes, steps, seed)
         self.out, self.checkpoint = out, Path(f"{out}.ckpt")
-        self.identity = json.dumps({"preset": preset, "minutes": minutes, "steps": steps, "seed": seed,
-                                    "config": dataclasses.asdict(config), "field": given,
-                                    "views": {k: len(s.images) for k, s in self.splits.items()}}, sort_keys=True)
+        identity = {"preset": preset, "minutes": minutes, "steps": steps, "seed": seed,
+                    "config": dataclasses.asdict(config), "field": given,
+                    "views": {k: len(s.images) for k, s in self.splits.items()}, "data": fingerprint(self.splits)}
+        self.identity = json.loads(json.dumps(identity, sort_keys=True))
         self.history: list[dict] = []
         self.validated = 0.0
         self.faults: list[dict] = []
@@ -247,7 +251,7 @@ class _Loop(Descent):
     def finish(self) -> dict:
         """Write the field, read it back, measure it, and store the report in its header."""
         tensors = networks.to_tensors(self.nets)
-        report = {k: v for k, v in json.loads(self.identity).items() if k not in ("config", "field")}
+        report = {k: v for k, v in self.identity.items() if k not in ("config", "field", "data")}
         if self.given is not None:
             report["field"] = self.given
         report |= {"steps_done": self.step, "seconds": round(self.spent, 1), "history": self.history,

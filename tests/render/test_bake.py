@@ -69,9 +69,12 @@ def test_file_of_something_else_is_refused(medium, tmp_path):
         build(medium, table(0.02), named)
     with pytest.raises(MiNtfError, match="map_resolution is 16, the scene's is 32"):
         build(medium, table(), dataclasses.replace(named, map_resolution=32))
-    other = SimpleNamespace(path=str(file), representation="grid", field=medium.field, source=medium.source)
+    changed = dataclasses.replace(medium.field, digest="0" * 64)
+    other = SimpleNamespace(representation="grid", field=changed, source=medium.source)
     with pytest.raises(MiNtfError, match=r"light 0: field is [0-9a-f]{64}, the scene's is [0-9a-f]{64}"):
         build(other, table(), named)
+    with pytest.raises(MiNtfError, match=r"light 0: samples is 128\.0, the scene's is 384\.0; bake it anew or"):
+        build(medium, table(), dataclasses.replace(named, step=2 / 384))
     with pytest.raises(MiNtfError, match="holds 3 lights, the scene has 1"):
         build(medium, LightTable(WHERE[:1], np.ones((1, 3)), IS_POINT[:1], 1.0, mi), named)
     with pytest.raises(MiNtfError, match=r"nothing\.exr does not exist; make it with `mi-ntf bake"):
@@ -151,7 +154,7 @@ def test_cache_keeps_within_its_limits(medium, cache, monkeypatch):
         build(medium, table(0.01 * (k + 1)), options)
         seen += [f for f in cache.glob("*") if f not in seen]
     assert set(cache.glob("*")) == set(seen[-2:])
-    monkeypatch.setattr(map_cache, "MEMORY_LIMIT", 2 * size)
+    options = dataclasses.replace(options, map_memory=2 * size / 2**20)
     last = build(medium, table(0.5), options)
     assert len(map_cache._maps) == 2 and last in map_cache._maps.values()
     monkeypatch.setattr(map_cache, "LARGEST_FILE", size - 1)

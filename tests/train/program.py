@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_ntf.train import checkpoint, evaluate, networks, parallel, train, trainer
+from mi_ntf.train import evaluate, networks, parallel, train, trainer
 
 trainer.KEEP, trainer.INTERVAL = 4, 0.0
 
@@ -42,7 +42,7 @@ def main(dataset: str, out: str, steps: str, death: str = "") -> None:
         Path(f"{out}.json").write_text(json.dumps({"losses": losses, "history": run.history}))
         return finish(run)
 
-    trainer._Run.advance, trainer._Run.finish, checkpoint.os.replace = recorded, finished, replaced
+    trainer._Run.advance, trainer._Run.finish, os.replace = recorded, finished, replaced
     trainer._Run.carve = functools.partialmethod(trainer._Run.carve, steps=20)
     evaluate.score = lambda *_: {"srgb": 0.0}  # seconds, and no matter here
     report = train(Path(dataset), Path(out), steps=int(steps))
