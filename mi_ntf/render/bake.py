@@ -95,8 +95,11 @@ def read(path: Path, medium, table, options, width: int) -> np.ndarray:
     for k, part in enumerate(headers):
         if math.prod(_size(part)) * len(part.header["channels"]) > largest * max(width, 4):
             raise _damaged(path, k, f"is {_size(part)} texels of {len(part.header['channels'])} channels")
+    parts = _parts(path)
+    if len(parts) != table.total:  # the library leaves out those that it cannot read
+        raise MiNtfError(f"map_file {path} is damaged: {len(parts)} of {table.total} lights can be read; bake it anew")
     values = np.zeros((table.count, largest, width), np.float32)
-    for k, (part, digest) in enumerate(zip(_parts(path)[mine], digests, strict=True)):
+    for k, (part, digest) in enumerate(zip(parts[mine], digests, strict=True)):
         texels = _texels(path, k, part, width, shapes[k])
         if _digest(texels) != digest:
             raise _damaged(path, k, "holds other texels than were written")
@@ -157,7 +160,7 @@ def _compare(path: Path, k: int, found: dict, wanted: dict) -> None:
     for name, value in wanted.items():
         other = found.get(name)
         if not _same(other, value):
-            raise MiNtfError(f"map_file {path}, light {k}: {name} is {other}, the scene's is {value}; "
+            raise MiNtfError(f"map_file {path}, light {k}: {name} is {str(other)[:80]}, the scene's is {value}; "
                              "bake it anew or render with the settings it was baked with")
 
 

@@ -90,6 +90,61 @@ def test_a_damaged_cache_counts_as_none(cache, content):
     assert cost.constants() == cost.Constants()
 
 
+@pytest.mark.parametrize("prices", [
+    {"march": 0}, {"march": -1.0}, {"march": float("nan")}, {"march": float("inf")}, {"march": True}, {"march": "2"},
+    {"march": None}, {"march": [1]}, {"march": 10**400}, {"more": 1.0}])
+def test_prices_that_make_no_sense_count_as_none(cache, prices):
+    cost.remember(cost.Constants(march=3.0))
+    assert cost.constants().march == 3.0
+    cache.write_text(json.dumps({cost.machine(): asdict(cost.Constants()) | prices}))
+    assert cost.measured() is None and cost.constants() == cost.Constants()
+
+
+@pytest.mark.parametrize("content", [b"", b"\xff\xfe", b"[" * 100_000, b"9" * 10_000, b"{\"a\"", bytes(100)])
+def test_prices_that_are_no_json(cache, content):
+    cache.parent.mkdir()
+    cache.write_bytes(content)
+    assert cost.constants() == cost.Constants()
+    cost.remember(cost.Constants(march=3.0))
+    assert cost.constants().march == 3.0
+
+
+class Driver:
+    """A CUDA driver that answers `codes` and shows one card."""
+
+    def __init__(self, init=0, get=0, named=0, name="NVIDIA Imaginary 9000"):
+        self.cuInit = lambda flags: init
+        self.cuDeviceGet = lambda device, index: get
+
+        def write(buffer, size, device):
+            buffer.value = name.encode()
+            return named
+
+        self.cuDeviceGetName = write
+
+
+def test_prices_on_a_gpu_are_kept_by_its_name(cache, monkeypatch):
+    """Two cards beside the same processor have prices of their own; no driver, or a broken one, is no error."""
+    monkeypatch.setattr(cost.mi, "variant", lambda: "cuda_ad_rgb")
+
+    def machine(driver):
+        def load(name):
+            if driver is None:
+                raise OSError("libcuda.so.1: cannot open shared object file")
+            return driver
+
+        monkeypatch.setattr(cost.ctypes, "CDLL", load)
+        return cost.machine()
+
+    assert "NVIDIA Imaginary 9000" in machine(Driver()) and cost.processor() not in machine(Driver())
+    assert machine(Driver()) != machine(Driver(name="NVIDIA Imaginary 9001"))
+    cost.remember(cost.Constants(march=0.1))
+    machine(Driver())
+    assert cost.measured() is None
+    faulty = [None, object(), Driver(init=100), Driver(get=101), Driver(named=1), Driver(name="")]
+    assert {machine(d) for d in faulty} == {machine(None)} and "CUDA device" in machine(None)
+
+
 def test_a_cache_that_cannot_be_written_is_no_fault(cache):
     cache.parent.write_text("a file where the folder belongs")
     cost.remember(KNOT)

@@ -1,0 +1,99 @@
+"""Files are whole or not there: on errors, on full disks, after killed writers, with several writers at a time."""
+
+import os
+import platform
+import resource
+import subprocess
+import sys
+import threading
+
+import pytest
+
+from mi_ntf.core import files
+from mi_ntf.core.errors import MiNtfError
+
+
+def names(folder):
+    return sorted(p.name for p in folder.iterdir())
+
+
+def test_content_is_written_in_order_and_replaces_what_was_there(tmp_path):
+    path = tmp_path / "a[1] b.bin"
+    path.write_text("before")
+    files.write(path, "τ", b"\x00", memoryview(b"ab"))
+    assert path.read_bytes() == "τ".encode() + b"\x00ab"
+    assert names(tmp_path) == ["a[1] b.bin"]
+
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), RuntimeError("disk. full."), ValueError("x"),
+                                   KeyboardInterrupt()], ids=lambda e: type(e).__name__)
+def test_a_failed_block_leaves_what_was_there(tmp_path, error):
+    """Errors of the system and of libraries become one that names the file; others pass."""
+    path = tmp_path / "f"
+    path.write_text("before")
+    expected = MiNtfError if isinstance(error, OSError | RuntimeError) else type(error)
+    with pytest.raises(expected) as caught, files.replacing(path) as temporary:
+        temporary.write_text("half")
+        assert temporary.parent == tmp_path
+        raise error
+    if expected is MiNtfError:
+        reason = error.strerror if isinstance(error, OSError) else "disk. full"
+        assert str(caught.value) == f"cannot write {path} ({reason}); free space there or choose another place"
+    assert path.read_text() == "before" and names(tmp_path) == ["f"]
+
+
+@pytest.mark.parametrize("room", [0, 1, 4095, 9999])
+def test_a_disk_that_fills_up_midway(tmp_path, room):
+    """The system's own refusal, at the first byte, midway and at the last."""
+    path = tmp_path / "f"
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (room, hard))
+    try:
+        with pytest.raises(MiNtfError, match=r"cannot write .*f \(File too large\); free space"):
+            files.write(path, bytes(10000))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert names(tmp_path) == []
+
+
+def test_places_that_cannot_be_written_to(tmp_path):
+    (tmp_path / "file").write_text("")
+    for call in (files.check, lambda path: files.write(path, "x")):
+        with pytest.raises(MiNtfError, match=r"folder .*/no does not exist; create it first"):
+            call(tmp_path / "no" / "f")
+        with pytest.raises(MiNtfError, match=r"cannot write .*/file/f \(Not a directory\)"):
+            call(tmp_path / "file" / "f")
+        with pytest.raises(MiNtfError, match=r"cannot write \S+ \((it is a folder|Is a directory)\); free space"):
+            call(tmp_path)
+        with pytest.raises(MiNtfError, match=r"File name too long"):
+            call(tmp_path / ("f" * 250))
+    with pytest.raises(MiNtfError, match=r"cannot make the folder .*/file/a/b \(Not a directory\); choose another"):
+        files.make_folder(tmp_path / "file" / "a" / "b")
+    files.check(tmp_path / "good")
+    assert names(tmp_path) == ["file"]
+
+
+def test_what_a_killed_writer_left_is_removed_and_a_living_ones_is_not(tmp_path):
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    mine, other = f"f.{platform.node()}-", "f.elsewhere-"
+    kept = {f"{mine}{os.getppid()}.part", f"{other}{dead.pid}.part", f"{mine}x.part", f"g{mine[1:]}{dead.pid}.part"}
+    for name in kept | {f"{mine}{dead.pid}.part", f"{mine}{'9' * 30}.part"}:
+        (tmp_path / name).write_text("half")
+    files.write(tmp_path / "f", "whole")
+    assert set(names(tmp_path)) == kept | {"f"}
+
+
+def test_a_reader_never_sees_half_a_file(tmp_path):
+    """Two processes write ten times 1 MB of one letter each, while a third reads."""
+    path = tmp_path / "f"
+    program = ("import sys; from mi_ntf.core import files\n"
+               "for _ in range(10): files.write(sys.argv[1], sys.argv[2] * 10**6)")
+    files.write(path, "a" * 10**6)
+    writers = [subprocess.Popen([sys.executable, "-c", program, str(path), letter]) for letter in "bc"]
+    while any(w.poll() is None for w in writers):
+        content = path.read_text()
+        assert len(content) == 10**6 and content == content[0] * 10**6
+        threading.Event().wait(0.001)
+    assert [w.returncode for w in writers] == [0, 0]
+    assert names(tmp_path) == ["f"] and path.read_text()[0] in "bc"
