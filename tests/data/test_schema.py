@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mi_ntf.data import schema
+from mi_ntf.data.schema import Split
 
 
 def pose(position=(0.0, 0.0, 3.0)) -> np.ndarray:
@@ -49,3 +50,28 @@ def test_camera_conversion_is_its_own_inverse_and_keeps_the_handedness(values):
     np.testing.assert_array_equal(there[:, [1, 3]], matrix[:, [1, 3]])  # up and position stay
     # two flipped axes keep the determinant; 1e-7 is 1e-10 of the largest product of three entries (10^3), for rounding
     assert np.linalg.det(there[:3, :3]) == pytest.approx(np.linalg.det(matrix[:3, :3]), abs=1e-7)
+
+
+@pytest.mark.parametrize(("name", "place", "what"), [
+    ("images", (1, 2, 3, 0), "photographs or masks"), ("images", (0, 0, 0, 3), "photographs or masks"),
+    ("c2w", (1, 0, 3), "cameras"), ("focal", (0, 1), "cameras"), ("principal", (1, 0), "cameras"),
+    ("light_pos", (0, 2), "lights"), ("light_intensity", (1, 1), "lights"), ("center", (1,), "the object's sphere"),
+    ("radius", (), "the object's sphere")])
+@pytest.mark.parametrize("split", ["train", "val"])
+def test_fingerprints_tell_what_changed(split, name, place, what):
+    """The last bit of any number of any split changes the hash of its kind and no other."""
+    def make():
+        shapes = {"images": (2, 4, 5, 4), "c2w": (2, 4, 4), "focal": (2, 2), "principal": (2, 2), "light_pos": (2, 3),
+                  "light_intensity": (2, 3), "center": (3,), "radius": ()}
+        return Split(**{k: np.random.default_rng(1).random(shape) for k, shape in shapes.items()})
+
+    one, other = ({"train": make(), "val": make()} for _ in range(2))
+    before = schema.fingerprint(one)
+    assert schema.fingerprint(other) == before
+    values = np.array(getattr(other[split], name))
+    values[place] = np.nextafter(values[place], 2)
+    object.__setattr__(other[split], name, values)
+    after = schema.fingerprint(other)
+    assert {k for k in before if before[k] != after[k]} == {what}
+    moved = {"train": one["val"], "val": one["train"], "test": one["val"]}
+    assert not set(schema.fingerprint(moved).values()) & set(before.values())

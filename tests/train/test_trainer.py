@@ -77,6 +77,25 @@ def test_same_seed_gives_the_same_losses_and_a_checkpoint_continues_them(photogr
         run(photographs, tmp_path / "a", 21).resume()
 
 
+def test_a_checkpoint_is_not_taken_up_on_other_data(tmp_path):
+    """By content: the same pictures in new files go on; one pixel changed does not, and is named."""
+    data = two_spheres.write(tmp_path / "data", {"train": 2, "val": 1, "test": 1}, size=8)
+    first = run(data, tmp_path / "f", 20)
+    first.step = 7
+    first.keep()
+    first.save()
+    for path in data.rglob("*.exr"):
+        schema.write_exr(path, schema.read_image(path))
+    again = run(data, tmp_path / "f", 20)
+    again.resume()
+    assert again.step == 7
+    path = data / "train" / "0000.exr"
+    schema.write_exr(path, schema.read_image(path) * np.where(np.arange(64).reshape(8, 8, 1) == 27, 0.9, 1))
+    with pytest.raises(MiNtfError, match=r"f\.ckpt belongs to a run on other data: photographs or masks changed since; "
+                                         "put back what the run began with, or delete the file to start anew"):
+        run(data, tmp_path / "f", 20).resume()
+
+
 def _step(state):
     value = state.advance()
     state.step += 1
