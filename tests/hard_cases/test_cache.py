@@ -18,6 +18,7 @@ from helpers import scenes
 from helpers.maps import OPTIONS, SIZE, build, find_medium, table, texels, without_cache
 
 import mi_ntf.render
+from mi_ntf import cli
 from mi_ntf.infer import profile
 from mi_ntf.render import cost, field, map_cache, user_cache
 
@@ -375,3 +376,15 @@ def test_maps_of_one_run_of_several_are_not_kept(medium, cache):
         assert held() == 0
         assert build(medium, part, OPTIONS) is not first
     assert len(list(cache.iterdir())) == 4, "on disk each run is found again"
+
+
+@pytest.mark.slow
+def test_prices_are_measured_without_a_place_for_them(path, tmp_path, cache, warnings, capfd):
+    """`mi-ntf explain --measure` says what it measured, and in one warning that it cannot keep it."""
+    (tmp_path / "cache").write_text("a file")
+    scene = tmp_path / "scene.xml"
+    scene.write_text(SCENE.replace("FIELD", str(path)))
+    assert cli.main(["explain", str(scene), "--measure"]) == 0
+    assert "measured" in capfd.readouterr().out
+    (text,) = warnings
+    assert "keeps nothing for later renders" in text

@@ -210,16 +210,20 @@ def kill_at_random(words, check, seed, program=("-m", "mi_ntf")):
     moments are drawn from the time that the whole run took, so that they fall into imports, work and writing."""
     begin = time.monotonic()
     finish(start(*words[1], program=program))
-    span = time.monotonic() - begin
-    rng = np.random.default_rng(seed)
-    for share in rng.uniform(0.3, 1.0, KILLS):
+    span, killed, rng = time.monotonic() - begin, 0, np.random.default_rng(seed)
+    for _ in range(4 * KILLS):
         process = start(*words[0], program=program)
         try:
-            process.communicate(timeout=share * span)
+            process.communicate(timeout=rng.uniform(0.3, 1.0) * span)
+            span *= 0.7  # it was done sooner: less is compiled, or done, than at first
         except subprocess.TimeoutExpired:
             process.send_signal(signal.SIGKILL)
             process.communicate()
+            killed += 1
         check()
+        if killed == KILLS:
+            break
+    assert killed
     finish(start(*words[0], program=program))
 
 
