@@ -10,6 +10,7 @@ from typing import Any
 
 import mitsuba as mi
 
+from mi_ntf.core import errors
 from mi_ntf.core.errors import MiNtfError
 
 OWN_PLUGINS = ("nrf", "ntf")
@@ -39,14 +40,12 @@ _constructors: dict[tuple[str, str], Any] = {}
 def serve(name: str, variant: str) -> str:
     """Call `register`; return '' or the text of the fault, which C++ hands on to the user.
 
-    Faults with a remedy come as one sentence, all others with their traceback.
+    A fault comes as one sentence, or with its traceback where MI_NTF_DEBUG=1 asks for it.
     """
     try:
         register(name, variant)
-    except MiNtfError as error:
-        return str(error)
-    except BaseException:
-        return traceback.format_exc()
+    except BaseException as error:
+        return traceback.format_exc() if errors.debug() else errors.sentence(error)
     return ""
 
 

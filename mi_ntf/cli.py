@@ -1,11 +1,11 @@
-"""The command `mi-ntf`. Exit code 0: done, 1: the work failed, 2: bad usage.
+"""The command `mi-ntf`. Exit code 0: done, 1: the work failed, 2: bad usage. An error is one sentence; the environment
+variable MI_NTF_DEBUG=1 adds Python's frames.
 
 Each command imports what it needs when it runs, so that `info` needs no renderer and
 `render` no PyTorch.
 """
 
 import json
-import os
 import sys
 import traceback
 from collections.abc import Sequence
@@ -15,6 +15,8 @@ from typing import Annotated, Any
 
 import tyro
 from tyro.conf import Positional, UseAppendAction, arg, subcommand
+
+from mi_ntf.core import errors
 
 Output = Annotated[Path, arg(aliases=("-o",), metavar="FILE")]
 
@@ -254,7 +256,6 @@ Command = (
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command line (default: sys.argv) and return the exit code."""
     words = list(sys.argv[1:] if arguments is None else arguments)
-    debug = os.environ.get("MI_NTF_DEBUG") == "1"
     try:
         return parse(words).run() or 0
     except SystemExit as leave:  # argument parsers end this way, with 0 after help and 2 on bad usage
@@ -264,16 +265,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     except KeyboardInterrupt:
         return 130
-    except (ValueError, OSError, RuntimeError) as error:
-        if debug:
+    except Exception as error:
+        if errors.debug():
             traceback.print_exc()
-        print(f"mi-ntf: error: {error}", file=sys.stderr)
-    except ImportError as error:
-        if debug:
-            traceback.print_exc()
-        print(f"mi-ntf: error: {error}; `mi-ntf doctor` names the package to install", file=sys.stderr)
-    except Exception:  # a defect of this package: the traceback is what a report needs
-        traceback.print_exc()
+        remedy = "; `mi-ntf doctor` names the package to install" if isinstance(error, ImportError) else ""
+        print(f"mi-ntf: error: {errors.sentence(error)}{remedy}", file=sys.stderr)
     return 1
 
 

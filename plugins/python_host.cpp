@@ -1,4 +1,5 @@
 #include "python_host.h"
+#include "without_frames.h"
 
 #include <cstdio>
 #include <cstdlib>
@@ -120,6 +121,8 @@ void become_launcher(const Environment &env) {
  *
  * Exit handlers and destructors of loaded libraries run in one order, last registered first:
  * this one is registered again after each step that may have loaded a library.
+ *
+ * The program returns -1 on errors, which a shell sees as 255; here they end with 1 as in `mi-ntf`.
  */
 void leave(int status, void *) {
     PYTHON(PyGILState_Ensure, int)();
@@ -127,7 +130,7 @@ void leave(int status, void *) {
         ("import sys; sys.stdout.flush(); sys.stderr.flush()", nullptr);
     std::cout.flush();
     std::fflush(nullptr);
-    _exit(status);
+    _exit(status < 0 ? 1 : status);
 }
 
 } // namespace
@@ -135,6 +138,10 @@ void leave(int status, void *) {
 void start_python(const fs::path &site_packages) {
     if (python_is_running())
         return;
+
+    const char *debug = std::getenv("MI_NTF_DEBUG");
+    if (!debug || std::string(debug) != "1")
+        new WithoutFrames(std::cerr);                        // for as long as the program runs
 
     Environment env = find_environment(site_packages);
     if (env.python.empty())

@@ -172,17 +172,20 @@ def test_misspelt_property_is_named_with_its_line(scene: Path):
 def test_constructor_fault_reaches_the_terminal(scene: Path):
     scene.write_text(SCENE.replace('value="3"', 'value="-3"'))
     done = run_program("mitsuba", "-m", "llvm_ad_rgb", scene, cwd=scene.parent)
-    assert done.returncode != 0
-    assert "Traceback" in done.stderr
-    assert '"max_depth" must be set to -1' in done.stderr
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    assert re.search(r'"max_depth" must be set to -1.*\(MI_NTF_DEBUG=1 shows where\)', done.stderr)
 
 
 def test_rendering_fault_reaches_the_terminal(scene: Path, stand_in: dict[str, str]):
     scene.write_text(SCENE.replace('value="3"', 'value="-3"'))
-    done = run_program("mitsuba", "-m", "llvm_ad_rgb", "-Dintegrator=nrf", scene, cwd=scene.parent, **stand_in)
-    assert done.returncode != 0
-    assert "Traceback" in done.stderr
-    assert "a fault while rendering" in done.stderr
+    flags = ("-m", "llvm_ad_rgb", "-Dintegrator=nrf")
+    done = run_program("mitsuba", *flags, scene, cwd=scene.parent, **stand_in)
+    assert done.returncode == 1
+    assert "exception: ValueError: a fault while rendering (MI_NTF_DEBUG=1 shows where)\n" in done.stderr
+    shown = run_program("mitsuba", *flags, scene, cwd=scene.parent, **stand_in, MI_NTF_DEBUG="1")
+    assert shown.returncode == 1
+    assert "Traceback" in shown.stderr and "in render\nValueError: a fault while rendering\n" in shown.stderr
 
 
 def test_one_name_serves_medium_and_integrator(scene: Path, stand_in: dict[str, str]):

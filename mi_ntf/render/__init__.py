@@ -9,31 +9,13 @@ nothing.
 The stock ``mitsuba`` program does this by itself through the bridge.
 """
 
-import difflib
 from pathlib import Path
 
 import mitsuba as mi
 
 from ..core.errors import MiNtfError
 from ..infer.backend import module
-
-MEDIUM_PROPERTIES = ("filename", "to_world", "scale", "representation", "resolution")
-INTEGRATOR_PROPERTIES = (
-    "visibility",
-    "samples",
-    "light_samples",
-    "environment_lights",
-    "map_resolution",
-    "map_source",
-    "map_components",
-    "map_memory",
-    "map_file",
-    "aovs",
-    "hide_emitters",
-    "timeout",
-    "max_depth",
-    "block_size",
-)
+from .properties import is_medium
 
 _classes: dict[str, dict] = {}
 _watching = False
@@ -56,7 +38,7 @@ def register() -> None:
         # Kept alive for good: Mitsuba may still call a constructor after another one took its name.
         medium, integrator = medium_class(phase_class()), integrator_class()
         _classes[variant] = {
-            "nrf": lambda props: (medium if _is_medium(props) else integrator)(props),
+            "nrf": lambda props: (medium if is_medium(props) else integrator)(props),
             "emitter": emitter_class(),
         }
     classes = _classes[variant]
@@ -84,16 +66,3 @@ def _on_variant(_old: str, new: str) -> None:
     """Registrations hold for one variant: repeat them for the new one, where the plugins can run in it."""
     if new in ("llvm_ad_rgb", "cuda_ad_rgb"):
         register()
-
-
-def _is_medium(props) -> bool:
-    """Mitsuba has one constructor per plugin name and tells it no kind: whether `props` are those of the medium
-    ``nrf``, not the integrator's. A misspelt property counts for the kind that it resembles most, whose error then
-    names it."""
-    if props.id() in ("interior", "exterior"):
-        return True
-    for name in props.keys():
-        near = difflib.get_close_matches(name, (*MEDIUM_PROPERTIES, *INTEGRATOR_PROPERTIES), n=1, cutoff=0.0)
-        if near[0] in MEDIUM_PROPERTIES:
-            return True
-    return False

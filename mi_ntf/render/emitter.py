@@ -5,7 +5,7 @@ import mitsuba as mi
 
 from ..core.errors import MiNtfError
 from ..infer.visibility import METHODS
-from . import lights
+from . import lights, properties
 from .visibility import Options, build
 
 STEP = 2 / 384
@@ -45,12 +45,14 @@ def emitter_class() -> type:
         """
 
         def __init__(self, props):
-            self.visibility = props.get("visibility", "auto")
-            if self.visibility not in METHODS:
-                raise MiNtfError(
-                    f'ntf emitter: visibility is "{self.visibility}", expected one of {", ".join(METHODS)}'
-                )
-            nested = [props[name] for name in list(props.keys()) if name not in ("visibility", "to_world")]
+            read = properties.Reader(props, "ntf emitter", properties.EMITTER, nested=True)
+            self.visibility = read.choice("visibility", "auto", METHODS)
+            read.number("sampling_weight", 1.0, 0.0, 1e30)
+            nested = [value for _, value in props.objects()]
+            other = [o for o in nested if not (isinstance(o, mi.Emitter) or getattr(o, "is_nrf", False))]
+            if other:
+                raise MiNtfError(f"ntf emitter: it has no place for a nested {other[0].class_name()}; it takes a light "
+                                 "and an nrf medium")
             self.inner = _single([o for o in nested if isinstance(o, mi.Emitter)], "emitter", "a light to wrap")
             self.medium = _single([o for o in nested if getattr(o, "is_nrf", False)], "medium", "an nrf medium")
             mi.Emitter.__init__(self, props)

@@ -7,6 +7,11 @@ import numpy as np
 from ..core.architecture import Similarity
 from ..core.errors import MiNtfError
 
+SCALES = (1e-12, 1e12)
+"""Scene units per capture unit."""
+LENGTHS = (1e-12, 1e12)
+"""Scene units per field unit: cubes of it are still numbers in single precision."""
+
 
 class Frame:
     """world = to_world · scale · (center + radius · field).
@@ -17,8 +22,6 @@ class Frame:
     """
 
     def __init__(self, similarity: Similarity, to_world: np.ndarray, scale: float):
-        if not scale > 0:
-            raise MiNtfError(f"nrf medium: scale is {scale}, must be above 0 (scene units per capture unit)")
         linear = np.asarray(to_world, np.float64)[:3, :3] * scale
         gram = linear.T @ linear
         size = np.sqrt(np.trace(gram) / 3)
@@ -29,6 +32,12 @@ class Frame:
             )
         self.length = float(size * similarity.radius)
         self.origin = linear @ np.asarray(similarity.center) + np.asarray(to_world, np.float64)[:3, 3]
+        if not (LENGTHS[0] <= self.length <= LENGTHS[1] and np.abs(self.origin).max() <= LENGTHS[1]):
+            raise MiNtfError(
+                f"nrf medium: its object has radius {self.length:g} at {self.origin.tolist()}, in scene units, where "
+                f"single precision reckons with radii from {LENGTHS[0]:g} and places up to {LENGTHS[1]:g}; change "
+                "scale or to_world"
+            )
         self._matrix = linear / size
         self._rotation = mi.Matrix3f(self._matrix.tolist())
         self._back = mi.Matrix3f(self._matrix.T.tolist())

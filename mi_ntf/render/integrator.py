@@ -6,9 +6,9 @@ import time
 import drjit as dr
 import mitsuba as mi
 
-from ..core.errors import MiNtfError
+from ..core.errors import MiNtfError, root
 from ..infer.visibility import METHODS
-from . import aovs
+from . import aovs, properties
 from .camera import Camera, Reconstruction
 from .composition import Composition
 
@@ -68,26 +68,31 @@ def integrator_class() -> type:
         """
 
         def __init__(self, props):
+            read = properties.Reader(props, "nrf integrator", properties.INTEGRATOR)
             # Kept here: Mitsuba's own clock would count from the construction of the plugin.
-            self.timeout = float(props.get("timeout", -1.0))
-            self.visibility = _choice(props, "visibility", "auto", METHODS)
-            self.map_source = _choice(props, "map_source", "field", ("field", "network"))
-            self.samples = _whole(props, "samples", 384, 8, 8192)
-            self.light_samples = _whole(props, "light_samples", 0, 0, 65536)
-            self.environment_lights = _whole(props, "environment_lights", 512, 1, 65536)
-            self.map_resolution = _whole(props, "map_resolution", 128, 4, 4096)
-            self.map_components = _whole(props, "map_components", 1, 1, 2)
-            self.map_memory = float(props.get("map_memory", 1024.0))
-            self.map_file = props.get("map_file", "")
-            self.max_depth = _whole(props, "max_depth", 2, -1, 1 << 20)
-            self.aovs = aovs.parse(props.get("aovs", ""))
+            self.timeout = read.number("timeout", -1.0)
+            self.visibility = read.choice("visibility", "auto", METHODS)
+            self.map_source = read.choice("map_source", "field", ("field", "network"))
+            self.samples = read.whole("samples", 384, 8, 8192)
+            self.light_samples = read.whole("light_samples", 0, 0, 65536)
+            self.environment_lights = read.whole("environment_lights", 512, 1, 65536)
+            self.map_resolution = read.whole("map_resolution", 128, 4, 4096)
+            self.map_components = read.whole("map_components", 1, 1, 2)
+            self.map_memory = read.number("map_memory", 1024.0, 0.0, 2.0**24)
+            self.map_file = read.text("map_file", "")
+            self.max_depth = read.whole("max_depth", 2, -1, 1 << 20)
+            self.aovs = aovs.parse(read.text("aovs", ""))
+            read.flag("hide_emitters", False)
             self.lights_seen = 0
             props["timeout"] = -1.0
             mi.SamplingIntegrator.__init__(self, props)
 
         def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-            return _render(self, scene, sensor, seed, spp, develop)
+            try:
+                return _render(self, scene, sensor, seed, spp, develop)
+            except RuntimeError as error:
+                raise root(error) from None
 
         def aov_names(self):
             """Of the last render: a layer for each light is known from then on."""
@@ -106,20 +111,6 @@ def integrator_class() -> type:
             )
 
     return NRFIntegrator
-
-
-def _choice(props, name: str, default: str, legal: tuple[str, ...]) -> str:
-    value = props.get(name, default)
-    if value not in legal:
-        raise MiNtfError(f'nrf integrator: {name} is "{value}", expected one of {", ".join(legal)}')
-    return value
-
-
-def _whole(props, name: str, default: int, low: int, high: int) -> int:
-    value = int(props.get(name, default))
-    if not low <= value <= high:
-        raise MiNtfError(f"nrf integrator: {name} is {value}, expected {low} to {high}")
-    return value
 
 
 def _render(self, scene, sensor, seed: int, spp: int, develop: bool):

@@ -4,12 +4,11 @@ import math
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from ..core.architecture import MAX_LOG_DENSITY
 from ..core.errors import MiNtfError
-from . import field
-from .frame import Frame
+from . import field, properties
+from .frame import SCALES, Frame
 
 REPRESENTATIONS = ("grid", "network")
 
@@ -42,22 +41,18 @@ def medium_class(phase_class: type) -> type:
         is_nrf = True
 
         def __init__(self, props):
-            path = str(mi.file_resolver().resolve(props.get("filename", ""))) if "filename" in props else None
-            if path is None:
+            read = properties.Reader(props, "nrf medium", properties.MEDIUM)
+            name = read.text("filename", "")
+            if not name:
                 raise MiNtfError(
                     'nrf medium: "filename" is missing; add <string name="filename" value="field.safetensors"/>'
                 )
-            to_world = np.array(props.get("to_world", mi.ScalarTransform4f()).matrix, dtype=np.float64)
-            scale = float(props.get("scale", 1.0))
-            self.representation = props.get("representation", "grid")
-            if self.representation not in REPRESENTATIONS:
-                raise MiNtfError(
-                    f'nrf medium: representation is "{self.representation}", expected one of '
-                    + ", ".join(REPRESENTATIONS)
-                )
-            resolution = int(props.get("resolution", 192))
-            if not 16 <= resolution <= 512:
-                raise MiNtfError(f"nrf medium: resolution is {resolution}, expected 16 to 512")
+            path = str(mi.file_resolver().resolve(name))
+            to_world = read.placement("to_world")
+            scale = read.number("scale", 1.0, *SCALES)
+            self.representation = read.choice("representation", "grid", REPRESENTATIONS)
+            resolution = read.whole("resolution", 192, 16, 512)
+            read.flag("sample_emitters", True)
             self.field = field.load(path, resolution)
             self.source = self.field.grid if self.representation == "grid" else self.field.network
             self.frame = Frame(self.field.header.similarity, to_world, scale)

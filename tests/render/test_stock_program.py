@@ -6,6 +6,7 @@ from helpers import scenes
 from helpers.programs import run_program
 
 import mi_ntf.render
+from mi_ntf.core.errors import MiNtfError
 from mi_ntf.evaluate.compare import read_image
 
 SCENE = """<scene version="3.9.0">
@@ -79,18 +80,45 @@ def test_stock_volumetric_integrators_see_the_field(folder, integrator, tmp_path
     assert images[0][..., 3].mean() == pytest.approx(images[1][..., 3].mean(), rel=0.02)
 
 
-def test_misspelt_property_is_named_with_its_line(folder, tmp_path):
-    path = write(folder, "bad.xml", options='<string name="visiblity" value="none"/>')
-    done = run_program("mitsuba", "-m", "llvm_ad_rgb", path, cwd=tmp_path)
-    assert done.returncode != 0
-    assert "visiblity" in done.stdout + done.stderr and "bad.xml" in done.stdout + done.stderr
+UNKNOWN = '(line 3, col 4): failed to instantiate integrator plugin of type "nrf": nrf integrator: unknown property "vis'
+PROGRAMS = [("mitsuba", "-m", "llvm_ad_rgb"), ("mi-ntf", "render", "-m", "llvm_ad_rgb"), ("mi-ntf", "explain"),
+            ("mi-ntf", "bake", "-o", "maps.exr")]
 
 
-def test_missing_field_file(folder, tmp_path):
-    text = SCENE.format(**NRF).replace("blobs.safetensors", "nowhere.safetensors")
-    (folder / "lost.xml").write_text(text)
-    done = run_program("mitsuba", "-m", "llvm_ad_rgb", folder / "lost.xml", cwd=tmp_path)
-    assert done.returncode != 0 and "nowhere.safetensors does not exist; make one with" in done.stdout + done.stderr
+@pytest.mark.parametrize("program", PROGRAMS, ids=lambda p: " ".join(p[:2]))
+@pytest.mark.parametrize(
+    ("name", "old", "new", "text"),
+    [
+        ("constructor", 'name="visibility" value="$vis', 'name="visiblity" value="$vis', UNKNOWN),
+        ("field", "blobs.safetensors", "nowhere.safetensors", "nowhere.safetensors does not exist; make one with"),
+        ("render", '"radius" value="1.5"', '"radius" value="0.5"', "give shape and medium the same placement"),
+    ],
+)
+def test_an_error_is_one_sentence_without_frames(folder, tmp_path, program, name, old, new, text):
+    path = folder / f"{name}.xml"
+    path.write_text(SCENE.format(**NRF).replace(old, new))
+    done = run_program(*program, path, cwd=tmp_path)
+    told = [line for line in done.stderr.splitlines() if "rror:" in line or "exception:" in line]
+    assert done.returncode == 1
+    assert len(told) == 1 and text in told[0], done.stderr
+    assert "Traceback" not in done.stderr and "  File" not in done.stderr
+
+
+@pytest.mark.parametrize("program", PROGRAMS[:2], ids=lambda p: p[0])
+def test_a_switch_shows_the_frames(folder, tmp_path, program):
+    path = folder / "frames.xml"
+    path.write_text(SCENE.format(**NRF).replace("blobs.safetensors", "nowhere.safetensors"))
+    done = run_program(*program, path, cwd=tmp_path, MI_NTF_DEBUG="1")
+    assert done.returncode == 1 and "Traceback" in done.stderr and "render/medium.py" in done.stderr
+
+
+def test_from_python_an_error_stays_an_exception(folder, variant):
+    """Of a type that tells it, also out of one of Dr.Jit's loops."""
+    path = folder / "outside.xml"
+    path.write_text(SCENE.format(**NRF).replace('"radius" value="1.5"', '"radius" value="0.5"'))
+    loaded = variant.load_file(str(path))
+    with pytest.raises(MiNtfError, match="give shape and medium the same placement"):
+        loaded.integrator().render(loaded)
 
 
 def test_ntf_emitter_shadows_a_floor(folder, tmp_path, variant):
