@@ -5,6 +5,8 @@ import math
 import drjit as dr
 import mitsuba as mi
 
+from ..core.errors import MiNtfError
+
 CHANNELS = 8
 """Channels that one kernel sums: each is a register of its loop."""
 
@@ -22,6 +24,8 @@ class Camera:
         if spp:
             self.sampler.set_sample_count(spp)
         self.spp = self.sampler.sample_count()
+        if self.spp < 1:  # Mitsuba's samplers divide by it
+            raise MiNtfError("nrf integrator: the sampler's sample_count is 0, expected 1 or more samples a pixel")
         self.sampler.set_samples_per_wavefront(self.spp)
         self.border = self.film.rfilter().border_size() if self.film.sample_border() else 0
         width, height = (int(n) + 2 * self.border for n in self.film.crop_size())

@@ -82,7 +82,7 @@ def ordinary_shapes(scene) -> list:
     for shape in shapes:
         if shape.is_medium_transition():
             raise MiNtfError(
-                f"nrf integrator: shape {shape.id()} bounds a medium that is no nrf medium, which this integrator does "
+                f"nrf integrator: {_called(shape)} bounds a medium that is no nrf medium, which this integrator does "
                 "not see; remove the medium, or render the scene with volpath"
             )
     return shapes
@@ -100,21 +100,26 @@ def _check_bounds(medium, shapes) -> None:
     # Matter lies in the unit sphere too, out of which the corners of a box may stick.
     origin, radius = medium.frame.origin, medium.frame.length
     low, high = np.maximum(world.min(0), origin - radius), np.minimum(world.max(0), origin + radius)
-    slack = 0.01 * radius
-    for shape in shapes:
-        _check_bsdf(shape)
-        box = shape.bbox()
-        if (np.array(box.min).ravel() > low + slack).any() or (np.array(box.max).ravel() < high - slack).any():
-            raise MiNtfError(
-                f"bounding shape {shape.id()} spans {_text(box.min)} to {_text(box.max)}, but the nrf medium inside it "
-                f"({medium.path}) has its object from {_text(low)} to {_text(high)}; give shape and medium the same "
-                f"placement (a sphere of centre {_text(origin)} and radius {radius:.4g} fits)"
-            )
     if len(shapes) > 1:
         raise MiNtfError(
-            f"{len(shapes)} bounding shapes ({', '.join(s.id() for s in shapes)}) share one nrf medium, which can "
-            "agree with one placement only; give each shape a medium of its own with its own to_world"
+            f"{len(shapes)} bounding shapes ({', '.join(map(_called, shapes))}) share one nrf medium ({medium.path}), "
+            f"which is at one place, {_text(origin)}, by <ref> or since Mitsuba merges media of the same text; give "
+            "each shape a medium of its own with its own to_world, or take the other shapes out"
         )
+    (shape,), slack = shapes, 0.01 * radius
+    _check_bsdf(shape)
+    box = shape.bbox()
+    if not ((np.array(box.min).ravel() <= low + slack).all() and (np.array(box.max).ravel() >= high - slack).all()):
+        raise MiNtfError(
+            f"bounding {_called(shape)} spans {_text(box.min)} to {_text(box.max)}, but the nrf medium inside it "
+            f"({medium.path}) has its object from {_text(low)} to {_text(high)}; give shape and medium the same "
+            f"placement (a sphere of centre {_text(origin)} and radius {radius:.4g} fits)"
+        )
+
+
+def _called(shape) -> str:
+    """A shape as its user knows it: by its id, else by kind and place."""
+    return f'shape "{shape.id()}"' if shape.id() else f"{shape.class_name()} at {_text(shape.bbox().center())}"
 
 
 def _check_bsdf(shape) -> None:
@@ -122,7 +127,7 @@ def _check_bsdf(shape) -> None:
     flags, names = shape.bsdf().flags(), ("Diffuse", "Glossy", "DeltaReflection", "DeltaTransmission")
     if any(mi.has_flag(flags, getattr(mi.BSDFFlags, name)) for name in names):
         raise MiNtfError(
-            f"bounding shape {shape.id()} has a {shape.bsdf().class_name()} BSDF, but a shape that bounds an nrf "
+            f"bounding {_called(shape)} has a {shape.bsdf().class_name()} BSDF, but a shape that bounds an nrf "
             'medium is no surface; give it <bsdf type="null"/> (the default is diffuse), and add a surface such as '
             "glass as a shape of its own around it"
         )

@@ -7,6 +7,7 @@ from helpers import fields, scenes
 
 import mi_ntf.render
 from mi_ntf.core import field_file
+from mi_ntf.core.errors import MiNtfError
 
 LIGHT = '<emitter type="constant"/>'
 FILM = '<film type="hdrfilm"><integer name="width" value="4"/><integer name="height" value="4"/></film>'
@@ -125,26 +126,28 @@ def test_no_medium():
     assert "the scene has no nrf medium" in str(caught.value.__cause__ or caught.value)
 
 
-def test_two_bounding_shapes_of_one_medium(path):
-    loaded = mi.load_string(f"""<scene version="3.9.0"><integrator type="nrf"/>{SENSOR}{LIGHT}
-      <medium type="nrf" id="m"><string name="filename" value="{path}"/></medium>
-      <shape type="sphere" id="here"><bsdf type="null"/><ref id="m" name="interior"/></shape>
-      <shape type="sphere" id="there"><point name="center" x="3" y="0" z="0"/><bsdf type="null"/>
-        <ref id="m" name="interior"/></shape></scene>""")
-    with pytest.raises(Exception) as caught:
-        mi.render(loaded, spp=1)
-    message = str(caught.value.__cause__ or caught.value)
-    assert "bounding shape there spans" in message and "give shape and medium the same placement" in message
+ALIKE = '<medium type="nrf" name="interior"><string name="filename" value="{path}"/></medium>'
+REFERRED = '<ref id="m" name="interior"/>'
 
 
-def test_two_agreeing_shapes_are_one_too_many(path):
+@pytest.mark.parametrize("medium", [ALIKE, REFERRED], ids=["alike", "referred to"])
+@pytest.mark.parametrize(
+    ("second", "names"),
+    [
+        ('<shape type="sphere"><point name="center" x="3" y="0" z="0"/>', '(Sphere at (0, 0, 0), Sphere at (3, 0, 0))'),
+        ('<shape type="cube" id="there">', '(Sphere at (0, 0, 0), shape "there")'),
+    ],
+)
+def test_two_shapes_of_one_medium(path, medium, second, names):
+    """Mitsuba's parser merges media of the same text into one, as if the second shape referred to the first's."""
+    medium = medium.format(path=path)
     loaded = mi.load_string(f"""<scene version="3.9.0"><integrator type="nrf"/>{SENSOR}{LIGHT}
       <medium type="nrf" id="m"><string name="filename" value="{path}"/></medium>
-      <shape type="sphere" id="a"><bsdf type="null"/><ref id="m" name="interior"/></shape>
-      <shape type="cube" id="b"><bsdf type="null"/><ref id="m" name="interior"/></shape></scene>""")
-    with pytest.raises(Exception) as caught:
-        mi.render(loaded, spp=1)
-    assert "2 bounding shapes (a, b) share one nrf medium" in str(caught.value.__cause__ or caught.value)
+      <shape type="sphere"><bsdf type="null"/>{medium}</shape>{second}<bsdf type="null"/>{medium}</shape></scene>""")
+    with pytest.raises(MiNtfError) as caught:
+        loaded.integrator().render(loaded, spp=1)
+    assert f"2 bounding shapes {names} share one nrf medium ({path})" in str(caught.value)
+    assert "Mitsuba merges media of the same text; give each shape a medium of its own" in str(caught.value)
 
 
 def test_variant_without_jit():

@@ -80,7 +80,7 @@ def test_stock_volumetric_integrators_see_the_field(folder, integrator, tmp_path
     assert images[0][..., 3].mean() == pytest.approx(images[1][..., 3].mean(), rel=0.02)
 
 
-UNKNOWN = '(line 3, col 4): failed to instantiate integrator plugin of type "nrf": nrf integrator: unknown property "vis'
+UNKNOWN = '(line 3, col 4): failed to instantiate integrator plugin of type "nrf": nrf integrator: unknown property "v'
 PROGRAMS = [("mitsuba", "-m", "llvm_ad_rgb"), ("mi-ntf", "render", "-m", "llvm_ad_rgb"), ("mi-ntf", "explain"),
             ("mi-ntf", "bake", "-o", "maps.exr")]
 
@@ -102,6 +102,21 @@ def test_an_error_is_one_sentence_without_frames(folder, tmp_path, program, name
     assert done.returncode == 1
     assert len(told) == 1 and text in told[0], done.stderr
     assert "Traceback" not in done.stderr and "  File" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new"),
+    [
+        ("spp", 'value="$spp"', 'value="0"'),  # by which Mitsuba's samplers divide
+        ("sunsky", POINT, '<emitter type="timed_sunsky"/>'),  # cannot be drawn from inside of a loop
+    ],
+)
+def test_nothing_ends_without_a_word(folder, tmp_path, name, old, new):
+    path = folder / f"{name}.xml"
+    path.write_text(SCENE.format(**NRF).replace(old, new))
+    done = run_program("mitsuba", "-m", "llvm_ad_rgb", path, cwd=tmp_path)
+    told = done.stderr.partition("exception: ")[2].split("\x1b")[0].strip()
+    assert done.returncode == 0 or (done.returncode == 1 and len(told.splitlines()) == 1), done.stderr
 
 
 @pytest.mark.parametrize("program", PROGRAMS[:2], ids=lambda p: p[0])
