@@ -26,6 +26,8 @@ MIN_LOG_DENSITY = -12.0
 MEAN_FLOOR = -6.0
 """Where ln σ is averaged over space, lower values count as this: they are empty all the same, and must not thin out a
 skin beside them."""
+MAX_OCTAVES = 24
+"""sin(2^k π x) of higher k is noise in single precision."""
 NAMES = ("density", "reflectance", "transmittance")
 """Networks of every field."""
 
@@ -111,39 +113,73 @@ class Header:
         return {"format": FORMAT} | asdict(self)
 
 
-def header_from_json(data: dict, source: str) -> Header:
-    """Parse and check a header; `source` (a file name) starts every error text."""
+def header_from_json(data: object, source: str) -> Header:
+    """Parse and check a header, any JSON; `source` (a file name) starts every error text. Raises MiNtfError."""
     version = data.get("format") if isinstance(data, dict) else None
     if version != FORMAT:
-        raise MiNtfError(
-            f"{source}: field format {version!r}, this build reads {FORMAT}; train or export the field anew")
+        raise MiNtfError(f"{source}: field format {_shown(version)}, this build reads {FORMAT}; "
+                         "train or export the field anew")
     try:
-        nets = {name: _network(data["architecture"][name], name) for name in NAMES}
-        if data["architecture"].get("visibility") is not None:  # absent from files of earlier builds
-            nets["visibility"] = _network(data["architecture"]["visibility"], "visibility")
-        center = [float(c) for c in data["similarity"]["center"]]
+        described = _member(data, "architecture", dict)
+        nets = {name: _network(_member(described, name, dict), name) for name in NAMES}
+        if described.get("visibility") is not None:  # absent from files of earlier builds
+            nets["visibility"] = _network(_member(described, "visibility", dict), "visibility")
+        similarity = _member(data, "similarity", dict)
+        center = _member(similarity, "center", list)
         if len(center) != 3:
-            raise ValueError(f"similarity center {center}, expected 3 numbers")
-        sim = Similarity((center[0], center[1], center[2]), float(data["similarity"]["radius"]))
-        if not sim.radius > 0 or not all(map(math.isfinite, (*sim.center, sim.radius))):
-            raise ValueError(f"similarity {sim}")
-        return Header(Architecture(**nets), sim, dict(data.get("provenance", {})))
-    except (KeyError, TypeError, ValueError) as error:
-        raise MiNtfError(f"{source}: the header's description is incomplete ({error!r}); "
+            raise ValueError(f"the similarity's center {_shown(center)}, expected 3 numbers")
+        x, y, z = (_number(c, "the similarity's center") for c in center)
+        radius = _number(_member(similarity, "radius", object), "the similarity's radius", above=0)
+        provenance = _member({"provenance": {}} | data, "provenance", dict)
+        return Header(Architecture(**nets), Similarity((x, y, z), radius), provenance)
+    except ValueError as error:
+        raise MiNtfError(f"{source}: the header's description is incomplete or wrong: {error}; "
                          "was it written by `mi-ntf train`?") from None
 
 
 def _network(data: dict, name: str) -> Network:
-    e = data["encoding"]
-    encoding = Encoding(e["kind"], tuple(e["resolutions"]), e["channels"], e["octaves"])
     legal = {"transmittance": ("frequency", "depth"), "visibility": ("frequency",)}.get(name, ("planes", "frequency"))
-    if encoding.kind not in legal:
-        raise ValueError(f"encoding kind {encoding.kind!r} of {name}, expected one of {', '.join(legal)}")
-    network = Network(encoding, tuple(data["hidden"]), data["components"])
-    sizes = (*encoding.resolutions, *network.hidden, network.components)
-    if not all(isinstance(n, int) and n > 0 for n in sizes) or any(r < 2 for r in encoding.resolutions):
-        raise ValueError(f"sizes {sizes}, expected positive integers and resolutions of at least 2")
-    return network
+    e = _member(data, "encoding", dict)
+    kind = _member(e, "kind", str)
+    if kind not in legal:
+        raise ValueError(f"encoding kind {_shown(kind)} of {name}, expected one of {', '.join(legal)}")
+    planes = kind == "planes"
+    resolutions = tuple(_whole(r, f"a resolution of {name}", 2) for r in _member(e, "resolutions", list))
+    if planes != bool(resolutions):
+        raise ValueError(f"{len(resolutions)} resolutions of {name}, whose encoding is {kind}; planes alone have any")
+    channels = _whole(_member(e, "channels", object), f"channels of {name}", int(planes))
+    octaves = _whole(_member(e, "octaves", object), f"octaves of {name}", 0, MAX_OCTAVES)
+    hidden = tuple(_whole(n, f"a layer's width in {name}", 1) for n in _member(data, "hidden", list))
+    components = _whole(_member(data, "components", object), f"components of {name}", 1)
+    return Network(Encoding(kind, resolutions, channels, octaves), hidden, components)
+
+
+def _member(data: dict, key: str, kind: type):
+    if key not in data:
+        raise ValueError(f"{key} is missing")
+    if not isinstance(data[key], kind):
+        raise ValueError(f"{key} is {_shown(data[key])}, expected {_JSON[kind]}")
+    return data[key]
+
+
+def _whole(value: object, what: str, low: int, high: int = 1 << 31) -> int:
+    if type(value) is not int or not low <= value <= high:  # a bool is an int too
+        raise ValueError(f"{what} is {_shown(value)}, expected an integer, {low} to {high}")
+    return value
+
+
+def _number(value: object, what: str, above: float = -math.inf) -> float:
+    if type(value) not in (int, float) or not above < value or not abs(value) < 1e30:
+        raise ValueError(f"{what} is {_shown(value)}, expected a finite number" + (" above 0" if above == 0 else ""))
+    return float(value)
+
+
+def _shown(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+_JSON = {dict: "an object", list: "a list", str: "text"}
 
 
 FAST = Architecture(

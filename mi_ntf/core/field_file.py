@@ -8,30 +8,33 @@ import safetensors
 import safetensors.numpy
 
 from . import files
-from .architecture import Header, header_from_json
+from .architecture import Header, Network, header_from_json
 from .errors import MiNtfError
 
 _KEY = "mi_ntf"
+_LARGEST = 1e36
+"""What no sum of a network may reach: then no order of summation leaves single precision."""
 
 
 def save(path: str | Path, header: Header, tensors: dict[str, np.ndarray], dtype: type = np.float16) -> None:
     """Write a field atomically. `tensors`: name → array, exactly ``header.architecture.skeleton()``.
 
     Planes are stored as `dtype`, layers as float32. float16 keeps 11 bits of features that bilinear
-    interpolation and a trained perceptron smooth anyway and halves the file.
+    interpolation and a trained perceptron smooth anyway and halves the file; planes that it cannot hold are float32.
     """
     _check(str(path), header, tensors)
-    with np.errstate(over="ignore"):  # a float16 overflow is reported by the check below, by name
-        data: dict[str, np.ndarray] = {
-            k: np.ascontiguousarray(v, dtype if ".planes." in k else np.float32) for k, v in tensors.items()}
-    _check(f"{path} as {np.dtype(dtype).name}", header, data)
+    data = {k: np.ascontiguousarray(v, _fitting(v, dtype) if ".planes." in k else np.float32)
+            for k, v in tensors.items()}
     files.write(path, safetensors.numpy.save(data, metadata={_KEY: json.dumps(header.to_json())}))
 
 
 def load(path: str | Path) -> tuple[Header, dict[str, np.ndarray]]:
     """Read a field: header and float32 tensors. Every mismatch with the header's skeleton is named in one error."""
     header = load_header(path)
-    tensors = safetensors.numpy.load_file(path)
+    try:
+        tensors = safetensors.numpy.load_file(path)
+    except (safetensors.SafetensorError, TypeError, AttributeError) as error:  # the latter two of types NumPy lacks
+        raise MiNtfError(f"{path} is no field file ({error}); make it anew with `mi-ntf train`") from None
     _check(str(path), header, tensors)
     return header, {k: v.astype(np.float32) for k, v in tensors.items()}
 
@@ -51,7 +54,7 @@ def load_header(path: str | Path) -> Header:
                          "pass a file of `mi-ntf train`")
     try:
         data = json.loads(metadata[_KEY])
-    except json.JSONDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise MiNtfError(f"{path}: header is not JSON ({error}); make the file anew with `mi-ntf train`") from None
     return header_from_json(data, str(path))
 
@@ -76,8 +79,30 @@ def _check(source: str, header: Header, tensors: dict[str, np.ndarray]) -> None:
             faults.append(f"{name}: expected shape {shape}, found {value.shape}")
         elif not np.issubdtype(value.dtype, np.floating):
             faults.append(f"{name}: expected floating point, found {value.dtype}")
-        elif not np.isfinite(value).all():
-            faults.append(f"{name}: {np.count_nonzero(~np.isfinite(value))} values are NaN or infinite")
+        elif bad := np.count_nonzero(~(np.abs(value) <= np.finfo(np.float32).max)):
+            faults.append(f"{name}: {bad} values are NaN or infinite in single precision")
+    if not faults:
+        reach = {name: _reach(name, net, tensors) for name, net in header.architecture.networks().items()}
+        faults += [f"{name}: its weights lead to values of {most:.1e}, more than {_LARGEST:g}"
+                   for name, most in reach.items() if not most <= _LARGEST]
     if faults:
         raise MiNtfError(f"{source} does not match its architecture: " + "; ".join(faults) +
                          ". Train or export the field anew")
+
+
+def _reach(name: str, network: Network, tensors: dict[str, np.ndarray]) -> float:
+    """An upper bound of what the layers of a network hold for any point, ray or direction of the unit sphere."""
+    size = {k: np.abs(v) for k, v in tensors.items() if k.startswith(f"{name}.")}
+    planes = [np.prod(size[f"{name}.planes.{i}"].max((1, 2)), 0, np.float64).max()
+              for i in range(len(network.encoding.resolutions))]
+    most = largest = max([8.0, *planes])  # other encodings stay below 8: coordinates, sines, logarithms of skins
+    for i in range(len(network.hidden) + 1):
+        weight, bias = (size[f"{name}.layers.{i}.{part}"] for part in ("weight", "bias"))
+        most = float((weight.sum(1, np.float64) * most + bias).max())
+        largest = max(largest, most)
+    return largest
+
+
+def _fitting(value: np.ndarray, dtype: type) -> type:
+    """`dtype`, or float32 where `dtype` cannot hold `value`."""
+    return dtype if np.abs(value).max() <= np.finfo(dtype).max else np.float32
