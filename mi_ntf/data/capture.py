@@ -128,8 +128,9 @@ def _open_manifest(out: Path, settings: dict) -> None:
     if path.exists():
         try:
             before = dict(json.loads(path.read_bytes()))
-        except (TypeError, ValueError):
-            raise MiNtfError(f"{path} is no JSON object; delete the folder to capture anew") from None
+        except (ValueError, TypeError, RecursionError) as error:
+            raise MiNtfError(f"{path}: cannot be read ({error}), so what this folder was captured with is not known; "
+                             "use another folder or delete this one") from None
         for key, value in settings.items():
             if before.get(key) != value:
                 raise MiNtfError(f"{path}: this folder was captured with {key} = {before.get(key)}, now {key} = "
@@ -189,7 +190,11 @@ def capture(scene: Path, out: Path, *, views: int = 100, size: int = 128, test_v
             params["light.position"] = mi.Point3f(frame.light_pos.tolist())
             params["light.intensity.value"] = mi.Color3f(frame.light_intensity.tolist())
             params.update()
-            schema.write_exr(path, np.array(mi.render(studio, spp=spp, seed=seed * len(frames) + index)))
+            image = np.array(mi.render(studio, spp=spp, seed=seed * len(frames) + index))
+            if bad := np.count_nonzero(~np.isfinite(image).all(-1)):
+                raise MiNtfError(f"{scene}: {bad} pixels of view {frame.file} are NaN or infinite; look for extreme "
+                                 "values in its materials and media, or give it another integrator")
+            schema.write_exr(path, image)
             rendered += 1
     for split, entries in plan.items():
         schema.write_transforms(out, split, schema.Transforms(angle, size, size, center, radius, entries))

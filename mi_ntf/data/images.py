@@ -71,7 +71,9 @@ def _decode(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     finite = np.isfinite(rgb).all(-1) & (True if alpha is None else np.isfinite(alpha))
     bad = int(np.count_nonzero(~finite))
     if bad:
-        raise MiNtfError(f"{path}: {bad} pixels are NaN or infinite; delete it and capture it again")
+        raise MiNtfError(f"{path}: {bad} pixels are NaN or infinite (half precision ends at 65504); write it with 32 "
+                         "bits a channel or under a weaker light. One of `mi-ntf capture` can be deleted: the same "
+                         "command makes it anew")
     return rgb, alpha
 
 
@@ -124,10 +126,12 @@ def mask_places(root: Path, name: str) -> list[Path]:
 
 
 def write_exr(path: Path, rgba: np.ndarray) -> None:
-    """Write linear premultiplied RGBA (H, W, 4) as a half-float EXR, whole or not at all."""
+    """Write linear premultiplied RGBA (H, W, 4) as EXR, whole or not at all: in half precision, in single where a value
+    is beyond it."""
     import OpenEXR
 
+    dtype = np.float32 if np.abs(rgba).max() > np.finfo(np.float16).max else np.float16
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with OpenEXR.File(header, {"RGBA": np.ascontiguousarray(rgba, dtype=np.float16)}) as file:
+    with OpenEXR.File(header, {"RGBA": np.ascontiguousarray(rgba, dtype=dtype)}) as file:
         with files.replacing(path) as temporary:
             file.write(str(temporary))

@@ -206,6 +206,35 @@ def test_scenes_that_cannot_be_photographed_say_why(tmp_path, text, message):
     assert not (tmp_path / "out").exists()
 
 
+def of_albedo(folder, value):
+    """The sphere with an albedo that only a raw texture may have."""
+    mi.util.write_bitmap(str(folder / "albedo.exr"), np.full((2, 2, 3), value, np.float32), write_async=False)
+    texture = """<texture type="bitmap" name="reflectance"><boolean name="raw" value="true"/>
+        <string name="filename" value="albedo.exr"/></texture>"""
+    return write(folder, SPHERE.replace('<rgb name="reflectance" value="0.8, 0.4, 0.2"/>', texture))
+
+
+def test_radiance_beyond_half_precision_is_kept(tmp_path):
+    small(of_albedo(tmp_path, 1e6), tmp_path / "out")
+    images = load_dataset(tmp_path / "out")["train"].images
+    assert np.isfinite(images).all() and images[..., :3].max() == pytest.approx(1.5e6, rel=0.5)
+
+
+def test_photographs_that_are_not_finite_are_not_written(tmp_path):
+    with pytest.raises(MiNtfError, match=r"scene.xml: [0-9]+ pixels of view train/0000.exr are NaN or infinite"):
+        small(of_albedo(tmp_path, 3e38), tmp_path / "out")
+    assert not list((tmp_path / "out").rglob("*.exr"))
+
+
+@pytest.mark.parametrize("text", ["", "[1, 2]", "{", "3"])
+def test_a_damaged_note_of_the_settings(tmp_path, text):
+    scene, out = write(tmp_path), tmp_path / "out"
+    out.mkdir()
+    (out / "capture.json").write_text(text)
+    with pytest.raises(MiNtfError, match=r"capture.json: cannot be read .*use another folder or delete this one"):
+        small(scene, out)
+
+
 def test_missing_scene_and_bad_counts(tmp_path):
     with pytest.raises(MiNtfError, match=r"gone.xml does not exist; name a Mitsuba scene file"):
         small(tmp_path / "gone.xml", tmp_path / "out")

@@ -70,7 +70,7 @@ def test_files_that_cannot_be_read(tmp_path):
     pixels = np.zeros((4, 6, 4), np.float32)
     pixels[1, 2, 0], pixels[3, 3, 3] = np.nan, np.inf
     images.write_exr(tmp_path / "1.exr", pixels)
-    with pytest.raises(MiNtfError, match=r"1.exr: 2 pixels are NaN or infinite; delete it"):
+    with pytest.raises(MiNtfError, match=r"1.exr: 2 pixels are NaN or infinite .half .*; write it with 32 bits"):
         images.read_image(tmp_path / "1.exr")
     (tmp_path / "1.exr").write_bytes(b"no image")
     with pytest.raises(MiNtfError, match=r"1.exr: cannot be read as an image"):
@@ -87,3 +87,15 @@ def test_files_that_cannot_be_read(tmp_path):
         file.write(str(tmp_path / "y.exr"))
     with pytest.raises(MiNtfError, match=r"y.exr: has channels Y, lacks R, G, B"):
         images.read_image(tmp_path / "y.exr")
+
+
+def test_bright_pixels_keep_their_value(tmp_path):
+    """Half precision where it holds the image: it is half as large; single where it would write infinity."""
+    pixels = np.full((2, 2, 4), 0.5, np.float32)
+    images.write_exr(tmp_path / "dim.exr", pixels)
+    pixels[0, 0, 1] = 1e6
+    images.write_exr(tmp_path / "bright.exr", pixels)
+    np.testing.assert_array_equal(images.read_image(tmp_path / "bright.exr"), pixels)
+    for name, dtype in (("dim", np.float16), ("bright", np.float32)):
+        with OpenEXR.File(str(tmp_path / f"{name}.exr")) as file:
+            assert file.channels()["RGBA"].pixels.dtype == dtype
