@@ -24,7 +24,6 @@ LLVM_MINIMUM = 17
 EXTRAS = {
     "train": ("torch", "tensorboard", "torchmetrics"),
     "eval": ("skimage", "flip_evaluator", "matplotlib", "trimesh"),
-    "colmap": ("pycolmap",),
 }
 """Extras of this package and the modules that they bring."""
 

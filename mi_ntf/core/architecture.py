@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass, field
 from itertools import pairwise
 
 from .depth_profile import FEATURES
-from .errors import MiNtfError
+from .errors import MiNtfError, shown
 
 FORMAT = 2
 MAX_LOG_DENSITY = 6.5
@@ -117,7 +117,7 @@ def header_from_json(data: object, source: str) -> Header:
     """Parse and check a header, any JSON; `source` (a file name) starts every error text. Raises MiNtfError."""
     version = data.get("format") if isinstance(data, dict) else None
     if version != FORMAT:
-        raise MiNtfError(f"{source}: field format {_shown(version)}, this build reads {FORMAT}; "
+        raise MiNtfError(f"{source}: field format {shown(version)}, this build reads {FORMAT}; "
                          "train or export the field anew")
     try:
         described = _member(data, "architecture", dict)
@@ -127,7 +127,7 @@ def header_from_json(data: object, source: str) -> Header:
         similarity = _member(data, "similarity", dict)
         center = _member(similarity, "center", list)
         if len(center) != 3:
-            raise ValueError(f"the similarity's center {_shown(center)}, expected 3 numbers")
+            raise ValueError(f"the similarity's center {shown(center)}, expected 3 numbers")
         x, y, z = (_number(c, "the similarity's center") for c in center)
         radius = _number(_member(similarity, "radius", object), "the similarity's radius", above=0)
         provenance = _member({"provenance": {}} | data, "provenance", dict)
@@ -142,7 +142,7 @@ def _network(data: dict, name: str) -> Network:
     e = _member(data, "encoding", dict)
     kind = _member(e, "kind", str)
     if kind not in legal:
-        raise ValueError(f"encoding kind {_shown(kind)} of {name}, expected one of {', '.join(legal)}")
+        raise ValueError(f"encoding kind {shown(kind)} of {name}, expected one of {', '.join(legal)}")
     planes = kind == "planes"
     resolutions = tuple(_whole(r, f"a resolution of {name}", 2) for r in _member(e, "resolutions", list))
     if planes != bool(resolutions):
@@ -158,25 +158,20 @@ def _member(data: dict, key: str, kind: type):
     if key not in data:
         raise ValueError(f"{key} is missing")
     if not isinstance(data[key], kind):
-        raise ValueError(f"{key} is {_shown(data[key])}, expected {_JSON[kind]}")
+        raise ValueError(f"{key} is {shown(data[key])}, expected {_JSON[kind]}")
     return data[key]
 
 
 def _whole(value: object, what: str, low: int, high: int = 1 << 31) -> int:
     if type(value) is not int or not low <= value <= high:  # a bool is an int too
-        raise ValueError(f"{what} is {_shown(value)}, expected an integer, {low} to {high}")
+        raise ValueError(f"{what} is {shown(value)}, expected an integer, {low} to {high}")
     return value
 
 
 def _number(value: object, what: str, above: float = -math.inf) -> float:
     if type(value) not in (int, float) or not above < value or not abs(value) < 1e30:
-        raise ValueError(f"{what} is {_shown(value)}, expected a finite number" + (" above 0" if above == 0 else ""))
+        raise ValueError(f"{what} is {shown(value)}, expected a finite number" + (" above 0" if above == 0 else ""))
     return float(value)
-
-
-def _shown(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 _JSON = {dict: "an object", list: "a list", str: "text"}

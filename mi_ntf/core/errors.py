@@ -35,3 +35,9 @@ def sentence(error: BaseException) -> str:
         text = text if known else f"{type(first).__name__}: {text}"
     text, _, more = text.strip().partition("\n\n")  # Dr.Jit explains at length what only its callers can mend
     return text if known and not more else f"{text} (MI_NTF_DEBUG=1 shows where)"
+
+
+def shown(value: object) -> str:
+    """`value` for a message: what comes from a file may be of any length."""
+    text = repr(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."

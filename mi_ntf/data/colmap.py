@@ -1,4 +1,4 @@
-"""Reader of COLMAP models, text or binary, through pycolmap. Photographs with a flash at the lens.
+"""Reader of COLMAP models, text or binary. Photographs with a flash at the lens.
 
 Accepted folders: `DIR/images` with the model in `DIR/sparse/0`, `DIR/sparse` or `DIR`; DIR may be the model's own
 folder with `images` in it or up to two levels above. Masks in `masks` beside `images`.
@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from mi_ntf.core.errors import MiNtfError
+from mi_ntf.data import colmap_files
 from mi_ntf.data.images import mask_places
 from mi_ntf.data.schema import Found, View
 
@@ -26,55 +27,46 @@ def find_model(folder: Path) -> Path | None:
 
 def read(folder: Path, model: Path) -> Found:
     """All posed photographs of the model as one split, `train`, by name, and its points. Raises MiNtfError."""
-    reconstruction = _open(model)
+    cameras, images, points = colmap_files.read(model)
     root = next((p for p in (folder, folder.parent, folder.parent.parent) if (p / "images").is_dir()), None)
     if root is None:
         raise MiNtfError(f"{folder / 'images'} does not exist; put the photographs of the model {model} there")
     views = []
-    for image in sorted(map(reconstruction.image, reconstruction.reg_image_ids()), key=lambda i: i.name):
+    for image in sorted(images, key=lambda i: i.name):
         where = f"{model}, image '{image.name}'"
-        camera = _camera(reconstruction.camera(image.camera_id), f"{model}, camera {image.camera_id}")
-        size = reconstruction.camera(image.camera_id)
-        views.append(View(where, root / "images" / image.name, mask_places(root, image.name),
-                          _opengl(np.array(image.cam_from_world().matrix()), where), camera,
-                          (int(size.width), int(size.height))))
+        if image.camera not in cameras:
+            raise MiNtfError(f"{where}: there is no camera {image.camera}; export the model again with `colmap "
+                             "model_converter`")
+        camera = cameras[image.camera]
+        views.append(View(where, root / "images" / image.name, mask_places(root, image.name), _opengl(image),
+                          _intrinsics(camera, f"{model}, camera {image.camera}"), (camera.width, camera.height)))
     if not views:
         raise MiNtfError(f"{model}: the model has no posed photograph; run `colmap mapper` again")
-    points = np.array([p.xyz for p in reconstruction.points3D.values()]).reshape(-1, 3)
     stored = sum(f.suffix.lower() in (".png", ".exr", ".jpg", ".jpeg") for f in (root / "images").rglob("*"))
     notes = [f"{stored - len(views)} of {stored} photographs in {root / 'images'} have no pose and are left out"]
     return Found({"train": views}, None, points, notes if stored > len(views) else [])
 
 
-def _open(model: Path):
-    """The reconstruction. pycolmap looks for binary files before text ones."""
-    try:
-        import pycolmap
-    except ImportError as error:
-        raise MiNtfError(f"{model} is a COLMAP model; reading it needs pycolmap ({error}): "
-                         "pip install 'mi-ntf[colmap]'") from error
-    try:
-        return pycolmap.Reconstruction(str(model))
-    except Exception as error:  # pycolmap raises many kinds for a damaged file
-        raise MiNtfError(f"{model}: cannot be read as a COLMAP model ({' '.join(str(error).split())[:200]}); it needs "
-                         "cameras, images and points3D, all .bin or all .txt: export it again with "
-                         "`colmap model_converter`") from error
-
-
-def _camera(camera, where: str) -> tuple[float, float, float, float]:
-    name = camera.model_name if hasattr(camera, "model_name") else camera.model.name
-    if name not in PINHOLE:
-        raise MiNtfError(f"{where}: its model {name} has lens distortion; rays are straight here: run `colmap "
+def _intrinsics(camera: colmap_files.Camera, where: str) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy in pixels."""
+    if camera.model not in PINHOLE:
+        raise MiNtfError(f"{where}: its model {camera.model} has lens distortion; rays are straight here: run `colmap "
                          "image_undistorter` and train on its output folder (PINHOLE)")
-    fx, fy, cx, cy = (float(camera.params[i]) for i in PINHOLE[name])
+    fx, fy, cx, cy = (camera.params[i] for i in PINHOLE[camera.model])
+    if min(fx, fy) <= 0:
+        raise MiNtfError(f"{where}: its focal length is {min(fx, fy):g}, must be positive; run `colmap mapper` again")
     return fx, fy, cx, cy
 
 
-def _opengl(w2c: np.ndarray, where: str) -> np.ndarray:
-    """OpenGL camera-to-world (4, 4) of COLMAP's world-to-camera (3, 4) with OpenCV axes (x right, y down, z ahead)."""
-    if not np.isfinite(w2c).all():
-        raise MiNtfError(f"{where}: its pose is not finite: {w2c.tolist()}; run `colmap mapper` again")
+def _opengl(image: colmap_files.Image) -> np.ndarray:
+    """OpenGL camera-to-world (4, 4) of COLMAP's world-to-camera with OpenCV axes (x right, y down, z ahead)."""
+    w, x, y, z = np.array(image.quaternion) / np.linalg.norm(image.quaternion)
+    rotation = np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ])
     c2w = np.eye(4)
-    c2w[:3, :3] = w2c[:, :3].T * (1.0, -1.0, -1.0)
-    c2w[:3, 3] = -w2c[:, :3].T @ w2c[:, 3]
+    c2w[:3, :3] = rotation.T * (1.0, -1.0, -1.0)
+    c2w[:3, 3] = -rotation.T @ image.translation
     return c2w

@@ -129,6 +129,9 @@ def _cameras(views: list[View], images: np.ndarray):
         if not (0 < camera[2] < width and 0 < camera[3] < height):
             raise MiNtfError(f"{view.where}: its principal point is ({camera[2]:g}, {camera[3]:g}), outside the image "
                              f"of {width}x{height} pixels; scale the camera's intrinsics with the image")
+        if not all(1e-3 * width < f < 1e6 * width for f in camera[:2]):
+            raise MiNtfError(f"{view.where}: its focal lengths are {camera[0]:g} and {camera[1]:g} pixels, for an "
+                             f"image of {width}x{height} pixels that is no pinhole camera; correct the camera")
         full.append(camera)
     intrinsics = np.array(full, dtype=np.float64)
     return np.stack([view.c2w for view in views]), intrinsics[:, :2], intrinsics[:, 2:]

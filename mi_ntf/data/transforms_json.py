@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_ntf.core.errors import MiNtfError
+from mi_ntf.core.errors import MiNtfError, shown
 from mi_ntf.data.images import SUFFIXES, mask_places
 from mi_ntf.data.poses import check_rigid
 from mi_ntf.data.schema import SPLITS, Found, View
@@ -44,9 +44,9 @@ def _read_split(folder: Path, path: Path):
     """``(views, sphere or None)`` of one file."""
     try:
         data = json.loads(path.read_text())
-    except ValueError as error:  # also text that is not UTF-8
+    except (ValueError, RecursionError) as error:  # also text that is not UTF-8
         raise MiNtfError(f"{path}: not valid JSON ({error}); the file is damaged, capture or copy it again") from None
-    if not isinstance(data, dict) or not data.get("frames"):
+    if not isinstance(data, dict) or not isinstance(data.get("frames"), list) or not data["frames"]:
         raise MiNtfError(f"{path}: 'frames' is empty or missing; a split needs one photograph at least")
     camera, size = _camera(data, str(path)), None
     if "w" in data or "h" in data:
@@ -108,17 +108,17 @@ def _numbers(entry: dict, key: str, shape: tuple[int, ...], where: str) -> np.nd
         raise MiNtfError(f"{where}: '{key}' is missing; see mi_ntf/data/schema.py for the format")
     try:
         value = np.array(entry[key], dtype=np.float64)
-    except (TypeError, ValueError):
-        raise MiNtfError(f"{where}: '{key}' is {entry[key]!r}, expected numbers of shape {shape}") from None
+    except (TypeError, ValueError, OverflowError):
+        raise MiNtfError(f"{where}: '{key}' is {shown(entry[key])}, expected numbers of shape {shape}") from None
     if value.shape != shape:
         raise MiNtfError(f"{where}: '{key}' has shape {value.shape}, expected {shape}; write it as nested lists")
-    if not np.isfinite(value).all():
-        raise MiNtfError(f"{where}: '{key}' is not finite: {value.tolist()}; correct the pose or light")
+    if not (np.abs(value) < 1e30).all():
+        raise MiNtfError(f"{where}: '{key}' is not finite: {shown(value.tolist())}; correct the pose or light")
     return value
 
 
 def _positive(entry: dict, key: str, where: str) -> float:
     value = float(_numbers(entry, key, (), where))
-    if value <= 0.0:
-        raise MiNtfError(f"{where}: '{key}' is {value:g}, must be positive")
+    if not 1e-12 < value < 1e12:
+        raise MiNtfError(f"{where}: '{key}' is {value:g}, must be positive, from 1e-12 to 1e12")
     return value
