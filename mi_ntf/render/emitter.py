@@ -20,16 +20,17 @@ def emitter_class() -> type:
     class NTFEmitter(mi.Emitter):
         """A light seen through a field (``ntf``).
 
-        =========== ======= ========================================================================================
-        parameter   type    meaning
-        =========== ======= ========================================================================================
-        (nested)    emitter the light: any emitter, another ``ntf`` for a second field; ``area`` where this emitter
-                            stands inside the shape that shines
-        (nested)    medium  the ``nrf`` medium in its way, nested or by ``<ref>``
-        visibility  string  ``raymarch``, ``neural_transmittance``, ``visibility_mlp``, ``none``; of lights that are one
-                            point or direction also ``transmittance_map``, ``transmittance_volume``; ``auto`` is
-                            ``neural_transmittance`` (default: auto)
-        =========== ======= ========================================================================================
+        =============== ======= ====================================================================================
+        parameter       type    meaning
+        =============== ======= ====================================================================================
+        (nested)        emitter the light: any emitter, another ``ntf`` for a second field; ``area`` where this emitter
+                                stands inside the shape that shines
+        (nested)        medium  the ``nrf`` medium in its way, nested or by ``<ref>``
+        visibility      string  ``raymarch``, ``neural_transmittance``, ``visibility_mlp``, ``none``; of lights that are
+                                one point or direction also ``transmittance_map``, ``transmittance_volume``; ``auto`` is
+                                ``neural_transmittance`` (default: auto)
+        sampling_weight float   as of any emitter: share of the samples drawn from all (default: 1)
+        =============== ======= ====================================================================================
 
         Whatever samples this emitter receives the nested light's radiance times the field's transmittance from the lit
         point to the light, so that a field casts its shadow on ordinary surfaces under stock ``path``, ``direct`` and

@@ -27,6 +27,7 @@ def medium_class(phase_class: type) -> type:
         scale            float     scene units per capture unit, > 0 (default: 1)
         representation   string    ``grid``: baked voxels; ``network``: the networks, exact and slower (default: grid)
         resolution       integer   voxels per side of the baked grid, 16 to 512 (default: 192; 4 bytes each)
+        sample_emitters  boolean   as of any medium: for stock volumetric integrators (default: true)
         ================ ========= ====================================================================================
 
         The medium fills the sphere around the captured object (the file's similarity: centre and radius in capture
