@@ -6,6 +6,7 @@ Memory is limited to what the process has after its start and `ROOM` bytes.
 
 import faulthandler
 import json
+import os
 import pickle
 import resource
 import struct
@@ -260,10 +261,76 @@ def properties_case(rng, _folder: Path, base):
     return f"{plugin} {''.join(made)[:200]}", attempt
 
 
+# --- maps: files of `mi-ntf bake`, and what is cached -----------------------------------------------------------------
+
+
+def maps(folder: Path):
+    """``(medium, map file, its numbers, cached file, its numbers)``."""
+    import mitsuba as mi
+    from helpers import scenes
+    from helpers.maps import OPTIONS, build, find_medium, table, texels
+
+    import mi_ntf.render
+    from mi_ntf.render import bake
+
+    os.environ |= {"XDG_CACHE_HOME": str(folder / "cache"), "MI_NTF_MAP_CACHE": "on"}
+    mi.set_variant("llvm_ad_rgb")
+    mi.set_log_level(mi.LogLevel.Error)
+    mi_ntf.render.register()
+    medium = find_medium(scenes.write_blobs(folder, log_density=3.0))
+    bake.write(folder / "maps.exr", medium, table(), OPTIONS, [build(medium)])
+    (cached,) = (folder / "cache").rglob("*.map")
+    baked = folder / "maps.exr"
+    return medium, baked, bake.read(baked, medium, table(), OPTIONS, 2), cached, texels(medium)
+
+
+def maps_case(rng, folder: Path, base):
+    from helpers.maps import OPTIONS, table, texels
+
+    from mi_ntf.render import bake, map_cache
+
+    medium, baked, expected, cached, kept = base
+    if rng.random() < 0.4:
+        good = cached.read_bytes()
+        damaged = pickled(folder) if rng.random() < 0.2 else mutate.blob(rng, good, head=64)
+
+        def look_up():
+            cached.write_bytes(damaged)
+            map_cache.forget()
+            assert np.array_equal(texels(medium), kept), "another map"
+            assert cached.read_bytes() == good, "a damaged map is not made anew"
+
+        return "cached", look_up
+    path = folder / "case.exr"
+    if rng.random() < 0.5:
+        path.write_bytes(mutate.blob(rng, baked.read_bytes(), head=2000))
+    else:
+        rewrite(baked, path, lambda about: mutate.tree(rng, about))
+
+    def read():
+        assert np.array_equal(bake.read(path, medium, table(), OPTIONS, 2), expected), "another map"
+
+    return "baked", read
+
+
+def rewrite(source: Path, path: Path, change) -> None:
+    """Write the map file `source` again, `change` made to what it says of each light."""
+    import OpenEXR
+
+    from mi_ntf.render import bake
+
+    parts = []
+    for part in OpenEXR.File(str(source)).parts:
+        header = {k: v for k, v in part.header.items() if k not in ("channels", "dataWindow")}
+        header[bake.ATTRIBUTE] = json.dumps(change(json.loads(header[bake.ATTRIBUTE])))
+        parts.append(OpenEXR.Part(header, {name: c.pixels.copy() for name, c in part.channels.items()}))
+    OpenEXR.File(parts).write(str(path))
+
+
 # --- the batch --------------------------------------------------------------------------------------------------------
 
 KINDS = {"field": (field, field_case), "dataset": (dataset, dataset_case), "colmap": (colmap, colmap_case),
-         "properties": (properties, properties_case)}
+         "properties": (properties, properties_case), "maps": (maps, maps_case)}
 
 
 def run(kind: str, seed: int, first: int, last: int, folder: Path) -> None:
