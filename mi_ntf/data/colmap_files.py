@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mi_ntf.core.errors import MiNtfError, shown
+from mi_ntf.data.images import is_file_name
 
 MODELS = {
     "SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "OPENCV_FISHEYE": 8,
@@ -67,8 +68,10 @@ def _camera(model: str, width: int, height: int, params: tuple[float, ...]) -> C
 
 
 def _image(name: str, camera: int, pose: tuple[float, ...]) -> Image:
+    if not is_file_name(name):
+        raise ValueError(f"an image's name is {shown(name)}")
     if not all(abs(v) < 1e30 for v in pose) or not 1e-12 < math.hypot(*pose[:4]):
-        raise ValueError(f"the pose of image {name} is {pose}")
+        raise ValueError(f"the pose of image {shown(name)} is {pose}")
     return Image(name, camera, pose[:4], pose[4:])
 
 

@@ -113,6 +113,15 @@ def _read_mask(path: Path) -> np.ndarray:
         raise MiNtfError(f"{path}: cannot be read as a mask ({error}); write it as 8-bit grey PNG") from error
 
 
+def is_file_name(name: object) -> bool:
+    """Whether a file could be called so, in any folder."""
+    try:
+        parts = [part.encode() for part in name.split("/")] if isinstance(name, str) else []
+    except UnicodeError:  # half a character
+        return False
+    return bool(parts) and b"\0" not in b"".join(parts) and max(map(len, parts)) <= 240 and sum(map(len, parts)) <= 2000
+
+
 def mask_places(root: Path, name: str) -> list[Path]:
     """Where the mask of photograph `name` (relative to `root`) may lie: `root`/masks, the same name, as PNG or as
     COLMAP writes it (name.jpg.png). A leading folder `images` is left out."""

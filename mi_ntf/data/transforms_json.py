@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from mi_ntf.core.errors import MiNtfError, shown
-from mi_ntf.data.images import SUFFIXES, mask_places
+from mi_ntf.data.images import SUFFIXES, is_file_name, mask_places
 from mi_ntf.data.poses import check_rigid
 from mi_ntf.data.schema import SPLITS, Found, View
 
@@ -86,10 +86,17 @@ def _view(entry: dict, where: str, folder: Path, camera: tuple[float, ...], size
         if intensity.min() < 0 or intensity.max() <= 0:
             raise MiNtfError(f"{where}: 'pl_intensity' is {intensity.tolist()}, must be positive; leave it out in all "
                              "frames to have it estimated")
-    name = str(entry["file_path"])
+    name = _file_name(entry, "file_path", where)
     if Path(name).suffix.lower() not in SUFFIXES:
-        name = _with_suffix(folder, name, entry.get("file_ext"), where)
+        told = _file_name(entry, "file_ext", where) if entry.get("file_ext") else None
+        name = _with_suffix(folder, name, told, where)
     return View(where, folder / name, mask_places(folder, name), c2w, camera, size, position, intensity)
+
+
+def _file_name(entry: dict, key: str, where: str) -> str:
+    if not is_file_name(entry[key]):
+        raise MiNtfError(f"{where}: '{key}' is {shown(entry[key])}, expected the name of a file")
+    return entry[key]
 
 
 def _with_suffix(folder: Path, name: str, told: str | None, where: str) -> str:
