@@ -34,7 +34,7 @@ def load(path: str | Path) -> tuple[Header, dict[str, np.ndarray]]:
     try:
         tensors = safetensors.numpy.load_file(path)
     except (safetensors.SafetensorError, TypeError, AttributeError) as error:  # the latter two of types NumPy lacks
-        raise MiNtfError(f"{path} is no field file ({error}); make it anew with `mi-ntf train`") from None
+        raise MiNtfError(f"{path} is no field file ({str(error)[:200]}); make it anew with `mi-ntf train`") from None
     _check(str(path), header, tensors)
     return header, {k: v.astype(np.float32) for k, v in tensors.items()}
 
@@ -47,7 +47,7 @@ def load_header(path: str | Path) -> Header:
         with safetensors.safe_open(path, "np") as file:
             metadata = file.metadata() or {}
     except safetensors.SafetensorError as error:
-        raise MiNtfError(f"{path} is no field file or is truncated ({error}); "
+        raise MiNtfError(f"{path} is no field file or is truncated ({str(error)[:200]}); "
                          "make it anew with `mi-ntf train`") from None
     if _KEY not in metadata:
         raise MiNtfError(f"{path} is a safetensors file of another program (no '{_KEY}' header); "
@@ -70,7 +70,7 @@ def describe(path: str | Path) -> dict:
 def _check(source: str, header: Header, tensors: dict[str, np.ndarray]) -> None:
     skeleton = header.architecture.skeleton()
     faults = [f"missing tensor {k}" for k in skeleton if k not in tensors]
-    faults += [f"unknown tensor {k}" for k in tensors if k not in skeleton]
+    faults += [f"unknown tensor {k[:80]}" for k in tensors if k not in skeleton]
     for name, shape in skeleton.items():
         if name not in tensors:
             continue
@@ -86,7 +86,8 @@ def _check(source: str, header: Header, tensors: dict[str, np.ndarray]) -> None:
         faults += [f"{name}: its weights lead to values of {most:.1e}, more than {_LARGEST:g}"
                    for name, most in reach.items() if not most <= _LARGEST]
     if faults:
-        raise MiNtfError(f"{source} does not match its architecture: " + "; ".join(faults) +
+        more = f"; and {len(faults) - 8} more" if len(faults) > 8 else ""
+        raise MiNtfError(f"{source} does not match its architecture: " + "; ".join(faults[:8]) + more +
                          ". Train or export the field anew")
 
 
