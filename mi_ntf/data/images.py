@@ -114,12 +114,11 @@ def _read_mask(path: Path) -> np.ndarray:
 
 
 def is_file_name(name: object) -> bool:
-    """Whether a file could be called so, in any folder."""
-    try:
-        parts = [part.encode() for part in name.split("/")] if isinstance(name, str) else []
-    except UnicodeError:  # half a character
+    """Whether `name` is text that a file could be called by and that one line can show, in any folder."""
+    if not isinstance(name, str) or not name.isprintable():  # half a character is not printable either
         return False
-    return bool(parts) and b"\0" not in b"".join(parts) and max(map(len, parts)) <= 240 and sum(map(len, parts)) <= 2000
+    parts = [len(part.encode()) for part in name.split("/")]
+    return 0 < sum(parts) <= 2000 and max(parts) <= 240
 
 
 def mask_places(root: Path, name: str) -> list[Path]:
