@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from helpers.variants import VARIANT
 
 from mi_ntf.core import logistic, microfacet, ops, spheres
 
@@ -136,7 +137,7 @@ def _drjit(formula, inputs):
     mi = pytest.importorskip("mitsuba")
     import drjit as dr
 
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(VARIANT)
     from mi_ntf.infer import ops as namespace
 
     inputs = [mi.Float(v) for v in inputs]

@@ -4,6 +4,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from helpers.variants import VARIANT
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import quad
@@ -200,7 +201,7 @@ def test_collocated_form_is_the_general_one_for_equal_directions(cos, roughness)
 @pytest.mark.parametrize("roughness", ROUGHNESS)
 def test_values_equal_mitsubas_blend_of_diffuse_and_rough_conductor(roughness):
     mi = pytest.importorskip("mitsuba")
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(VARIANT)
     k, s = 0.6, 0.35
     conductor = {"type": "roughconductor", "distribution": "ggx", "material": "none", "alpha": roughness**2}
     bsdf = mi.load_dict({"type": "blendbsdf", "weight": s,

@@ -5,6 +5,7 @@ import json
 import mitsuba as mi
 import numpy as np
 import pytest
+from helpers.variants import VARIANT
 
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.data import capture as cap
@@ -46,7 +47,7 @@ MEDIUM = """<scene version="3.9.0">
 
 @pytest.fixture(autouse=True, scope="module")
 def variant():
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(VARIANT)
 
 
 def write(folder, text=SPHERE):

@@ -6,6 +6,7 @@ from dataclasses import asdict
 import mitsuba as mi
 import numpy as np
 import pytest
+from helpers.variants import VARIANT
 
 from mi_ntf.evaluate import bench, bench_figure, bench_image, bench_measure, bench_paper
 from mi_ntf.render import cost
@@ -13,7 +14,7 @@ from mi_ntf.render import cost
 
 @pytest.fixture(autouse=True)
 def variant(monkeypatch, tmp_path):
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(VARIANT)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 import OpenEXR
 import pytest
+from helpers.variants import VARIANT
 from skimage import io
 
 from mi_ntf.core.errors import MiNtfError
@@ -45,7 +46,7 @@ def test_aov_layers_are_dropped(tmp_path, rgba):
 
 def test_images_of_mitsuba_are_read(tmp_path, rgba):
     mi = pytest.importorskip("mitsuba")
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(VARIANT)
     mi.Bitmap(rgba).write(str(tmp_path / "m.exr"))
     np.testing.assert_array_equal(read_image(tmp_path / "m.exr"), rgba)
     mi.Bitmap(rgba[..., :1]).write(str(tmp_path / "grey.exr"))

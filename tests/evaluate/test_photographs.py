@@ -5,6 +5,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
+from helpers.variants import VARIANT
 
 import mi_ntf.render
 from mi_ntf.core.errors import MiNtfError
@@ -24,7 +25,7 @@ def dataset(tmp_path_factory):
 
 def test_statue(dataset):
     """Cameras, light and normals agree: mirrored or turned views would lie below 20 dB and above 40°."""
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(VARIANT)
     mi_ntf.render.register()
     found = photographs.study(STATUE / "field.safetensors", dataset, STATUE / "mesh.xml", spp=16)
     assert found["psnr"] > 29 and found["ssim"] > 0.9 and found["normal_error"] < 10

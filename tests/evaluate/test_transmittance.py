@@ -4,6 +4,7 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
+from helpers.variants import VARIANT
 
 import mi_ntf.render
 from mi_ntf.evaluate import transmittance
@@ -20,7 +21,7 @@ def test_directions_are_spread_evenly():
 
 def test_study_of_the_statue():
     """Few pixels and lights: the learned transmittance is within 8 % of the march even so, and every map within 10."""
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(VARIANT)
     mi_ntf.render.register()
     found = transmittance.study(STATUE, 32, 2, 3)
     assert found.pop("ns") > 0

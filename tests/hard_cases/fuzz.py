@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 from helpers import mutate
+from helpers.variants import VARIANT
 
 from mi_ntf.core import errors, field_file, reference
 from mi_ntf.core.architecture import Architecture, Encoding, Header, Network, Similarity
@@ -226,7 +227,7 @@ def properties(folder: Path):
     import mi_ntf.render
     from mi_ntf.render import properties
 
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(VARIANT)
     mi.set_log_level(mi.LogLevel.Error)
     mi_ntf.render.register()
     path = scenes.write_blobs(folder)
@@ -274,7 +275,7 @@ def maps(folder: Path):
     from mi_ntf.render import bake
 
     os.environ |= {"XDG_CACHE_HOME": str(folder / "cache"), "MI_NTF_MAP_CACHE": "on"}
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(VARIANT)
     mi.set_log_level(mi.LogLevel.Error)
     mi_ntf.render.register()
     medium = find_medium(scenes.write_blobs(folder, log_density=3.0))

@@ -16,6 +16,7 @@ import OpenEXR
 import pytest
 from helpers import scenes
 from helpers.maps import OPTIONS, SIZE, build, find_medium, table, texels, without_cache
+from helpers.variants import VARIANT
 
 import mi_ntf.render
 from mi_ntf import cli
@@ -25,7 +26,7 @@ from mi_ntf.render import cost, field, map_cache, user_cache
 
 @pytest.fixture(autouse=True)
 def variant():
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(VARIANT)
     mi_ntf.render.register()
 
 

@@ -16,6 +16,7 @@ import numpy as np
 import OpenEXR
 import pytest
 from helpers import maps, scenes
+from helpers.variants import VARIANT
 
 import mi_ntf.render
 from mi_ntf import cli
@@ -44,7 +45,7 @@ LIT = """<scene version="3.9.0">
 
 @pytest.fixture(autouse=True)
 def variant():
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(VARIANT)
     mi_ntf.render.register()
 
 

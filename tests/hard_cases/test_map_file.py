@@ -9,6 +9,7 @@ import OpenEXR
 import pytest
 from helpers import scenes
 from helpers.maps import OPTIONS, build, find_medium, table
+from helpers.variants import VARIANT
 
 import mi_ntf.render
 from mi_ntf.core.errors import MiNtfError
@@ -18,7 +19,7 @@ from mi_ntf.render import bake
 @pytest.fixture(scope="module")
 def baked(tmp_path_factory):
     """``(medium, file)``: the baked maps of the three lights."""
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(VARIANT)
     mi_ntf.render.register()
     folder = tmp_path_factory.mktemp("baked")
     medium, file = find_medium(scenes.write_blobs(folder, log_density=3.0)), folder / "maps.exr"

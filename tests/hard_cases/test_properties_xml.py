@@ -6,6 +6,7 @@ import re
 import mitsuba as mi
 import pytest
 from helpers import scenes
+from helpers.variants import VARIANT
 
 import mi_ntf.render
 from mi_ntf.core.errors import sentence
@@ -40,7 +41,7 @@ def path(tmp_path_factory):
 
 @pytest.fixture(autouse=True)
 def variant():
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(VARIANT)
     mi_ntf.render.register()
 
 

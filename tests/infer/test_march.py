@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from helpers import fields
 from helpers.jit import arrays
+from helpers.variants import VARIANT
 
 from mi_ntf.infer import march
 from mi_ntf.infer.grid import GridField
@@ -17,14 +18,14 @@ BLOBS = [(-0.3, 0.0, 0.0), (0.35, 0.2, 0.1), (0.0, -0.45, 0.3)], [0.35, 0.25, 0.
 
 @pytest.fixture(scope="module")
 def grid():
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(VARIANT)
     return GridField(NetworkField(*fields.blobs(*BLOBS, log_density=3.5), mi), 64, mi)
 
 
 @pytest.fixture(scope="module")
 def slab():
     """σ = 1.5 in the whole unit sphere (but for the voxels that its surface cuts)."""
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(VARIANT)
     return GridField(NetworkField(*fields.uniform(1.5), mi), 256, mi)
 
 
@@ -144,7 +145,7 @@ def test_skipping_changes_nothing(grid, rng):
 
 
 def test_rays_that_miss():
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(VARIANT)
     empty = GridField(NetworkField(*fields.empty(), mi), 32, mi)
     o, d = np.array([[0, 0, 3.0], [5.0, 0, 3.0]]), np.array([[0, 0, -1.0], [0, 0, -1.0]])
     samples = march.camera_samples(

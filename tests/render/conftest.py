@@ -3,13 +3,14 @@
 import mitsuba as mi
 import pytest
 from helpers import scenes
+from helpers.variants import VARIANT
 
 import mi_ntf.render
 
 
 @pytest.fixture(autouse=True)
 def variant():
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(VARIANT)
     mi_ntf.render.register()
     return mi
 

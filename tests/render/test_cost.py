@@ -6,6 +6,7 @@ from dataclasses import asdict, replace
 import mitsuba as mi
 import pytest
 from helpers import scenes
+from helpers.variants import VARIANT
 
 import mi_ntf.render
 from mi_ntf.core.errors import MiNtfError
@@ -76,7 +77,7 @@ def test_constants_are_kept_for_the_machine(cache):
     cost.remember(KNOT)
     assert cost.measured() == KNOT and cost.constants() == KNOT
     ((key, values),) = json.loads(cache.read_text()).items()
-    assert "llvm_ad_rgb" in key and values == asdict(KNOT)
+    assert VARIANT in key and values == asdict(KNOT)
     cache.write_text(json.dumps({"another machine": values}))
     assert cost.measured() is None
     cost.remember(KNOT)

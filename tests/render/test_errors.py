@@ -4,6 +4,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import fields, scenes
+from helpers.variants import VARIANT
 
 import mi_ntf.render
 from mi_ntf.core import field_file
@@ -156,7 +157,7 @@ def test_variant_without_jit():
         with pytest.raises(ValueError, match="variant scalar_rgb: the nrf and ntf plugins need llvm_ad_rgb"):
             mi_ntf.render.register()
     finally:
-        mi.set_variant("llvm_ad_rgb")
+        mi.set_variant(VARIANT)
 
 
 def test_scenes_helper_matches_the_medium(tmp_path):

@@ -5,6 +5,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
+from helpers.variants import VARIANT
 
 from mi_ntf.core import field_file
 from mi_ntf.core.architecture import Architecture, Encoding, Header, Network, Similarity
@@ -170,7 +171,7 @@ def test_errors_of_files(folder):
 def test_mitsuba_loads_a_swapped_scene_from_another_folder(folder):
     """Includes and files named in them are found; the medium itself is tried elsewhere, so a stock one stands in."""
     mi = pytest.importorskip("mitsuba")
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(VARIANT)
     mi.Bitmap(np.ones((2, 4, 3), np.float32)).write(str(folder / "env.exr"))
     text = MESH.replace('<emitter type="envmap"><string name="filename" value="env.exr"/></emitter>', "")
     (folder / "mesh.xml").write_text(text)

@@ -8,6 +8,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
+from helpers.variants import VARIANT
 from scipy.ndimage import map_coordinates
 
 from mi_ntf.data import capture as cap
@@ -22,7 +23,7 @@ CLOUD = SCENES / "cloud"
 
 @pytest.fixture(autouse=True, scope="module")
 def variant():
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(VARIANT)
 
 
 def sphere_of(path: Path) -> tuple[np.ndarray, float]:
