@@ -47,9 +47,12 @@ class LightTable:
         part.first, part.total = self.first + first, self.total
         return part
 
-    def attach(self, where, power) -> None:
-        """Let gradients flow to `where` and `power`, 3-tuples of arrays of a number a light. Their values stay."""
-        self.moving = dr.grad_enabled(where)
+    def attach(self, where, power, axes=None) -> None:
+        """Let gradients flow to `where`, `power` and, if there are cones, their `axes`: 3-tuples of arrays of a number
+        a light. Their values stay."""
+        self.moving = dr.grad_enabled(where) or dr.grad_enabled(axes)
+        if axes is not None:
+            self._cones[:3] = [dr.replace_grad(c, axis) for c, axis in zip(self._cones, axes, strict=False)]
         rows = self.dj.Float(self._rows)
         first = 8 * dr.arange(self.dj.UInt32, self.count)
         for offset, column in zip((0, 1, 2, 4, 5, 6), (*where, *power), strict=True):

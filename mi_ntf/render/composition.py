@@ -7,7 +7,7 @@ import mitsuba as mi
 
 from ..core.errors import MiNtfError
 from ..infer import march, shade
-from . import effects, lights, visibility
+from . import effects, environment, lights, visibility
 from .surfaces import Surfaces
 from .walk import Paths, Walk
 
@@ -203,9 +203,7 @@ class Composition:
             if hit is not None:
                 sums.add_surface(ray, hit, transmittance)
         if found.background and not self.run:
-            si = dr.zeros(mi.SurfaceInteraction3f, n)
-            si.wi = -ray.d
-            radiance += dr.select(missed, transmittance, 0) * self.scene.environment().eval(si)
+            radiance += dr.select(missed, transmittance, 0) * environment.seen(self.scene.environment(), ray.d)
             opacity = dr.ones(mi.Float, n)
         return radiance, opacity
 

@@ -2,12 +2,11 @@
 
 from dataclasses import dataclass
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ..core.errors import MiNtfError
-from . import cost
+from . import cost, gradient_checks
 
 PINHOLES = ("PerspectiveCamera",)
 """Cameras whose rays all pass one point: light from there goes the way of the view."""
@@ -143,7 +142,7 @@ def describe(scene, integrator, sensor, spp: int, media: list, light) -> Effects
     depth = integrator.max_depth
     lit = bool(light.rows.power.size or light.sampled) and not 0 <= depth < 2
     exhaustive = integrator.light_samples == 0
-    gradients = any(dr.grad_enabled(v) for _, v in mi.traverse(scene))
+    gradients = gradient_checks.check(scene, light)
     # Derivatives by a light's place need the light's own transmittance.
     collocated = lit and not gradients and integrator.visibility != "none" and _at_camera(light, sensor, media)
     width, height = sensor.film().crop_size()

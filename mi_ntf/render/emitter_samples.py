@@ -71,7 +71,7 @@ class EmitterSamples:
         def body(k, kept, of_kept, total):
             ds, irradiance = self._draw(index, k, it, active)
             value, _ = scatter.evaluate(self.frame.direction_to_field(ds.d), p.wo, reflectance)
-            target = sum(e * v for e, v in zip(irradiance, value, strict=True))
+            target = dr.abs(sum(e * v for e, v in zip(irradiance, value, strict=True)))  # light may be negative
             total = total + target
             u = mi.sample_tea_float32(self._lane ^ self._seed, index * CANDIDATES + k)
             keep = u * total < target
@@ -97,4 +97,5 @@ class EmitterSamples:
             weight = dr.rcp(pmf)
         chosen = dr.gather(mi.EmitterPtr, self._emitters, emitter, active)
         ds, irradiance = chosen.sample_direction(it, mi.Point2f(*u), active)
+        ds.d = dr.normalize(ds.d)  # an environment's has the length of its to_world
         return ds, dr.select(ds.pdf > 0, irradiance * weight, 0)

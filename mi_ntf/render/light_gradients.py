@@ -1,35 +1,39 @@
 """Derivatives of a light table by the parameters of Mitsuba's emitters: intensity, irradiance, radiance, an
-environment's texels, position and direction."""
+environment's texels, position and direction. :mod:`mi_ntf.render.gradient_checks` refuses all others."""
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ..core.errors import MiNtfError
-from . import light_rows
+from . import environment, light_rows
 from .frame import Frame
 
 MAX_MOVING = 32
 """Lights of a table whose positions are attached: each is a kernel of its own."""
 
 
-def attach(table, rows: light_rows.Rows, emitters: list, limit: int, frame: Frame) -> None:
-    """Give the light table of `rows` the gradients of the discrete `emitters`, pairs of emitter and kind, if they have
-    any. `limit`: most lights of an environment; `frame`: whose coordinates the table is in.
+def attached(emitters: list) -> bool:
+    """Whether a parameter of one of `emitters` carries gradients."""
+    return any(dr.grad_enabled(value) for emitter in emitters for _, value in mi.traverse(emitter))
 
-    Environments are attached by the power of their texels alone. Their directions, a ``sunsky`` and the cones of spots
-    stay as they are; lights without power, which the table leaves out, have no gradients.
+
+def attach(table, rows: light_rows.Rows, discrete: list, frame: Frame) -> None:
+    """Give the light table of `rows` the gradients of `discrete` (:class:`mi_ntf.render.lights.Discrete`), if they have
+    any; `rows` are then all of theirs, dark ones included. `frame`: whose coordinates the table is in.
+
+    Environments are attached by the power of their cells, every texel of them, dark or bright. Cells and directions
+    stay as they are, and so does a ``sunsky``.
     """
-    if not any(dr.grad_enabled(value) for emitter, _ in emitters for _, value in mi.traverse(emitter)):
+    if not attached([d.emitter for d in discrete]):
         return
-    parts = [_environment(e, k, limit) if k in ("envmap", "constant", "sunsky") else _single(e, k) for e, k in emitters]
-    where, power = ([dr.ravel(part[i]) for part in parts] for i in (0, 1))
-    where, power = (_join(arrays) for arrays in (where, power))
-    lit = mi.UInt32(np.flatnonzero(np.array(dr.detach(power)).reshape(-1, 3).max(axis=1) > 0))
-    where, power = dr.gather(mi.Point3f, where, lit), dr.gather(mi.Color3f, power, lit)
+    parts = [_environment(d) if d.cells else _single(d.emitter, d.kind) for d in discrete]
+    where, power = (_join([dr.ravel(part[i]) for part in parts]) for i in (0, 1))
+    where, power = dr.unravel(mi.Point3f, where), dr.unravel(mi.Color3f, power)
+    axes = _axes(rows, discrete, frame) if rows.cones is not None else None
     point, direction = frame.point_to_field(where), frame.direction_to_field(where)
     is_point = mi.Bool(rows.is_point)
-    table.attach(tuple(dr.select(is_point, p, d) for p, d in zip(point, direction, strict=True)), tuple(power))
+    table.attach(tuple(dr.select(is_point, p, d) for p, d in zip(point, direction, strict=True)), tuple(power), axes)
     if table.moving and table.count > MAX_MOVING:
         raise MiNtfError(
             f"gradients by the place of a light: the scene has {table.count} lights, expected {MAX_MOVING} at most; "
@@ -50,23 +54,29 @@ def _single(emitter, kind: str):
     return ds.p, weight * dr.squared_norm(ds.p - it.p)
 
 
-def _environment(emitter, kind: str, limit: int):
-    """As :func:`_single` for all texels; the places are fixed."""
-    fixed = light_rows.environment(emitter, kind, limit, dark=True)
-    where = mi.Point3f(*fixed.where.T.astype(np.float32))
-    if kind == "sunsky":
-        return where, mi.Color3f(*fixed.power.T.astype(np.float32))
-    world, solid_angle, (rows, columns) = light_rows.texels(emitter, kind, limit)
-    si = dr.zeros(mi.SurfaceInteraction3f, len(world))
-    si.wi = mi.Vector3f(*(-world.T).astype(np.float32))
-    radiance = emitter.eval(si) * mi.Float(solid_angle.astype(np.float32))
-    n = light_rows.SUBSAMPLES
-    row, column = np.divmod(np.arange(len(world)), columns * n)
-    texel = mi.UInt32((row // n * columns + column // n).astype(np.uint32))
-    power = [dr.zeros(mi.Float, rows * columns) for _ in range(3)]
-    for total, channel in zip(power, radiance, strict=True):
-        dr.scatter_add(total, channel, texel)
-    return where, mi.Color3f(*power)
+def _axes(rows, discrete: list, frame: Frame):
+    """Unit 3-tuple away from each spot light, in the coordinates of `frame`."""
+    axes = mi.Vector3f(*rows.cones[:, :3].T.astype(np.float32))
+    first = 0
+    for light in discrete:
+        if light.kind == "spot":
+            along = dr.normalize(mi.traverse(light.emitter)["to_world"] @ mi.Vector3f(0, 0, 1))
+            dr.scatter(axes, along, mi.UInt32(first))
+        first += len(light.rows.power)
+    return frame.direction_to_field(axes)
+
+
+def _environment(light):
+    """As :func:`_single` for all cells; the places are fixed."""
+    where = mi.Point3f(*light.rows.where.T.astype(np.float32))
+    if light.kind == "sunsky":
+        return where, mi.Color3f(*light.rows.power.T.astype(np.float32))
+    if light.kind == "constant":
+        si = dr.zeros(mi.SurfaceInteraction3f)
+        return where, light.emitter.eval(si) * mi.Float(light.cells.solid_angle.astype(np.float32))
+    parameters = mi.traverse(light.emitter)
+    data, scale = parameters["data"], parameters["scale"]
+    return where, environment.power(data.array * scale, data.shape[:2], light.cells)
 
 
 def _join(arrays: list):

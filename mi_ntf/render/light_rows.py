@@ -1,7 +1,6 @@
 """Mitsuba's emitters as rows of a light table: point, spot and directional lights as they are, environments as a
-directional light per texel."""
+directional light for each of their cells."""
 
-import re
 from dataclasses import dataclass
 
 import drjit as dr
@@ -9,10 +8,10 @@ import mitsuba as mi
 import numpy as np
 
 from ..infer.lights import LightTable
+from . import environment
 from .frame import Frame
+from .sun import Sun
 
-SUBSAMPLES = 4
-"""Environment radiance is averaged over SUBSAMPLES² points of each texel of the chosen grid."""
 NO_CONE = (0.0, 0.0, 1.0, 8.0, 9.0)
 
 
@@ -46,7 +45,8 @@ def join(parts: list[Rows], dark: bool = False) -> Rows:
     where, power, is_point = (
         np.concatenate([getattr(p, name) for p in parts]) for name in ("where", "power", "is_point")
     )
-    lit = (power.max(axis=1, initial=0) > 0) | dark
+    # What is negative counts, as it does for Mitsuba.
+    lit = (power != 0).any(axis=1) | dark
     cones = None
     if any(p.cones is not None for p in parts):
         cones = np.concatenate([np.tile(NO_CONE, (len(p.power), 1)) if p.cones is None else p.cones for p in parts])
@@ -82,95 +82,13 @@ def _look(emitter, p: np.ndarray):
     return *to_host, float(np.ravel(ds.dist)[0])
 
 
-def environment(emitter, kind: str, limit: int, dark: bool = False) -> Rows:
-    """At most `limit` directional lights for an ``envmap``, ``constant`` or ``sunsky``; with those without power if
-    `dark`.
-
-    On a grid of twice as many columns as rows (no finer than the map itself), each with the irradiance of its texel,
-    radiance × solid angle, from the direction of the texel's centre of radiance. The sun is a light of its own.
-    """
-    parts, sun = [], None
-    if kind == "sunsky":
-        sun = _Sun(emitter)
-        limit = max(1, limit - 1)
-        parts.append(sun.rows)
-    world, solid_angle, (rows, columns) = texels(emitter, kind, limit)
-    n = SUBSAMPLES
-    radiance = _radiance(emitter, sun.avoid(world) if sun else world)
-    power = radiance * solid_angle[:, None]
-    weight = power.sum(axis=1) + 1e-12 * solid_angle
-
-    def by_texel(v):
-        return v.reshape(rows, n, columns, n, -1).sum(axis=(1, 3)).reshape(rows * columns, -1)
-
-    centre = by_texel(world * weight[:, None])
-    centre /= np.linalg.norm(centre, axis=1, keepdims=True)
-    return join([Rows(centre, by_texel(power), np.zeros(rows * columns, bool)), *parts], dark)
-
-
-def texels(emitter, kind: str, limit: int):
-    """``(world, solid_angle, (rows, columns))``: scene directions and solid angles of SUBSAMPLES² points of each of
-    `rows` × `columns` texels, at most `limit`, of an environment; by rows of points."""
-    rows = max(1, int(np.sqrt(limit / 2)))
-    columns = max(1, limit // rows)
-    rotation = _rotation(emitter, kind)
-    if kind == "envmap":
-        height, width, _ = mi.traverse(emitter)["data"].shape
-        rows, columns = min(rows, height), min(columns, width - 2)  # two columns are Mitsuba's halo
-    n = SUBSAMPLES
-    theta = (np.arange(rows * n) + 0.5) * np.pi / (rows * n)
-    phi = (np.arange(columns * n) + 0.5) * 2 * np.pi / (columns * n)
-    theta, phi = (v.ravel() for v in np.meshgrid(theta, phi, indexing="ij"))
-    # Mitsuba's parametrisation of the sphere: y up, u from −z around to +x.
-    local = np.stack([np.sin(phi) * np.sin(theta), np.cos(theta), -np.cos(phi) * np.sin(theta)], axis=1)
-    solid_angle = np.sin(theta) * (np.pi / rows / n) * (2 * np.pi / columns / n)
-    return local @ rotation.T, solid_angle, (rows, columns)
-
-
-def _rotation(emitter, kind: str) -> np.ndarray:
-    """Columns: the environment's x, y and z axes in the scene, y being up (``sunsky`` has z up)."""
-    if kind == "constant":
-        return np.eye(3)
-    rotation = np.array(mi.traverse(emitter)["to_world"].matrix, dtype=np.float64).reshape(4, 4)[:3, :3]
-    rotation = rotation / np.linalg.norm(rotation, axis=0)
-    return rotation[:, [1, 2, 0]] if kind == "sunsky" else rotation
-
-
-def _radiance(emitter, towards: np.ndarray) -> np.ndarray:
-    """(n, 3) radiance that arrives from the scene directions `towards` (n, 3)."""
-    si = dr.zeros(mi.SurfaceInteraction3f, len(towards))
-    si.wi = mi.Vector3f(*(-towards.T).astype(np.float32))
-    radiance = np.array(emitter.eval(si), dtype=np.float64).reshape(3, -1).T
-    return np.broadcast_to(radiance, (len(towards), 3))
-
-
-class _Sun:
-    """The sun's disc of a ``sunsky``: `rows`, one directional light of its irradiance above the sky's."""
-
-    def __init__(self, emitter, rings: int = 16):
-        self.axis = np.array(mi.traverse(emitter)["sun_direction"], np.float64).ravel()
-        # The aperture is no scene parameter; the plugin prints it, in degrees.
-        printed = re.search(r"Sun aperture = ([\d.e+-]+)", str(emitter))
-        self.half_aperture = np.radians(float(printed[1]) / 2) if printed else 0.0
-        side = np.cross(self.axis, [0.0, 0.0, 1.0] if abs(self.axis[2]) < 0.9 else [1.0, 0.0, 0.0])
-        self._side = side / np.linalg.norm(side)
-        self._up = np.cross(self._side, self.axis)
-        cap = 1 - np.cos(self.half_aperture)
-        cos = 1 - (np.arange(rings) + 0.5) / rings * cap  # rings of equal solid angle
-        phi = (np.arange(4 * rings) + 0.5) * np.pi / (2 * rings)
-        cos, phi = (v.ravel() for v in np.meshgrid(cos, phi))
-        disc = self._around(np.arccos(cos), phi)
-        glow = _radiance(emitter, disc) - _radiance(emitter, self.avoid(disc))
-        power = np.maximum(glow, 0).mean(axis=0, keepdims=True) * 2 * np.pi * cap
-        self.rows = Rows(self.axis[None], power, np.array([False]))
-
-    def _around(self, angle, phi) -> np.ndarray:
-        across = np.cos(phi)[:, None] * self._side + np.sin(phi)[:, None] * self._up
-        return np.cos(angle)[..., None] * self.axis + np.sin(angle)[..., None] * across
-
-    def avoid(self, towards: np.ndarray) -> np.ndarray:
-        """`towards` (n, 3) with those on the disc moved to just beside it, where the sky is the same."""
-        on = towards @ self.axis > np.cos(self.half_aperture * 1.01)
-        phi = np.arctan2(towards @ self._up, towards @ self._side)
-        beside = self._around(np.full(len(towards), self.half_aperture * 1.02), phi)
-        return np.where(on[:, None], beside, towards)
+def sky(emitter, kind: str, limit: int) -> tuple[Rows, environment.Cells]:
+    """At most `limit` directional lights for an ``envmap``, ``constant`` or ``sunsky``, and the cells that they are of;
+    the sun of a ``sunsky`` comes last, a light of its own."""
+    sun = Sun(emitter) if kind == "sunsky" else None
+    cells = environment.cells(environment.image(emitter, kind, sun), max(1, limit - bool(sun)))
+    rotation, _ = environment.placement(emitter, kind)
+    where, power = cells.direction @ rotation.T, cells.power
+    if sun:
+        where, power = np.concatenate([where, sun.axis[None]]), np.concatenate([power, sun.power[None]])
+    return Rows(where, power, np.zeros(len(power), bool)), cells

@@ -1,12 +1,13 @@
 """The scene's emitters as lights of the field: which are rows of a table, which are drawn by Mitsuba's sampling."""
 
 from contextlib import contextmanager
+from dataclasses import dataclass
 
 import mitsuba as mi
 import numpy as np
 
 from ..infer.lights import LightTable
-from . import light_gradients, light_rows
+from . import light_checks, light_gradients, light_rows
 from .emitter_samples import EmitterSamples
 from .frame import Frame
 
@@ -23,10 +24,27 @@ KINDS = {
     "Projector": "projector",
 }
 """Mitsuba's class name → plugin name."""
-DISCRETE = ("point", "spot", "directional", "envmap", "constant", "sunsky")
-"""Those that become rows of a table."""
 SINGLE = ("point", "spot", "directional")
-"""Those that become one row."""
+"""Those that become one row of a table."""
+SKIES = ("envmap", "constant", "sunsky")
+"""Those that become many."""
+
+
+@dataclass(frozen=True)
+class Discrete:
+    """An emitter of a finite set of lights: itself, its kind, its rows, and the cells of an environment."""
+
+    emitter: object
+    kind: str
+    rows: light_rows.Rows
+    cells: object = None
+
+    @classmethod
+    def of(cls, emitter, kind: str, environment_lights: int) -> "Discrete":
+        """`environment_lights`: most rows of an environment, which has those without power, too."""
+        if kind in SKIES:
+            return cls(emitter, kind, *light_rows.sky(emitter, kind, environment_lights))
+        return cls(emitter, kind, light_rows.delta(emitter, kind))
 
 
 class Lights:
@@ -38,8 +56,13 @@ class Lights:
                         emitter that is no finite set of lights; n: n samples a point of all emitters together
     environment_lights  most directional lights that stand for an environment
 
-    kinds   plugin name of each emitter
-    sampled emitters that are drawn at random
+    kinds        plugin name of each emitter
+    sampled      emitters that are drawn at random
+    discrete     the others, each with its rows (:class:`Discrete`)
+    rows         all of those in scene coordinates
+    environments pairs of an environment among them and its :class:`mi_ntf.render.environment.Cells`
+
+    Raises MiNtfError where an emitter has numbers that are none, or cannot be drawn.
     """
 
     def __init__(self, scene, media=(), light_samples: int = 0, environment_lights: int = 512):
@@ -47,9 +70,14 @@ class Lights:
         emitters = [self._unwrap(e, scene, media) for e in scene.emitters()]
         self.kinds = [kind(e) for e in emitters]
         self.light_samples = light_samples
+        for e, k in zip(emitters, self.kinds, strict=True):
+            light_checks.check(e, k, light_samples > 0 or not is_discrete(e))
         discrete = [(e, k) for e, k in zip(emitters, self.kinds, strict=True) if not light_samples and is_discrete(e)]
-        self.rows = rows(discrete, environment_lights)
-        self._discrete = discrete, environment_lights
+        self.discrete = [Discrete.of(e, k, environment_lights) for e, k in discrete]
+        # What is dark now may be the parameter that is to become light.
+        dark = light_gradients.attached([e for e, _ in discrete])
+        self.rows = light_rows.join([d.rows for d in self.discrete], dark)
+        self.environments = [(d.emitter, d.cells) for d in self.discrete if d.cells]
         pairs = [(e, w) for e, w in zip(emitters, scene.emitters(), strict=True) if light_samples or not is_discrete(e)]
         self.sampled = [e for e, _ in pairs if _shines(e)]
         self._weights = [outer.sampling_weight() for e, outer in pairs if _shines(e)]
@@ -81,7 +109,7 @@ class Lights:
     def table(self, frame: Frame) -> LightTable:
         """The discrete lights, in the field coordinates of `frame`."""
         table = self.rows.table(frame)
-        light_gradients.attach(table, self.rows, *self._discrete, frame)
+        light_gradients.attach(table, self.rows, self.discrete, frame)
         return table
 
     def sources(self, table: LightTable, frame: Frame, points, seed) -> list:
@@ -107,7 +135,7 @@ def kind(emitter) -> str:
 
 def is_discrete(emitter) -> bool:
     """Whether the light is a finite set of points and directions: a spot without texture; an environment by texels."""
-    return emitter.class_name() in KINDS and kind(emitter) in DISCRETE and not _is_textured_spot(emitter)
+    return emitter.class_name() in KINDS and kind(emitter) in (*SINGLE, *SKIES) and not _is_textured_spot(emitter)
 
 
 def _is_textured_spot(emitter) -> bool:
@@ -138,9 +166,4 @@ def _same(medium, other) -> bool:
 
 def rows(emitters: list, environment_lights: int) -> light_rows.Rows:
     """Discrete `emitters`, each with its kind, as rows in scene coordinates. Lights without power are dropped."""
-    return light_rows.join([
-        light_rows.environment(e, k, environment_lights)
-        if k in ("envmap", "constant", "sunsky")
-        else light_rows.delta(e, k)
-        for e, k in emitters
-    ])  # fmt: skip
+    return light_rows.join([Discrete.of(e, k, environment_lights).rows for e, k in emitters])

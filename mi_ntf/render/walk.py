@@ -112,7 +112,7 @@ class Walk:
         weight = dr.max(paths.weight)
         alive = weight > 0
         if depth > ROULETTE_DEPTH:
-            chance = dr.minimum(weight, 0.95)
+            chance = dr.detach(dr.minimum(weight, 0.95))  # who survives has no derivative
             alive = alive & (paths.rng.next_float32() < chance)
             paths = replace(paths, weight=paths.weight * dr.select(alive, dr.rcp(chance), 0))
         return paths.take(dr.compress(alive))
