@@ -8,6 +8,8 @@ from .frame import Frame
 
 CANDIDATES = 8
 """Candidates of a resampled light: seven more draws are cheap beside one visibility."""
+SHARE = 1 / (3 * CANDIDATES)
+"""Of each colour of a candidate in their mean."""
 SAMPLES = 2
 """Resampled lights a point for each emitter with an extent, where all discrete lights are summed."""
 STRIDE = 3242174889, 2447445414
@@ -71,7 +73,8 @@ class EmitterSamples:
         def body(k, kept, of_kept, total):
             ds, irradiance = self._draw(index, k, it, active)
             value, _ = scatter.evaluate(self.frame.direction_to_field(ds.d), p.wo, reflectance)
-            target = dr.abs(sum(e * v for e, v in zip(irradiance, value, strict=True)))  # light may be negative
+            # Light may be negative. Scaled, so that the sum of the brightest that floats hold is still one.
+            target = dr.abs(sum(SHARE * e * v for e, v in zip(irradiance, value, strict=True)))
             total = total + target
             u = mi.sample_tea_float32(self._lane ^ self._seed, index * CANDIDATES + k)
             keep = u * total < target

@@ -1,22 +1,25 @@
 """What the ``nrf`` integrator will do with a scene, why, and what that costs: ``mi-ntf explain``."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
 
-from . import calibrate, cost, effects, lights, load_scene, visibility
+from . import calibrate, cost, effects, environment, lights, load_scene, visibility
 from .measure import measure as watch
 
 
 def explain(scene: Path, parameters: dict[str, str], measure: bool = False) -> dict:
     """Load `scene` (with `parameters` for its $names) and describe its render.
 
-    Returns ``fields`` (file, placement), ``lights`` (kinds, count), ``effects``: name → ``{"on": bool, "why": str}``;
-    ``constants``: where the prices of the machine are from; ``seconds``: predicted, by stage; ``memory_bytes`` of what
-    is held beside the film. With `measure`, measures the machine's prices and renders: ``measured``, see
-    :func:`mi_ntf.render.measure.measure`. Raises MiNtfError where rendering would.
+    Returns ``fields`` (file, placement), ``lights`` (kinds, count), ``environments`` (of each that is summed:
+    ``lights``; their ``radius_degrees``, see :class:`mi_ntf.render.environment.Cells`; the bound on the error of an
+    unshadowed surface's irradiance, in percent of all light of that environment), ``effects``: name → ``{"on": bool,
+    "why": str}``; ``constants``: where the prices of the machine are from; ``seconds``: predicted, by stage;
+    ``memory_bytes`` of what is held beside the film. With `measure`, measures the machine's prices and renders:
+    ``measured``, see :func:`mi_ntf.render.measure.measure`. Raises MiNtfError where rendering would.
     """
     loaded = load_scene(scene, parameters)
     integrator, media = loaded.integrator(), effects.find_media(loaded)
@@ -35,6 +38,7 @@ def explain(scene: Path, parameters: dict[str, str], measure: bool = False) -> d
         "fields": [{"file": m.path, "representation": m.representation, "center": m.frame.origin.tolist(),
                     "radius": m.frame.length} for m in media],
         "lights": {"emitters": list(found.emitters), "count": count, "drawn": _drawn(integrator, light)},
+        "environments": [_environment(each) for each in light.discrete if each.cells],
         "visibility": found.visibility,
         "effects": _effects(loaded, found, integrator, count),
         "constants": "measured on this machine" if cost.measured() else "built in; --measure measures this machine's",
@@ -43,6 +47,13 @@ def explain(scene: Path, parameters: dict[str, str], measure: bool = False) -> d
         "memory_bytes": _memory(work) | {"maps or volumes": _held(integrator, media, found, light)},
     }
     return report | ({"measured": watch(loaded, integrator, spp)} if measure else {})
+
+
+def _environment(light) -> dict:
+    """How well directional lights stand for an environment; the sun of a ``sunsky`` is beside them."""
+    cells = light.cells
+    return {"emitter": environment.name(light.emitter, light.kind), "lights": int((cells.weight > 0).sum()),
+            "radius_degrees": math.degrees(cells.radius), "irradiance_error_percent": 100 * cells.error()}
 
 
 def _works(integrator, media: list, found, rays: int, count: int, light) -> list[cost.Work]:
@@ -123,6 +134,11 @@ def print_table(report: dict) -> None:
         f"{report['scene']}: {image['width']}×{image['height']}, {image['spp']} samples a pixel", highlight=False)
     for field in report["fields"]:
         console.print(f"field {field['file']} as {field['representation']}", highlight=False)
+    for each in report["environments"]:
+        console.print(
+            f"{each['emitter']}: {each['lights']} directional lights of cells of "
+            f"{each['radius_degrees']:.2g}° (RMS); what an unshadowed surface receives is right within "
+            f"{each['irradiance_error_percent']:.2g} % of all light", highlight=False)
     table = Table("effect", "", "why")
     for name, effect in report["effects"].items():
         table.add_row(name, "yes" if effect["on"] else "–", effect["why"])

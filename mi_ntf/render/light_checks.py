@@ -32,7 +32,8 @@ def check(emitter, kind: str, drawn: bool = False) -> None:
 
 def _numbers(value):
     """A parameter as an array; None where it has no floating-point numbers."""
-    value = getattr(value, "matrix", value)
+    if not dr.is_array_v(value):
+        value = getattr(value, "matrix", value)  # of transforms; arrays take any such name for a swizzle
     numbers = np.asarray(dr.detach(value) if dr.is_array_v(value) else value)
     return numbers if numbers.dtype.kind == "f" else None
 

@@ -56,11 +56,10 @@ class Lights:
                         emitter that is no finite set of lights; n: n samples a point of all emitters together
     environment_lights  most directional lights that stand for an environment
 
-    kinds        plugin name of each emitter
-    sampled      emitters that are drawn at random
-    discrete     the others, each with its rows (:class:`Discrete`)
-    rows         all of those in scene coordinates
-    environments pairs of an environment among them and its :class:`mi_ntf.render.environment.Cells`
+    kinds    plugin name of each emitter
+    sampled  emitters that are drawn at random
+    discrete the others, each with its rows (:class:`Discrete`)
+    rows     all of those in scene coordinates
 
     Raises MiNtfError where an emitter has numbers that are none, or cannot be drawn.
     """
@@ -77,7 +76,6 @@ class Lights:
         # What is dark now may be the parameter that is to become light.
         dark = light_gradients.attached([e for e, _ in discrete])
         self.rows = light_rows.join([d.rows for d in self.discrete], dark)
-        self.environments = [(d.emitter, d.cells) for d in self.discrete if d.cells]
         pairs = [(e, w) for e, w in zip(emitters, scene.emitters(), strict=True) if light_samples or not is_discrete(e)]
         self.sampled = [e for e, _ in pairs if _shines(e)]
         self._weights = [outer.sampling_weight() for e, outer in pairs if _shines(e)]
