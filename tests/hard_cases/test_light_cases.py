@@ -155,7 +155,7 @@ def block_error(a: np.ndarray, b: np.ndarray) -> float:
 
 def test_area_light_around_the_object_is_an_even_sky(blobs):
     lit = picture(blobs, "raymarch", {"ball_of_light": lamp_around(0.7)}, spp=32)
-    sky = picture(blobs, "raymarch", {"type": "constant", "radiance": 0.7}, environment_lights=64)
+    sky = picture(blobs, "raymarch", {"type": "constant", "radiance": 0.7}, spp=32, environment_lights=64)
     assert block_error(lit, sky) < 0.04  # noise of two drawn lights a point: 2 % in blocks of 4²
 
 
