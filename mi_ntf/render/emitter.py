@@ -5,7 +5,7 @@ import mitsuba as mi
 
 from ..core.errors import MiNtfError
 from ..infer.visibility import METHODS
-from . import light_checks, lights, properties
+from . import environment, light_checks, lights, properties
 from .visibility import Options, build
 
 STEP = 2 / 384
@@ -67,6 +67,7 @@ def emitter_class() -> type:
             method = "neural_transmittance" if self.visibility == "auto" else self.visibility
             table = None
             light_checks.check(self.inner, lights.kind(self.inner), drawn=True)
+            environment.check_unscaled(self.inner)
             if method != lights.method_for_drawn(method):
                 kind = lights.kind(self.inner)
                 if kind not in lights.SINGLE or not lights.is_discrete(self.inner):

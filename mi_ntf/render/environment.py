@@ -19,7 +19,7 @@ from ..core.errors import MiNtfError
 
 ROWS = 512
 """Rows of blocks that a map is summed to at most, and twice as many columns; more only where more lights are wanted."""
-FLOOR = 1e-3
+FLOOR = 1e-2
 """Share of an even sky that cells are cut by: dark regions too get a few, whose texels then have useful gradients."""
 SKY = 256, 512
 """Texels of the map that a ``sunsky`` without its sun is looked up in. The horizon lies between two rows."""
@@ -254,12 +254,17 @@ def seen(emitter, d):
 
 
 def scale(emitter) -> float:
-    """That of an environment's `to_world`, also of one inside ``ntf``: Mitsuba leaves it in the directions that it
-    looks up and samples."""
-    inner = getattr(emitter, "inner", None)
-    if inner is not None:
-        return scale(inner)
+    """That of an environment's `to_world`: Mitsuba leaves it in the directions that it looks up and samples."""
     return placement(emitter, "envmap")[1] if emitter.class_name() == "EnvironmentMapEmitter" else 1.0
+
+
+def check_unscaled(emitter) -> None:
+    """Raises MiNtfError where an environment's `to_world` scales, before Mitsuba itself lights surfaces by it."""
+    if emitter is not None and abs(scale(emitter) - 1) > 1e-3:
+        raise MiNtfError(
+            f"{name(emitter, 'envmap')}: to_world scales by {scale(emitter):.4g}, under which Mitsuba lights surfaces "
+            "wrongly; leave the scale out, an environment has no size"
+        )
 
 
 def placement(emitter, kind: str) -> tuple[np.ndarray, float]:

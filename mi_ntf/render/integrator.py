@@ -30,7 +30,7 @@ def integrator_class() -> type:
                                     or ``auto``, the cheaper of the first two (default: auto)
         samples             integer steps across the unit sphere's diameter (default: 384)
         light_samples       integer lights per shading point, drawn from Mitsuba's emitter sampling and resampled, from
-                                    any emitters; 0: all lights, every environment texel one, and 2 drawn ones (1 of a
+                                    any emitters; 0: all lights, cells of environments among them, and 2 drawn (1 of a
                                     projector or textured spot) of each emitter that is no finite set of lights, such
                                     as an area; these need no map and are marched under ``transmittance_map``
                                     (default: 0)
@@ -61,10 +61,11 @@ def integrator_class() -> type:
         method of maps or volumes. With ``none`` fields cast no shadows and receive none.
 
         The image can be differentiated by the lights: power, an environment's texels, and, of at most 32 lights in the
-        scene, position and direction, whose shadows are then marched whatever the method.
+        scene, position and direction, whose shadows are then marched whatever the method; and by the reflectance of
+        diffuse surfaces. Other parameters with gradients are refused.
 
         Does not support: media other than ``nrf``; spectral and polarised variants; derivatives by the fields and by
-        environments that turn.
+        environments that turn; ``timed_sunsky``; environments whose `to_world` shears or, among surfaces, scales.
         """
 
         def __init__(self, props):

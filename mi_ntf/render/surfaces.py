@@ -3,6 +3,8 @@
 import drjit as dr
 import mitsuba as mi
 
+from . import environment
+
 
 class Surfaces:
     """The ordinary shapes of `scene`, without the fields' bounding shapes.
@@ -16,6 +18,7 @@ class Surfaces:
     """
 
     def __init__(self, scene, shapes: list, hide_emitters: bool, transmittance):
+        environment.check_unscaled(scene.environment())
         self.scene, self.transmittance = scene, transmittance
         self._all = _scene_of(shapes)
         seen = [s for s in shapes if not (hide_emitters and s.is_emitter())]

@@ -6,6 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import emitters, scenes, ztest
+from helpers.variants import VARIANT
 
 import mi_ntf.render
 from mi_ntf.core.errors import MiNtfError
@@ -18,7 +19,7 @@ TOWARDS = np.array([0.6, 0.64, 0.48])
 
 @pytest.fixture(autouse=True)
 def variant():
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(VARIANT)
     mi_ntf.render.register()
     return mi
 
@@ -154,8 +155,8 @@ def block_error(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def test_area_light_around_the_object_is_an_even_sky(blobs):
-    lit = picture(blobs, "raymarch", {"ball_of_light": lamp_around(0.7)}, spp=32)
-    sky = picture(blobs, "raymarch", {"type": "constant", "radiance": 0.7}, spp=32, environment_lights=64)
+    lit = picture(blobs, "raymarch", {"ball_of_light": lamp_around(0.7)}, spp=64)
+    sky = picture(blobs, "raymarch", {"type": "constant", "radiance": 0.7}, spp=64, environment_lights=64)
     assert block_error(lit, sky) < 0.04  # noise of two drawn lights a point: 2 % in blocks of 4²
 
 

@@ -73,6 +73,22 @@ def test_memory_of_maps_is_bounded(tmp_path):
     assert report["lights"]["count"] == 512 and report["memory_bytes"]["maps or volumes"] == 4 << 20
 
 
+def test_environments_state_their_error(tmp_path, capsys):
+    """Fewer lights, more error: an even sky's 512 cells are 3.8° wide, its bound 0.48 %."""
+    light, found = f'<include filename="{SCENE.parent}/light_point.xml"/>', []
+    for count in (32, 512):
+        scene = with_integrator(tmp_path, f'<integer name="environment_lights" value="{count}"/>')
+        scene.write_text(scene.read_text().replace(light, '<emitter type="constant" id="sky"/>'))
+        report = explain(scene, {"visibility": "none"})
+        print_table(report)
+        found += report["environments"]
+    assert [e["lights"] for e in found] == [32, 512] and {e["emitter"] for e in found} == {"constant emitter (sky)"}
+    assert [e["irradiance_error_percent"] for e in found] == pytest.approx([5.5, 0.48], rel=0.05)
+    assert found[1]["radius_degrees"] == pytest.approx(3.83, rel=0.02)
+    assert "0.48 % of all light" in " ".join(capsys.readouterr().out.split())
+    assert explain(SCENE, {"visibility": "none", "light": "point"})["environments"] == []
+
+
 def test_table_names_every_effect_and_stage(capsys):
     report = explain(SCENE, {"visibility": "none"})
     print_table(report)
