@@ -8,11 +8,11 @@ from mi_ntf.core.microfacet import MIN_ROUGHNESS
 RESOLUTION = 128
 
 
-def architecture() -> Architecture:
+def architecture(components: int = 2) -> Architecture:
     return Architecture(
         Network(Encoding("planes", (RESOLUTION,), 8), (16,)),
         Network(Encoding("planes", (RESOLUTION,), 4), (16,)),
-        Network(Encoding("depth"), (16,), components=2),
+        Network(Encoding("depth"), (16,), components=components),
     )
 
 
@@ -33,12 +33,13 @@ def _logit(p):
 
 
 def blobs(
-    centers, radii, *, log_density=5.0, edge=8.0, albedo=(0.6, 0.5, 0.4), roughness=0.5, specular=0.2, similarity=None
+    centers, radii, *, log_density=5.0, edge=8.0, albedo=(0.6, 0.5, 0.4), roughness=0.5, specular=0.2, similarity=None,
+    components=2
 ) -> tuple[Header, dict]:
     """Opaque balls: ln σ rises from −12 to `log_density` over about radius/`edge`.. around each radius. Normals point
     away from the origin. At most 8 balls; a ball is the level set of a Gaussian, which the three planes' product holds
     exactly."""
-    arch = architecture()
+    arch = architecture(components)
     t = {k: np.zeros(s) for k, s in arch.skeleton().items()}
     u, v = _axes()
     for i, (c, r) in enumerate(zip(centers, radii, strict=True)):

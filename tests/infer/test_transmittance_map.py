@@ -4,12 +4,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from helpers import fields
 from helpers.jit import arrays
 
 from mi_ntf.core import logistic, mixture, ops
+from mi_ntf.infer.grid import GridField
 from mi_ntf.infer.lights import LightTable
+from mi_ntf.infer.network import NetworkField
+from mi_ntf.infer.profile import DepthProfile
 from mi_ntf.infer.visibility.light_rays import DIRECTIONAL, FRUSTUM, SPHERE, frames
 from mi_ntf.infer.visibility.map_source import CLEAR, Source, field_source, network_source
+from mi_ntf.infer.visibility.neural_transmittance import NeuralTransmittance
 from mi_ntf.infer.visibility.raymarch import optical_depth
 from mi_ntf.infer.visibility.transmittance_map import TransmittanceMap
 
@@ -198,3 +203,29 @@ def test_slanted_skin_stays_sharp(grid, slope, rng):
     truth = logistic.transmittance(ops, x @ LIGHTS["sun"][0], 100.0, slope * (x @ side))
     error = np.abs(look(tmap, x, "sun") - truth).max()
     assert error < 2e-3 if slope < 1 else 0.02 < error < 0.3
+
+
+@pytest.mark.parametrize("components", [1, 2])
+def test_light_deep_in_opaque_matter(components, rng):
+    """Where the network's own τ at the light has long underflowed: still 1 there, e^−(difference of depths) beyond as
+    in one query a point, and no light that leaks out of the matter."""
+    header, tensors = fields.blobs([(0, 0, 0)], [0.5], log_density=5.5, components=components)
+    for name, values in tensors.items():
+        if name.startswith("transmittance"):
+            values *= 0.2
+    network = NetworkField(header, tensors, mi)
+    grid = GridField(network, 48, mi)
+    reader = DepthProfile(grid.density, grid, mi.Float(1 / 512))
+    where = np.array([[0.05, -0.1, 0.02]])
+    lights = LightTable(where, np.ones((1, 3)), np.array([True]), 1.0, mi)
+    whole = lambda o, d, begin=None: reader(o, d)  # noqa: E731 — the light lies on a ray the network knows whole
+    tmap = TransmittanceMap(lights, 32, grid.hull, network_source(network, whole), mi)
+    o, d, _ = random_rays(tmap.rays, 0, rng)
+    distance = np.concatenate([np.full(100, 3e-4), rng.uniform(3e-4, 0.02, 100), rng.uniform(0.4, 0.9, 100)])
+    x = (o - distance * d).T
+    wi, r = (where - x) / distance[:, None], mi.Float(distance)
+    truth = np.array(NeuralTransmittance(network, whole).tau(arrays(x), arrays(wi), r, mi.UInt32(0), True))
+    found = np.array(tmap.tau(arrays(x), arrays(wi), r, mi.UInt32(0), True))
+    # Slopes of some hundred times float32's 1e-6; where S = e^−8 stands for an exponential, 3e-4 of it.
+    np.testing.assert_allclose(found, truth, atol=3e-3)
+    assert found[200:].max() < 1e-5 and 0.01 < truth[100:200].mean() < 0.99

@@ -11,12 +11,14 @@ from typing import Any
 
 import drjit as dr
 
-from ...core import logistic, mixture, spheres
+from ...core import logistic, spheres
 from .. import ops
 from . import two_logistics
 
 CLEAR = -100.0
 """b of a ray that nothing blocks: S(1·(t + 100)) = 1 in float32 for every t of the sphere."""
+DEEP = 8.0
+"""S(z) is e^z within e^−8, 3e-4, from z = −8 down."""
 
 
 @dataclass(frozen=True)
@@ -38,14 +40,33 @@ def network_source(field, profile, inside=True) -> Source:
     def fit(o, d, end):
         hit, h, mix = field.ray_mixture(o, d, lambda o, d: profile(o, d, begin=end))
         if inside:
-            near = end < h
-            top = mixture.transmittance(ops, dr.minimum(end, h), mix)
-            scale = dr.select(near, dr.rcp(dr.clip(top, 1e-6, 1)), 1)
-            mix, hit = tuple((w * scale, a, b) for w, a, b in mix), hit & (end > -h)
+            near, light = end < h, dr.minimum(end, h)
+            parts = zip(mix, _relative_to(light, mix), strict=True)
+            mix = tuple(tuple(dr.select(near, p, q) for p, q in zip(part, whole, strict=True)) for whole, part in parts)
+            hit &= end > -h
         share = 1 / len(mix)
         return tuple((dr.select(hit, w, share), dr.select(hit, a, 1), dr.select(hit, b, CLEAR)) for w, a, b in mix)
 
     return Source(fit, field.components, inside or field.components > 1)
+
+
+def _relative_to(light, mix):
+    """The mixture over its own value at t' = `light`, which may have underflowed in the midst of matter.
+
+    A part that far behind its centre is the exponential e^(a (t' − light)). A logistic with its centre `DEEP`/a from
+    the light has that shape too, and weights of a few thousand at most.
+    """
+    depths = [logistic.optical_depth(ops, light, a, b) - dr.log(w) for w, a, b in mix]
+    least = depths[0]
+    for depth in depths[1:]:
+        least = dr.minimum(least, depth)
+    shares = [dr.exp(least - depth) for depth in depths]
+    total = sum(shares[1:], shares[0])
+    near = [dr.minimum(b, light + DEEP / a) for _, a, b in mix]
+    return tuple(
+        (share / (total * logistic.sigmoid(ops, a * (light - b))), a, b)
+        for share, b, (_, a, _b) in zip(shares, near, mix, strict=True)
+    )
 
 
 LEVELS = (1e-3, math.log(4 / 3), math.log(2), math.log(4))
