@@ -1,5 +1,8 @@
 """Transmittance maps against the rays that they hold."""
 
+import subprocess
+import sys
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -12,7 +15,7 @@ from mi_ntf.infer.grid import GridField
 from mi_ntf.infer.lights import LightTable
 from mi_ntf.infer.network import NetworkField
 from mi_ntf.infer.profile import DepthProfile
-from mi_ntf.infer.visibility.light_rays import DIRECTIONAL, FRUSTUM, SPHERE, frames
+from mi_ntf.infer.visibility.light_rays import DIRECTIONAL, FRUSTUM, SPHERE, LightRays, frames
 from mi_ntf.infer.visibility.map_source import CLEAR, Source, field_source, network_source
 from mi_ntf.infer.visibility.neural_transmittance import NeuralTransmittance
 from mi_ntf.infer.visibility.raymarch import optical_depth
@@ -229,3 +232,27 @@ def test_light_deep_in_opaque_matter(components, rng):
     # Slopes of some hundred times float32's 1e-6; where S = e^−8 stands for an exponential, 3e-4 of it.
     np.testing.assert_allclose(found, truth, atol=3e-3)
     assert found[200:].max() < 1e-5 and 0.01 < truth[100:200].mean() < 0.99
+
+
+ALONE = """
+import drjit as dr, mitsuba as mi, numpy as np
+mi.set_variant("llvm_ad_rgb")
+from mi_ntf.infer.lights import LightTable
+from mi_ntf.infer.visibility.light_rays import LightRays
+table = LightTable([[0.0, 1.0, 2.0]], np.ones((1, 3)), [True], 1.0, mi)
+"""
+
+
+@pytest.mark.parametrize("resolution", [5, 7, 9, 31])
+def test_tables_of_any_size(grid, resolution, rng):
+    """A number of texels that is no multiple of a processor's lanes: those past the end belong to no light, and must
+    not divide by what stands in memory behind the last one. Each light's texels are those of a map of its own."""
+    program = f"{ALONE}\ndr.eval(LightRays(table, np.eye(3), {resolution}, mi).all_rays(0, 1)); dr.sync_thread()"
+    subprocess.run([sys.executable, "-c", program], check=True)
+    names = [n for n in LIGHTS if n != "inside"]
+    several = LightRays(table(*names), grid.hull, resolution, mi)
+    found = [np.array(v) for v in several.all_rays(0, len(names))[2]]
+    for k, name in enumerate(names):
+        alone = [np.array(v) for v in LightRays(table(name), grid.hull, resolution, mi).all_rays(0, 1)[2]]
+        part = slice(k * resolution**2, (k + 1) * resolution**2)
+        np.testing.assert_allclose([v[part] for v in found], alone, atol=1e-6)

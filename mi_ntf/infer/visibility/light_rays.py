@@ -96,7 +96,8 @@ class LightRays:
         texel = dr.arange(self.dj.UInt32, count * texels) + dr.opaque(self.dj.UInt32, first * texels)
         number = texel // self._texels
         light = self.light(number, True)
-        rest, columns = texel - number * self._texels, self.dj.UInt32(light.columns)
+        # Lanes that fill up a processor's last packet gather zeros, and whole numbers must not be divided by 0.
+        rest, columns = texel - number * self._texels, dr.maximum(self.dj.UInt32(light.columns), 1)
         line = rest // columns
         return texel, *self.ray(light, self.dj.Float(rest - line * columns), self.dj.Float(line))
 

@@ -1,0 +1,170 @@
+"""Random scenes in one process, for as long as it takes something to break.
+
+    python tests/hard_cases/soak.py [--scenes 200] [--seed 0] [--minutes 30]    # one process, all checks
+    python tests/hard_cases/soak.py --pairs 60 [--seed 0] [--minutes 30]        # against stock volpath, z-tests
+
+A failure is printed with its seed, which belongs into ``FAILED`` of test_soak.py. Exit code 1 if there is one.
+"""
+
+import argparse
+import ctypes
+import gc
+import sys
+import tempfile
+import time
+import traceback
+from pathlib import Path
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).parents[1]))
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from helpers import random_scenes, ztest
+
+from mi_ntf.core.errors import MiNtfError
+
+WARM_UP = 20
+"""Scenes after which memory may no longer grow: fields, fonts of code and caches have been seen by then."""
+GROWTH = 1.05
+SLOW = 60.0
+"""Seconds that no scene may take; compilation is most of what they take."""
+
+
+def render(what: random_scenes.Scene) -> np.ndarray:
+    """The picture (h, w, c)."""
+    loaded = mi.load_dict({"type": "scene", "integrator": what.integrator, **what.scene})
+    return np.array(mi.render(loaded, seed=what.seed % 1000), np.float64)
+
+
+def check(what: random_scenes.Scene) -> str:
+    """What is wrong with the scene's picture; empty if nothing is, "refused: …" where it says in one sentence why it
+    will not be rendered."""
+    try:
+        image = render(what)
+    except Exception as error:
+        text = refusal(error)
+        if text is None:
+            return "exception: " + "".join(traceback.format_exception(error))
+        return f"refused: {text}" if "\n" not in text else f"a refusal of several lines: {text}"
+    if not np.isfinite(image).all():
+        return f"{(~np.isfinite(image)).sum()} of {image.size} numbers are not finite"
+    colours = image[..., : what.coloured]
+    if not what.signed and colours.min() < 0:
+        return f"{(colours < 0).sum()} of {colours.size} colours are negative, down to {colours.min():.3g}"
+    return ""
+
+
+def refusal(error: BaseException) -> str | None:
+    """The sentence of a MiNtfError, also where Mitsuba has put it into an error of its own; None for any other."""
+    reason = error
+    while reason is not None and not isinstance(reason, MiNtfError):
+        reason = reason.__cause__ or reason.__context__
+    if reason is not None:
+        return str(reason)
+    _, found, text = str(error).rpartition("MiNtfError: ")
+    return text.strip() if found else None
+
+
+def memory() -> tuple[float, float]:
+    """MiB that this process holds: resident, and Dr.Jit's, without what caches keep of scenes that are gone."""
+    gc.collect()
+    gc.collect()
+    dr.sync_thread()
+    dr.flush_kernel_cache()
+    dr.flush_malloc_cache()
+    ctypes.CDLL("libc.so.6").malloc_trim(0)
+    dr.detail.malloc_clear_statistics()
+    own = dr.detail.malloc_watermark(dr.JitBackend.LLVM)
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * 4096 / 2**20, own / 2**20
+
+
+def soak(scenes: int, seed: int, files: dict, seconds: float, say=print) -> list[str]:
+    """Render `scenes` random scenes from `seed` on; the failures, in words."""
+    failures, refused, times, held = [], 0, [], []
+    begin = time.monotonic()
+    for k in range(scenes):
+        if time.monotonic() - begin > seconds:
+            failures.append(f"only {k} of {scenes} scenes within {seconds:.0f} s")
+            break
+        start = time.monotonic()
+        what = random_scenes.draw(seed + k, files)
+        found = check(what)
+        times.append(time.monotonic() - start)
+        if found.startswith("refused"):
+            refused += 1
+        elif found:
+            failures.append(f"seed {what.seed}: {found}\n    {what.what}")
+        if times[-1] > SLOW:
+            failures.append(f"seed {what.seed}: {times[-1]:.0f} s\n    {what.what}")
+        say(f"{k + 1}/{scenes} seed {what.seed}: {times[-1]:.1f} s {found[:150].splitlines()[0] if found else ''}")
+        if (k + 1) % WARM_UP == 0:
+            held.append(memory())
+            say(f"    {held[-1][0]:.0f} MiB resident, {held[-1][1]:.1f} MiB of Dr.Jit's arrays")
+    if len(held) > 1:
+        # Against the first two readings' larger one: what a process holds goes up and down by a field or two.
+        for name, first, last in zip(("resident", "Dr.Jit"), held[0], np.max(held[-1:], axis=0), strict=True):
+            if last > GROWTH * first:
+                failures.append(f"{name} memory grew from {first:.1f} to {last:.1f} MiB")
+    times = np.array(times)
+    say(f"{len(times)} scenes, {refused} refused, {len(failures)} failures; median {np.median(times):.1f} s, "
+        f"longest {times.max():.1f} s, {time.monotonic() - begin:.0f} s in all")
+    return failures
+
+
+def compare(seed: int, files: dict) -> str:
+    """What a z-test says against two scenes of one seed, ours and ``volpath``'s; empty if they agree. A pair that
+    fails is rendered again, longer and by other seeds: by chance that happens to one of ten thousand."""
+    what, theirs = random_scenes.draw_pair(seed, files)
+    scene = {"type": "scene", **what.scene}
+    loaded = [mi.load_dict({**scene, "integrator": i}) for i in (what.integrator, theirs)]
+    for attempt in range(2):
+        seeds = range(100 * attempt, 100 * attempt + 4 + 4 * attempt)
+        pair = [[np.array(mi.render(s, seed=k, spp=spp))[..., :3] for k in seeds]
+                for s, spp in zip(loaded, (16, 192), strict=True)]  # fmt: skip
+        try:
+            ztest.check(*pair, f"seed {seed}", block=4)
+            return ""
+        except AssertionError as error:
+            found = f"{error}\n    {what.what}"
+    return found
+
+
+def pairs(count: int, seed: int, files: dict, seconds: float, say=print) -> list[str]:
+    """Compare `count` pairs from `seed` on; the failures, in words."""
+    failures, begin = [], time.monotonic()
+    for k in range(count):
+        if time.monotonic() - begin > seconds:
+            failures.append(f"only {k} of {count} pairs within {seconds:.0f} s")
+            break
+        start = time.monotonic()
+        found = compare(seed + k, files)
+        failures += [found] if found else []
+        say(f"{k + 1}/{count} seed {seed + k}: {time.monotonic() - start:.1f} s {found}")
+    return failures
+
+
+def main() -> int:
+    """Command line; returns the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", type=int, default=200)
+    parser.add_argument("--pairs", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--minutes", type=float, default=30.0)
+    arguments = parser.parse_args()
+    import mi_ntf.render
+
+    mi.set_variant("llvm_ad_rgb")
+    mi_ntf.render.register()
+    with tempfile.TemporaryDirectory() as folder:
+        files = random_scenes.write_fields(Path(folder))
+        run, count = (pairs, arguments.pairs) if arguments.pairs else (soak, arguments.scenes)
+        failures = run(count, arguments.seed, files, 60 * arguments.minutes, lambda text: print(text, flush=True))
+    print(f"{len(failures)} failures", *failures, sep="\n")
+    return bool(failures)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
