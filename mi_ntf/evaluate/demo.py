@@ -1,7 +1,7 @@
 """`make demo`: the stock `mitsuba` program renders the shipped scene three ways; a table and a picture show the
 outcome.
 
-    python -m mi_ntf.evaluate.demo [--out out/demo] [--scene statue] [--spp 16] [--environment-spp 4]
+    python -m mi_ntf.evaluate.demo [--out out/demo] [--scene statue] [--size 256] [--spp 16] [--environment-spp 4]
 
 Writes to `out`: one EXR a render, ``table.md``, ``metrics.json``, ``comparison.png``. Exit code 1 if a render fails.
 """
@@ -59,9 +59,11 @@ def program() -> tuple[list[str], str]:
     return look_alike, f"rendered by `mi-ntf render`, since the bridge is missing ({why})"
 
 
-def render(command: list[str], scene: Path, light: str, visibility: str, spp: int, out: Path) -> Shot:
-    """Run one render as a process of its own. Raises :class:`MiNtfError` with the end of its output if it fails."""
-    defines = [w for d in (f"light={light}", f"visibility={visibility}", f"spp={spp}") for w in ("-D", d)]
+def render(command: list[str], scene: Path, light: str, visibility: str, spp: int, size: int, out: Path) -> Shot:
+    """Run one render of `size`² pixels as a process of its own. Raises :class:`MiNtfError` with the end of its output
+    if it fails."""
+    chosen = (f"light={light}", f"visibility={visibility}", f"spp={spp}", f"res={size}")
+    defines = [w for d in chosen for w in ("-D", d)]
     words = [*command, "-m", "llvm_ad_rgb", *defines, "-o", str(out), str(scene)]
     start = time.perf_counter()
     try:
@@ -137,13 +139,14 @@ def report(out: Path, shots: list[Shot], references: dict[str, np.ndarray], note
     return text
 
 
-def demo(out: Path = Path("out/demo"), scene: str = "statue", spp: int = 16,
+def demo(out: Path = Path("out/demo"), scene: str = "statue", size: int = 256, spp: int = 16,
          environment_spp: int = 4) -> None:
     """Render a shipped scene in three visibilities under two lights and compare.
 
     Args:
         out: folder for images, table and picture.
         scene: name of a folder of scenes/.
+        size: pixels along a side, a divisor of the references' 256.
         spp: samples per pixel under the point light.
         environment_spp: the same under the environment map, whose hundreds of lights each sample pays for.
     """
@@ -153,7 +156,7 @@ def demo(out: Path = Path("out/demo"), scene: str = "statue", spp: int = 16,
     folder = Path(__file__).parents[2] / "scenes" / scene
     if not (folder / "scene.xml").is_file():
         raise MiNtfError(f"{folder / 'scene.xml'} does not exist; run the demo in a checkout, on a scene of scenes/")
-    references = {light: _reference(folder, light) for light in LIGHTS}
+    references = {light: _reference(folder, light, size) for light in LIGHTS}
     files.make_folder(out)
     command, note = program()
     console = Console()
@@ -168,17 +171,22 @@ def demo(out: Path = Path("out/demo"), scene: str = "statue", spp: int = 16,
                 file = out / f"{folder.name}_{light}_{visibility}.exr"
                 file.unlink(missing_ok=True)
                 samples = environment_spp if light == "env" else spp
-                shots.append(render(command, folder / "scene.xml", light, visibility, samples, file))
+                shots.append(render(command, folder / "scene.xml", light, visibility, samples, size, file))
                 progress.advance(task)
     print(report(out, shots, references, note))
     console.print(f"picture: {out / 'comparison.png'}")
 
 
-def _reference(folder: Path, light: str) -> np.ndarray:
+def _reference(folder: Path, light: str, size: int) -> np.ndarray:
+    """The path-traced meshes, means of whole pixels where `size` is smaller than what is stored."""
     path = folder / f"reference_{light}.exr"
     if not path.is_file():
         raise MiNtfError(f"{path} does not exist; make it with `python scenes/make_references.py {folder.name}`")
-    return read_image(path)
+    image = read_image(path)
+    if not 16 <= size <= len(image) or len(image) % size:
+        raise MiNtfError(f"size is {size}, expected a divisor of the reference's {len(image)} pixels, at least 16")
+    block = len(image) // size
+    return image.reshape(size, block, size, block, -1).mean((1, 3))
 
 
 def main() -> int:

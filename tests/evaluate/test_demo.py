@@ -1,8 +1,9 @@
-"""The parts of `make demo` that need no renderer: process handling, table, picture."""
+"""`make demo`: process handling, table and picture by themselves, and the whole of it."""
 
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ import sys, numpy as np, OpenEXR
 words = sys.argv[1:]
 assert words[:2] == ["-m", "llvm_ad_rgb"] and words[-1].endswith("scene.xml"), words
 defined = dict(words[i + 1].split("=") for i, w in enumerate(words) if w == "-D")
+assert defined["res"] == "64"
 if defined["visibility"] == "none":
     sys.exit("no such visibility")
 pixels = np.full((4, 6), float(defined["spp"]), np.float32)
@@ -31,14 +33,14 @@ def fake(tmp_path):
 
 
 def test_render_passes_parameters_and_times_the_process(fake, tmp_path):
-    shot = demo.render(fake, tmp_path / "scene.xml", "env", "raymarch", 3, tmp_path / "o.exr")
+    shot = demo.render(fake, tmp_path / "scene.xml", "env", "raymarch", 3, 64, tmp_path / "o.exr")
     assert (shot.light, shot.visibility, shot.image.shape) == ("env", "raymarch", (4, 6, 4))
     assert (shot.image == 3).all() and shot.seconds > 0
 
 
 def test_a_failed_render_shows_its_output(fake, tmp_path):
     with pytest.raises(MiNtfError, match=r"(?s)visibility=none.*exit code 1.*no such visibility.*mi-ntf doctor"):
-        demo.render(fake, tmp_path / "scene.xml", "env", "none", 3, tmp_path / "o.exr")
+        demo.render(fake, tmp_path / "scene.xml", "env", "none", 3, 64, tmp_path / "o.exr")
 
 
 def _shots():
@@ -92,3 +94,43 @@ def test_measuring_never_imports_torch():
             "print('torch' in sys.modules)")
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
+
+
+ROOT = Path(__file__).parents[2]
+
+
+def check_demo(folder: Path, ssim: float, rmse: float, to_march: float) -> None:
+    """Six renders, each near the path-traced meshes and nearer to `raymarch`; table and picture beside them."""
+    measured = json.loads((folder / "metrics.json").read_text())
+    assert [(m["light"], m["visibility"]) for m in measured] == [(a, b) for a in demo.LIGHTS for b in demo.VISIBILITIES]
+    for m in measured:
+        print("DEMO", m)
+        assert m["ssim"] > ssim and m["relative_rmse"] < rmse, m
+        assert (m["relative_rmse_to_raymarch"] == 0) == (m["visibility"] == "raymarch")
+        assert m["relative_rmse_to_raymarch"] < to_march
+    assert (folder / "table.md").read_text().count("\n| ") == 7
+    assert io.imread(folder / "comparison.png")[..., :3].std() > 20
+    assert len(list(folder.glob("*.exr"))) == 6 and not list(folder.glob("*.part*"))
+
+
+def test_the_demo_on_few_pixels(tmp_path):
+    """The command of `make demo` itself, by the stock program, on 32² pixels."""
+    command = [sys.executable, "-m", "mi_ntf.evaluate.demo", "--size", "32", "--spp", "16", "--environment-spp", "4",
+               "--out", str(tmp_path)]  # fmt: skip
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=600)
+    assert done.returncode == 0, done.stdout + done.stderr
+    check_demo(tmp_path, 0.8, 0.3, 0.15)
+
+
+@pytest.mark.slow
+def test_make_demo():
+    """All of it, as a user types it: the figures that README gives."""
+    done = subprocess.run(["make", "demo"], cwd=ROOT, capture_output=True, text=True, check=False, timeout=3600)
+    assert done.returncode == 0, done.stdout + done.stderr
+    check_demo(ROOT / "out" / "demo", 0.9, 0.25, 0.07)
+
+
+@pytest.mark.parametrize("size", [8, 100, 512])
+def test_a_size_that_divides_nothing_is_refused(size, tmp_path):
+    with pytest.raises(MiNtfError, match=f"size is {size}, expected a divisor of the reference's 256 pixels"):
+        demo.demo(out=tmp_path, size=size)

@@ -61,7 +61,7 @@ METAL = {"type": "roughconductor", "alpha": 0.2}
 )
 def test_agrees_with_volpath(blobs, light, floor, lamp, depth):
     """Two fields of one file, floor and ball, every kind of shadow and bounce among them: z-test per 4×4 block; 8×8
-    block means of direct light within 4 %, four times volpath's noise in them; the mean of all bounces within 2 %."""
+    block means of direct light within 3 %, four times volpath's noise in them; the mean of all bounces within 2 %."""
     options = {"light_samples": 2} if light in (None, "env") else {}
     lights = {"light": scenes.light(light)} if light else {}
 
@@ -71,10 +71,11 @@ def test_agrees_with_volpath(blobs, light, floor, lamp, depth):
         )
         return [scenes.render(loaded, seed) for seed in range(SEEDS)]
 
-    ours, theirs = renders(nrf(samples=1024, **options), 64), renders({"type": "volpath"}, 256)
+    ours, theirs = renders(nrf(samples=1024, **options), 64), renders({"type": "volpath"}, 512)
     ztest.check([i[..., :3] for i in ours], [i[..., :3] for i in theirs], f"room {light} {depth}", block=4)
     ours, theirs = np.mean(ours, 0), np.mean(theirs, 0)
-    assert depth != 2 or ztest.block_difference(ours[..., :3], theirs[..., :3], 8, floor=0.3).max() < 0.04
+    print("BLOCK", light, depth, ztest.block_difference(ours[..., :3], theirs[..., :3], 8, floor=0.3))
+    assert depth != 2 or ztest.block_difference(ours[..., :3], theirs[..., :3], 8, floor=0.3).max() < 0.03
     np.testing.assert_allclose(ours.mean((0, 1)), theirs.mean((0, 1)), rtol=0.02)
 
 
