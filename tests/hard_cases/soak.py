@@ -22,6 +22,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from helpers import random_scenes, ztest
+from helpers.variants import VARIANT
 
 from mi_ntf.core.errors import MiNtfError
 
@@ -161,7 +162,7 @@ def main() -> int:
     arguments = parser.parse_args()
     import mi_ntf.render
 
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(VARIANT)
     mi_ntf.render.register()
     with tempfile.TemporaryDirectory() as folder:
         files = random_scenes.write_fields(Path(folder))

@@ -6,6 +6,7 @@ from pathlib import Path
 import mitsuba as mi
 import pytest
 from helpers import random_scenes
+from helpers.variants import VARIANT
 
 SPEC = importlib.util.spec_from_file_location("soak", Path(__file__).with_name("soak.py"))
 soak = importlib.util.module_from_spec(SPEC)
@@ -20,7 +21,7 @@ FAILED_PAIRS: dict[int, str] = {}
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(VARIANT)
     return random_scenes.write_fields(tmp_path_factory.mktemp("fields"))
 
 

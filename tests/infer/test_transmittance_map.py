@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from helpers import fields
 from helpers.jit import arrays
+from helpers.variants import VARIANT
 
 from mi_ntf.core import logistic, mixture, ops
 from mi_ntf.infer.grid import GridField
@@ -235,8 +236,9 @@ def test_light_deep_in_opaque_matter(components, rng):
 
 
 ALONE = """
+import sys
 import drjit as dr, mitsuba as mi, numpy as np
-mi.set_variant("llvm_ad_rgb")
+mi.set_variant(sys.argv[1])
 from mi_ntf.infer.lights import LightTable
 from mi_ntf.infer.visibility.light_rays import LightRays
 table = LightTable([[0.0, 1.0, 2.0]], np.ones((1, 3)), [True], 1.0, mi)
@@ -248,7 +250,7 @@ def test_tables_of_any_size(grid, resolution, rng):
     """A number of texels that is no multiple of a processor's lanes: those past the end belong to no light, and must
     not divide by what stands in memory behind the last one. Each light's texels are those of a map of its own."""
     program = f"{ALONE}\ndr.eval(LightRays(table, np.eye(3), {resolution}, mi).all_rays(0, 1)); dr.sync_thread()"
-    subprocess.run([sys.executable, "-c", program], check=True)
+    subprocess.run([sys.executable, "-c", program, VARIANT], check=True)
     names = [n for n in LIGHTS if n != "inside"]
     several = LightRays(table(*names), grid.hull, resolution, mi)
     found = [np.array(v) for v in several.all_rays(0, len(names))[2]]

@@ -11,13 +11,15 @@ from mi_ntf.infer.visibility import raymarch
 
 SCENES = Path(__file__).parents[2] / "scenes"
 TOLERANCE = {
-    "raymarch": 0.01,
-    "neural_transmittance": 0.05,  # the figure that the networks are trained for
-    "transmittance_map": 0.06,  # 128² texels: one is as wide as the finer shadows
-    "transmittance_volume": 0.12,  # the same, where one skin is brighter than its neighbour
-    "visibility_mlp": 0.6,  # the baseline: a small network that knows the object by heart
+    "raymarch": {"statue": 0.0033, "globe": 0.0026, "knot": 0.0017},
+    "neural_transmittance": {"statue": 0.027, "globe": 0.043, "knot": 0.021},
+    "transmittance_map": {"statue": 0.049, "globe": 0.055, "knot": 0.042},  # texels as wide as the finer shadows
+    "transmittance_volume": {"statue": 0.078, "globe": 0.046, "knot": 0.0127},  # where one skin outshines the next
+    "visibility_mlp": {"statue": 0.43, "globe": 0.39, "knot": 0.25},  # a small network that knows the object by heart
 }
-"""Relative RMSE of the image."""
+"""Relative RMSE of the image: 1.5 times what the emitter that errs least has, and no less than 1.05 times the worst."""
+DRAWN = ("area", "projector")
+"""What they shine is marched under maps and volumes."""
 KINDS = ("point", "spot", "directional", "constant", "envmap", "sunsky", "area", "projector", "directionalarea")
 
 
@@ -53,4 +55,6 @@ def test_every_method_and_emitter(name, kind):
         assert np.isfinite(image).all(), method
         error = np.sqrt(((image - truth) ** 2).mean()) / max(bright, 1e-9)
         print(f"{name} {kind} {method}: {error:.2%}")
-        assert error <= TOLERANCE[method], f"{method}: {error:.1%} of fine marches"
+        marched = kind in DRAWN and method in ("transmittance_map", "transmittance_volume")
+        limit = TOLERANCE["raymarch" if marched else method][name]
+        assert error <= limit, f"{method}: {error:.2%} of fine marches, {limit:.2%} is allowed"
