@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from helpers.variants import VARIANT
+from helpers.frameworks import BACKENDS, oracle
 
 from mi_ntf.core import logistic, microfacet, ops, spheres
 
@@ -110,61 +110,21 @@ def _inputs(formula):
     return [np.float32(v) for sample in formula.inputs for v in sample(rng)]
 
 
-def _oracle(formula, inputs):
-    """Values (k, n), and per input the central difference of Σ_k w_k f_k, w = 1, ½, ⅓ …"""
-    inputs = [v.astype(np.float64) for v in inputs]
-    values = np.array(formula.function(ops, *inputs))
-    weights = 1 / np.arange(1, len(values) + 1)
-    gradients = []
-    for i, x in enumerate(inputs):
-        step = STEP * np.maximum(np.abs(x), 1e-2)
-        moved = [[*inputs[:i], x + s, *inputs[i + 1:]] for s in (step, -step)]
-        up, down = (weights @ np.array(formula.function(ops, *m)) for m in moved)
-        gradients.append((up - down) / (2 * step))
-    return values, np.array(gradients)
-
-
-def _torch(formula, inputs):
-    torch = pytest.importorskip("torch")
-    namespace = pytest.importorskip("mi_ntf.train.ops")
-    inputs = [torch.tensor(v, requires_grad=True) for v in inputs]
-    values = formula.function(namespace, *inputs)
-    sum((v / (k + 1)).sum() for k, v in enumerate(values)).backward()
-    return [v.detach().numpy() for v in values], [v.grad.numpy() for v in inputs]
-
-
-def _drjit(formula, inputs):
-    mi = pytest.importorskip("mitsuba")
-    import drjit as dr
-
-    mi.set_variant(VARIANT)
-    from mi_ntf.infer import ops as namespace
-
-    inputs = [mi.Float(v) for v in inputs]
-    dr.enable_grad(inputs)
-    values = formula.function(namespace, *inputs)
-    dr.backward(sum((dr.sum(v / (k + 1)) for k, v in enumerate(values)), mi.Float(0)))
-    return [v.numpy() for v in values], [v.grad.numpy() for v in inputs]
-
-
-BACKENDS = {"numpy32": lambda f, x: (f.function(ops, *x), None), "torch": _torch, "drjit": _drjit}
-
-
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("formula", FORMULAS, ids=lambda f: f.name)
 def test_values_and_gradients(formula, backend):
     inputs = _inputs(formula)
-    expected, expected_gradients = _oracle(formula, inputs)
-    values, gradients = BACKENDS[backend](formula, inputs)
-    for value, oracle in zip(values, expected, strict=True):
+    expected, expected_gradients = oracle(formula.function, inputs, STEP)
+    values, gradients = BACKENDS[backend](formula.function, inputs)
+    for value, truth in zip(values, expected, strict=True):
         assert value.dtype == np.float32
-        error = np.abs(value - oracle) / np.maximum(np.abs(oracle), 1.0)
+        error = np.abs(value - truth) / np.maximum(np.abs(truth), 1.0)
         assert error.max() <= formula.value, f"worst input {[float(v[error.argmax()]) for v in inputs]}"
     if gradients is None:
         return
-    for gradient, oracle in zip(gradients, expected_gradients, strict=True):
+    for gradient, truth in zip(gradients, expected_gradients, strict=True):
         assert np.isfinite(gradient).all()
-        error = np.abs(gradient - oracle) / np.maximum(np.abs(oracle), formula.unit)
+        error = np.abs(gradient - truth) / np.maximum(np.abs(truth), formula.unit)
         assert error.max() <= formula.gradient, f"worst input {[float(v[error.argmax()]) for v in inputs]}"
 
 
@@ -193,15 +153,13 @@ SINGULAR = {
 @pytest.mark.parametrize("name", SINGULAR)
 def test_values_and_gradients_are_finite_at_singular_points(name, backend):
     function, x = SINGULAR[name]
-    formula = Formula(name, function, (), 0, 0)
-    values, gradients = BACKENDS[backend](formula, [np.full(3, x, np.float32)])
+    values, gradients = BACKENDS[backend](function, [np.full(3, x, np.float32)])
     assert np.isfinite(values).all() and np.isfinite(gradients).all()
 
 
 @pytest.mark.parametrize("backend", ["torch", "drjit"])
 def test_softplus_has_slope_one_half_at_zero(backend):
-    formula = Formula("softplus", lambda o, z: [logistic.softplus(o, z)], (), 0, 0)
-    values, gradients = BACKENDS[backend](formula, [np.zeros(2, np.float32)])
+    values, gradients = BACKENDS[backend](lambda o, z: [logistic.softplus(o, z)], [np.zeros(2, np.float32)])
     np.testing.assert_allclose(values[0], np.log(2), rtol=1e-7)
     np.testing.assert_array_equal(gradients[0], 0.5)
 
@@ -209,6 +167,6 @@ def test_softplus_has_slope_one_half_at_zero(backend):
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("name", ["maximum", "minimum"])
 def test_not_a_number_passes_through(backend, name):
-    formula = Formula(name, lambda o, x: [getattr(o, name)(x, 0.0), getattr(o, name)(x * 0 + 1, x)], (), 0, 0)
-    values, _ = BACKENDS[backend](formula, [np.array([np.nan, 2], np.float32)])
+    values, _ = BACKENDS[backend](
+        lambda o, x: [getattr(o, name)(x, 0.0), getattr(o, name)(x * 0 + 1, x)], [np.array([np.nan, 2], np.float32)])
     assert np.isnan([v[0] for v in values]).all() and np.isfinite([v[1] for v in values]).all()
