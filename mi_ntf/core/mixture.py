@@ -32,7 +32,8 @@ def from_outputs(ops, pairs, logits, h):
     if not logits:
         return ((0 * h + 1, *pairs[0]),)
     # |logits| is bounded: a component that has lost all weight would get no gradient, and its logarithm overflow.
-    scores = [1 + 0 * h, *(ops.exp(6 * logistic.tanh(ops, v / 6)) for v in logits)]
-    raw = tuple((w, a, b) for w, (a, b) in zip(scores, pairs, strict=True))
-    top = ops.maximum(transmittance(ops, h, raw), 1e-6)
-    return tuple((w / top, a, b) for w, a, b in raw)
+    scores = [0 * h, *(6 * logistic.tanh(ops, v / 6) for v in logits)]
+    # Divided as logarithms: where all centres lie beyond the exit, τ(h) falls to 1e-35 (sigmoid's clip), whose inverse
+    # float32 holds, but not the inverse's square, which the quotient's derivative needs.
+    top = ops.log(transmittance(ops, h, tuple((ops.exp(s), a, b) for s, (a, b) in zip(scores, pairs, strict=True))))
+    return tuple((ops.exp(s - top), a, b) for s, (a, b) in zip(scores, pairs, strict=True))

@@ -33,17 +33,13 @@ def blobs(tmp_path_factory):
 
 
 @pytest.fixture
-def check(request, record_property):
-    """``check(method, what, error, bound, unit="")``: one row of the catalogue.
+def check(record_property):
+    """``check(case, method, what, error, bound)``: one row of the catalogue.
 
-    `error`: what was measured, a number or an array, whose largest absolute value counts; NaN fails. The case's name is
-    the test's, with its parameters but for `method`.
+    `error`: what was measured, a number or an array, whose largest absolute value counts; NaN fails.
     """
-    parameters = getattr(request.node, "callspec", None)
-    ids = [str(v) for k, v in (parameters.params if parameters else {}).items() if k not in ("method", "backend")]
-    case = ": ".join([request.node.originalname.removeprefix("test_").replace("_", " "), *ids])
 
-    def row(method, what, error, bound):
+    def row(case, method, what, error, bound):
         worst = float(np.max(np.abs(np.asarray(error, np.float64)), initial=0.0))
         good = bool(worst <= bound)
         record_property(hard_cases.PROPERTY, [case, method, what, f"{worst:.2g}", f"{bound:.2g}", good])

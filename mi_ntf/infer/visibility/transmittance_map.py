@@ -74,16 +74,11 @@ class TransmittanceMap:
 
 
 def _root(t, mixture):
-    """√τ(t). Clipped where S is 4e-18 (of more than two logistics, more), so that no product of denominators
-    overflows."""
-    top = min(40.0, 80.0 / len(mixture))
-    terms = [(w, 1 + dr.exp(dr.clip(a * (b - t), -20, top))) for w, a, b in mixture]
-    total, below = terms[0]
+    """√τ(t). Clipped as :func:`mi_ntf.core.logistic.sigmoid` is: what a weight was divided by, it is multiplied by."""
+    terms = [(w, 1 + dr.exp(dr.clip(a * (b - t), -20, 80))) for w, a, b in mixture]
     if len(terms) == 1:
-        return dr.sqrt(total) * dr.rsqrt(below)
-    for w, e in terms[1:]:
-        total, below = total * e + w * below, below * e
-    return dr.sqrt(total / below)
+        return dr.sqrt(terms[0][0]) * dr.rsqrt(terms[0][1])
+    return dr.sqrt(sum(w / below for w, below in terms))
 
 
 def _shifts(mixtures, weights, size):
