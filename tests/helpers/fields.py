@@ -1,9 +1,14 @@
 """Fields with known values, written by hand into the networks: no training, exact up to bilinear interpolation."""
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+
 import numpy as np
 
 from mi_ntf.core.architecture import MIN_LOG_DENSITY, Architecture, Encoding, Header, Network, Similarity
 from mi_ntf.core.microfacet import MIN_ROUGHNESS
+from mi_ntf.infer.network import MIN_DENSITY
 
 RESOLUTION = 128
 
@@ -92,3 +97,76 @@ def uniform(sigma: float, **kwargs) -> tuple[Header, dict]:
     header, t = blobs([(0, 0, 0)], [0.3], **kwargs)
     constant(t, "density", [np.log(sigma)])
     return header, t
+
+
+@dataclass(frozen=True)
+class Skin:
+    """Matter whose surface is known in closed form: ln σ = `log_density` − distance/`scale` outside, `log_density`
+    inside. `distance`: of points (n, 3), above 0 outside, of slope 1 at the surface. σ is 0 where the package cuts it:
+    below MIN_DENSITY and outside the unit sphere."""
+
+    distance: Callable
+    log_density: float
+    scale: float
+    header: Header
+    tensors: dict
+
+    def density(self, x: np.ndarray) -> np.ndarray:
+        """σ (n,) in float64."""
+        log = np.clip(self.log_density - self.distance(x) / self.scale, MIN_LOG_DENSITY, self.log_density)
+        return np.where((np.exp(log) > MIN_DENSITY) & ((x * x).sum(-1) < 1), np.exp(log), 0.0)
+
+    def depth(self, x, d, length, steps: int = 2000) -> np.ndarray:
+        """∫ σ from `x` (n, 3) along unit `d` over `length` (n,), midpoint rule with steps that grow from `x` on."""
+        edges = np.linspace(0, 1, steps + 1) ** 2
+        total = np.zeros(len(x))
+        for a, b in pairwise(edges):
+            total += self.density(x + (0.5 * (a + b) * length)[:, None] * d) * (b - a)
+        return total * length
+
+
+def skin(kind: str, log_density: float = 5.0, scale: float = 0.01, **options) -> Skin:
+    """`plane`: z < 0; `sphere`: radius ½; `bumps`: z < 0.08 cos 9x cos 9y. Normals: z, or away from the centre."""
+    u, v = _axes()
+    header, t = blobs([(0, 0, 0)], [0.3], **options)
+    planes = t["density.planes.0"]
+    planes[...], weights = 1, np.zeros(8)
+    if kind == "sphere":
+        planes[0, :, :, 0], planes[0, :, :, 1], planes[1, :, :, 2] = u * u, v * v, v * v
+        weights[:3], offset = 1, -0.25
+
+        def distance(x):
+            return (x * x).sum(-1) - 0.25
+    else:
+        height = 0.0 if kind == "plane" else 0.08
+        planes[1, :, :, 0], planes[0, :, :, 1] = v, np.cos(9 * u) * np.cos(9 * v)
+        weights[0], weights[1], offset = 1, -height, 0.0
+        last = t["reflectance.layers.1.bias"]
+        constant(t, "reflectance", [0, 0, 1, *last[3:]])
+
+        def distance(x):
+            return x[:, 2] - height * np.cos(9 * x[:, 0]) * np.cos(9 * x[:, 1])
+
+    span = log_density - MIN_LOG_DENSITY
+    w0, b0, w1 = (t[f"density.layers.{n}"] for n in ("0.weight", "0.bias", "1.weight"))
+    w0[...], w1[...] = 0, 0
+    w0[:2] = -weights / scale
+    b0[...] = 0
+    b0[:2] = span - offset / scale - np.array([0, span])
+    w1[0, :2] = 1, -1
+    return Skin(distance, log_density, scale, header, t)
+
+
+def middle_of_profile(tensors: dict) -> None:
+    """The ray network that says nothing: the logistic through the middle of each ray's optical depth."""
+    constant(tensors, "transmittance", [0] * len(tensors["transmittance.layers.1.bias"]))
+
+
+def seen_points(skin: Skin, surface: np.ndarray, view: np.ndarray, rng) -> np.ndarray:
+    """Points (n, 3) at which rays that look along −`view` at the points `surface` (n, 3) scatter: free flight."""
+    reach, steps = 12 * skin.scale, 600
+    t = reach - (np.arange(steps) + 0.5) * 2 * reach / steps
+    sigma = np.stack([skin.density(surface + s * view) for s in t], 1)
+    passed = np.cumsum(sigma, 1) * 2 * reach / steps
+    depth = -np.log(1 - rng.random(len(surface)) * (1 - np.exp(-passed[:, -1])))
+    return surface + t[(passed < depth[:, None]).sum(1).clip(max=steps - 1)][:, None] * view

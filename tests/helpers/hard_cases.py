@@ -1,5 +1,20 @@
-"""What the catalogue of hard cases shares: its table, both frameworks of a formula, visibility methods on a field."""
+"""What the catalogue of hard cases shares: its table, visibility methods on a field."""
 
+from pathlib import Path
+from types import SimpleNamespace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy.ndimage import map_coordinates
+
+from helpers.jit import arrays
+from mi_ntf.infer.grid import GridField
+from mi_ntf.infer.lights import LightTable
+from mi_ntf.infer.network import MIN_DENSITY, NetworkField
+from mi_ntf.render import visibility
+
+SCENES = Path(__file__).parents[2] / "scenes"
 PROPERTY = "hard case"
 TITLES = ("case", "method", "value checked", "error", "allowed", "result")
 
@@ -10,3 +25,54 @@ def table(rows) -> str:
     widths = [max(len(line[k]) for line in lines) for k in range(len(TITLES))]
     text = ["  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines]
     return "\n".join([text[0], "-" * (sum(widths) + 2 * len(widths)), *text[1:]])
+
+
+METHODS = {
+    "raymarch": ("raymarch", {}),
+    "transmittance_volume": ("transmittance_volume", {}),
+    "transmittance_map": ("transmittance_map", {}),
+    "transmittance_map, 2 logistics": ("transmittance_map", {"map_components": 2}),
+    "transmittance_map, network": ("transmittance_map", {"map_source": "network"}),
+    "neural_transmittance": ("neural_transmittance", {}),
+}
+"""What users can choose: name in the table → method and options. Networks are those of the field's file."""
+
+
+def baked(header, tensors, resolution: int = 192):
+    """A field as a render holds it: stands for a medium whose frame is the identity."""
+    network = NetworkField(header, tensors, mi)
+    grid = GridField(network, resolution, mi)
+    return SimpleNamespace(source=grid, field=SimpleNamespace(network=network, grid=grid))
+
+
+def seen_from(x: np.ndarray, light) -> tuple:
+    """``(wi, distance)`` of the light at the points `x` (n, 3). `light`: a position and True, a direction and False."""
+    where, is_point = np.asarray(light[0], np.float64), light[1]
+    d = where - x if is_point else np.broadcast_to(where, x.shape)
+    r = np.linalg.norm(d, axis=1)
+    return d / np.maximum(r, 1e-300)[:, None], r if is_point else np.full(len(x), np.inf)
+
+
+def transmittance(method: str, medium, light, x: np.ndarray) -> np.ndarray:
+    """τ (n,) of one light at the points `x`, field coordinates, by a method of METHODS with the renderer's defaults."""
+    name, options = METHODS[method]
+    table = LightTable([light[0]], np.ones((1, 3)), [light[1]], 1.0, mi)
+    found = visibility.build(name, medium, table, visibility.Options(2 / 384, **options))
+    wi, distance = seen_from(x, light)
+    active = dr.full(mi.Bool, True, len(x))
+    return np.array(found.tau(arrays(x), arrays(wi), mi.Float(distance), mi.UInt32(0), active), np.float64)
+
+
+def marched(grid, x: np.ndarray, light: np.ndarray, step: float = 1 / 1024) -> np.ndarray:
+    """τ (n,) from the points `x` towards the direction `light`, in float64: the voxels' ln σ, trilinear, every `step`
+    to the end of the unit sphere."""
+    log_sigma = np.array(grid._log_sigma.tensor(), np.float64)[..., 0]
+    n = len(log_sigma)
+    along = x @ light
+    length, depth = np.sqrt(np.maximum(along**2 - (x * x).sum(1) + 1, 0)) - along, np.zeros(len(x))
+    for k in range(int(2 / step)):
+        t = (k + 0.5) * step
+        p = x + t * light
+        sigma = np.exp(map_coordinates(log_sigma, ((p[:, ::-1] + 1) * n / 2 - 0.5).T, order=1, mode="nearest"))
+        depth += np.where((t < length) & (sigma > MIN_DENSITY), sigma, 0) * step
+    return np.exp(-depth)
