@@ -7,6 +7,7 @@ import mitsuba as mi
 
 from ..core.errors import MiNtfError
 from ..infer import march, shade
+from ..infer.visibility import outside
 from . import effects, environment, lights, visibility
 from .surfaces import Surfaces
 from .walk import Paths, Walk
@@ -64,7 +65,8 @@ class Known:
 
 def _tau(frame, method, p, d, length, index, active):
     """A field's transmittance between scene points."""
-    return method.tau(frame.point_to_field(p), frame.direction_to_field(d), length / frame.length, index, active)
+    x, wi = frame.point_to_field(p), frame.direction_to_field(d)
+    return outside.tau(method, x, wi, length / frame.length, index, active)
 
 
 class Composition:

@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.errors import MiNtfError
-from ..infer.visibility import METHODS
+from ..infer.visibility import METHODS, outside
 from . import environment, light_checks, lights, properties
 from .visibility import Options, build
 
@@ -100,7 +100,7 @@ def emitter_class() -> type:
             frame = self.medium.frame
             distance = mi.Float(dr.inf) if _is_far(self.inner) else ds.dist / frame.length
             x, d = frame.point_to_field(it.p), frame.direction_to_field(ds.d)
-            return self._method.tau(x, d, distance, mi.UInt32(0), active)
+            return outside.tau(self._method, x, d, distance, mi.UInt32(0), active)
 
         def attached(self):
             """The nested light; one with a surface shines from the shape that this emitter belongs to."""

@@ -12,6 +12,7 @@ from helpers.jit import arrays
 from mi_ntf.infer.grid import GridField
 from mi_ntf.infer.lights import LightTable
 from mi_ntf.infer.network import MIN_DENSITY, NetworkField
+from mi_ntf.infer.visibility import outside
 from mi_ntf.render import visibility
 
 SCENES = Path(__file__).parents[2] / "scenes"
@@ -60,7 +61,8 @@ def transmittance(method: str, medium, light, x: np.ndarray) -> np.ndarray:
     found = visibility.build(name, medium, table, visibility.Options(2 / 384, **options))
     wi, distance = seen_from(x, light)
     active = dr.full(mi.Bool, True, len(x))
-    return np.array(found.tau(arrays(x), arrays(wi), mi.Float(distance), mi.UInt32(0), active), np.float64)
+    tau = outside.tau(found, arrays(x), arrays(wi), mi.Float(distance), mi.UInt32(0), active)
+    return np.array(tau, np.float64)
 
 
 def marched(grid, x: np.ndarray, light: np.ndarray, step: float = 1 / 1024) -> np.ndarray:
