@@ -31,8 +31,7 @@ def reflect(points, lights, visibility, specular=True, gradients=False):
 
     def body(i, r, g, b):
         wi, irradiance, distance = lights.sample(i, points.x, True)
-        diffuse, gloss = _lobes(wi, points, bool(visibility), specular)
-        lit = diffuse > 0
+        lit, diffuse, gloss = _lobes(wi, points, bool(visibility), specular)
         tau = _tau(visibility, points.x, wi, distance, i, lit, gradients and not moving) if visibility else 1
         if moving and visibility:
             tau = tau * _edge(wi, points.normal)
@@ -71,16 +70,17 @@ def _tau(visibility, x, wi, distance, index, lit, fixed: bool):
 
 
 def _lobes(wi, points, skin: bool, specular: bool):
-    """The diffuse lobe, to be multiplied by the albedo, and the specular one (None without)."""
+    """Whether the light shines on the normal's side; the diffuse lobe, to be multiplied by the albedo, and the specular
+    one (None without), each with its weight, which may be 0."""
     if not specular:
         cos = dr.maximum(dot(points.normal, wi), 0)
         if skin:
             above = dot(points.normal, points.wo)
             cos = dr.select((cos > 0) & (above > 0), cos + above, 0)
-        return cos * microfacet.INV_PI, None
+        return cos > 0, cos * microfacet.INV_PI, None
     model = microfacet.scattering if skin else microfacet.lobes
     diffuse, gloss = model(ops, wi, points.wo, points.normal, points.roughness)
-    return (1 - points.specular) * diffuse, points.specular * gloss
+    return diffuse > 0, (1 - points.specular) * diffuse, points.specular * gloss
 
 
 class Points:

@@ -89,8 +89,8 @@ def crossings(profile: torch.Tensor, h: torch.Tensor, levels: torch.Tensor) -> t
 
 def density_from_log(raw: torch.Tensor) -> torch.Tensor:
     """σ = exp(raw), clipped as in the format. Gradients do not see the clip, so that no point is stuck beyond it."""
-    clipped = raw + (raw.clamp(MIN_LOG_DENSITY, MAX_LOG_DENSITY) - raw).detach()
-    return torch.exp(clipped)
+    # The difference of two like numbers is 0 for any size: what is added to the clipped value has its slope alone.
+    return torch.exp(raw.detach().clamp(MIN_LOG_DENSITY, MAX_LOG_DENSITY) + (raw - raw.detach()))
 
 
 def encode(encoding: Encoding, tensors: dict, name: str, x: torch.Tensor) -> torch.Tensor:
