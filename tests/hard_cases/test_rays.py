@@ -121,10 +121,10 @@ def test_light_ray(name, method, check):
 def test_camera_ray(name, check):
     o, d = (arrays([v]) for v in RAYS[name])
     grid = ball().source
-    strand = march.Strand(grid.density, grid, o, d)
+    strand = march.Strand(grid.density, grid, o, d, mi.Float(2 / 384))
     halves = [mi.Float(0.5), mi.Float(0.5)]
     for end in (np.inf, 2.5):
-        samples = march.camera_samples([strand], mi.Float(end), mi.Float(2 / 384), *halves)
+        samples = march.camera_samples([strand], mi.Float(end), *halves)
         truth = np.exp(-SIGMA * inside(*RAYS[name], end))
         check(name, "camera march", f"transmittance as far as {end}", np.array(samples.transmittance) - truth, 1e-5)
 

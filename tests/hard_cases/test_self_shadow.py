@@ -100,11 +100,12 @@ def shipped(name: str):
     view = np.array([-0.3, 0.25, 0.92]) / np.linalg.norm([-0.3, 0.25, 0.92])
     o = rng.uniform(-0.7, 0.7, (count, 3))
     o += (3 - o @ view)[:, None] * view
-    strand = march.Strand(medium.source.density, medium.source, arrays(o), arrays(np.tile(-view, (count, 1))))
+    d = arrays(np.tile(-view, (count, 1)))
+    strand = march.Strand(medium.source.density, medium.source, arrays(o), d, mi.Float(2 / 384))
     random = [mi.Float(rng.random(count)) for _ in range(2)]
-    samples = march.camera_samples([strand], mi.Float(np.full(count, 1e9)), mi.Float(2 / 384), *random)
+    samples = march.camera_samples([strand], mi.Float(np.full(count, 1e9)), *random)
     kept = rng.permutation(len(samples.ray))[:1200]
-    x = o[np.array(samples.ray)[kept]] - np.array(samples.t)[kept][:, None] * view
+    x = np.array(samples.place(0, samples.ray, samples.t)[0], np.float64).T[kept]
     normals = np.array(medium.source.reflectance(arrays(x))[0]).T
     lights = rng.normal(size=(4, 3))
     lights /= np.linalg.norm(lights, axis=1, keepdims=True) * np.sign(lights @ view)[:, None]
