@@ -22,8 +22,8 @@ def attach(table, rows: light_rows.Rows, discrete: list, frame: Frame) -> None:
     """Give the light table of `rows` the gradients of `discrete` (:class:`mi_ntf.render.lights.Discrete`), if they have
     any; `rows` are then all of theirs, dark ones included. `frame`: whose coordinates the table is in.
 
-    Environments are attached by the power of their cells, every texel of them, dark or bright. Cells and directions
-    stay as they are, and so does a ``sunsky``.
+    Environments are attached by the power of their cells, every texel of them, dark or bright; each shines from its
+    cell's centre. Cells and directions stay as they are, and so does a ``sunsky``.
     """
     if not attached([d.emitter for d in discrete]):
         return

