@@ -155,7 +155,18 @@ def _render(self, scene, sensor, seed: int, spp: int, develop: bool):
     if picture:
         picture.write_to(block)
     film.put_block(block)
-    return film.develop() if develop else mi.TensorXf()
+    if not develop:
+        return mi.TensorXf()
+    image = film.develop()
+    return image + _no_slope(scene) if composition.effects.gradients and not dr.grad_enabled(image) else image
+
+
+def _no_slope(scene):
+    """0, attached to every attached parameter of `scene`: of a picture in which none of them shows, derivatives are 0;
+    Dr.Jit would take a detached one for a mistake of the caller."""
+    attached = [value for _, value in mi.traverse(scene) if dr.grad_enabled(value)]
+    zero = dr.opaque(mi.Float, 0)  # a literal one would detach
+    return sum((zero * dr.sum(dr.ravel(getattr(value, "matrix", value))) for value in attached), zero)
 
 
 def _stop(pixels: Reconstruction, run: int, first: int, runs: int) -> None:
