@@ -104,7 +104,6 @@ def check_demo(folder: Path, ssim: float, rmse: float, to_march: float) -> None:
     measured = json.loads((folder / "metrics.json").read_text())
     assert [(m["light"], m["visibility"]) for m in measured] == [(a, b) for a in demo.LIGHTS for b in demo.VISIBILITIES]
     for m in measured:
-        print("DEMO", m)
         assert m["ssim"] > ssim and m["relative_rmse"] < rmse, m
         assert (m["relative_rmse_to_raymarch"] == 0) == (m["visibility"] == "raymarch")
         assert m["relative_rmse_to_raymarch"] < to_march

@@ -32,8 +32,8 @@ GROWTH = 1.05
 PER_KERNEL = 0.026
 """MiB that LLVM keeps for good of every kernel compiled, measured on kernels of twenty sines in Dr.Jit alone. Kernels
 that come from the disk leave nothing behind."""
-SLOW = 60.0
-"""Seconds that no scene may take; compilation is most of what they take."""
+SLOW = 150.0
+"""Seconds that no scene may take on a busy machine: several fields as networks among surfaces compile for a minute."""
 
 
 def render(what: random_scenes.Scene) -> np.ndarray:

@@ -74,7 +74,6 @@ def test_agrees_with_volpath(blobs, light, floor, lamp, depth):
     ours, theirs = renders(nrf(samples=1024, **options), 64), renders({"type": "volpath"}, 512)
     ztest.check([i[..., :3] for i in ours], [i[..., :3] for i in theirs], f"room {light} {depth}", block=4)
     ours, theirs = np.mean(ours, 0), np.mean(theirs, 0)
-    print("BLOCK", light, depth, ztest.block_difference(ours[..., :3], theirs[..., :3], 8, floor=0.3))
     assert depth != 2 or ztest.block_difference(ours[..., :3], theirs[..., :3], 8, floor=0.3).max() < 0.03
     np.testing.assert_allclose(ours.mean((0, 1)), theirs.mean((0, 1)), rtol=0.02)
 

@@ -101,8 +101,7 @@ def test_a_floor_in_the_shadow_equals_a_path_traced_field(blobs, kind, bsdf):
     ]
     ztest.check(images[0], images[1], f"ntf volpath {kind}", block=2)
     difference = ztest.block_difference(np.mean(images[0], 0), np.mean(images[1], 0), 8, floor=0.3)
-    print("NTFBLOCK", kind, difference)
-    assert difference.max() < 0.03
+    assert difference.max() < 0.03  # measured 0.016
     # The shadow is there to be compared.
     with pytest.raises(AssertionError, match="values pass"):
         ztest.check(images[2], images[1], "without ntf", block=2)
