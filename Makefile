@@ -2,7 +2,7 @@
 PYTHON ?= python3
 RUN := .venv/bin/python
 
-.PHONY: setup demo test clean
+.PHONY: setup demo test hard-cases clean
 
 setup:
 	@$(PYTHON) tools/setup_env.py
@@ -16,6 +16,11 @@ test:
 	@$(PYTHON) tools/setup_env.py dev
 	@$(RUN) -m ruff check .
 	@$(RUN) -m pytest -n 2 --dist loadfile -q -m "not slow and not gpu"
+
+# The whole catalogue of hard cases, as a table.
+hard-cases:
+	@$(PYTHON) tools/setup_env.py dev
+	@$(RUN) -m pytest -n 2 --dist loadfile -q tests/hard_cases --catalogue
 
 clean:
 	rm -rf .venv build dist out .pytest_cache .ruff_cache .mypy_cache .hypothesis

@@ -92,8 +92,8 @@ class Reconstruction:
         dr.eval(self.block.tensor())
 
     def _sums(self, pixel, width: int, first: int, last: int, position, values: list) -> list:
-        """Of the samples around the block's pixels `pixel`, each of `values` by the filter's weights. What rounding cuts
-        off a sum is added with the next sample (Kahan): 10⁶ samples would lose three of float32's digits."""
+        """Of the samples around the block's pixels `pixel`, each of `values` by the filter's weights. What rounding
+        takes off a sum is added with the next sample (Kahan): 10⁶ samples would lose five of float32's seven digits."""
         spp, columns, count = (dr.opaque(mi.UInt32, n) for n in (self.camera.spp, self.camera.width, last - first))
         begin = dr.opaque(mi.UInt32, first)
         y = pixel // dr.opaque(mi.UInt32, width)
