@@ -222,8 +222,9 @@ def frames(lights: LightTable, hull: np.ndarray, resolution: int) -> np.ndarray:
         v = np.cos(angle) * up - np.sin(angle) * side
         row = np.concatenate([u, v, *_window(u, v, hull, np.maximum(depth, NEAREST_DEPTH))], axis=1)
         size = row[:, 7] * row[:, 9]
-        best = np.where((size < area)[:, None], row, best)
-        area = np.minimum(area, size)
+        # By a clear margin: of rectangles alike, rounding would pick another one wherever the field stands.
+        smaller = size < (1 - 1e-6) * area
+        best, area = np.where(smaller[:, None], row, best), np.where(smaller, size, area)
     u, v, (u_middle, u_half, v_middle, v_half) = best[:, :3], best[:, 3:6], best[:, 6:].T
     widest = k * np.maximum(np.abs(u_middle) + u_half, np.abs(v_middle) + v_half)
     sphere = (depth.min(0) < NEAREST_DEPTH) | (widest > WIDEST)
