@@ -176,12 +176,21 @@ class Samples:
     first: object
     count: object
 
+    def line(self, i: int, ray):
+        """``(o, d)`` of the rays `ray` in the coordinates of field `i`."""
+        s = self.bundle.strands[i]
+        return tuple(tuple(dr.gather(type(c), c, ray) for c in v) for v in (s.o, s.d))
+
+    def along(self, i: int, line, t):
+        """The points at `t` of such a `line`."""
+        rate = self.bundle.strands[i].rate
+        t = t if rate is None else t * rate
+        return tuple(a + t * b for a, b in zip(*line, strict=True))
+
     def place(self, i: int, ray, t):
         """``(x, d)``: points at `t` of the rays `ray`, and the rays' directions, in the coordinates of field `i`."""
-        s = self.bundle.strands[i]
-        d = tuple(dr.gather(type(t), c, ray) for c in s.d)
-        along = t if s.rate is None else t * s.rate
-        return tuple(dr.gather(type(t), a, ray) + along * b for a, b in zip(s.o, d, strict=True)), d
+        line = self.line(i, ray)
+        return self.along(i, line, t), line[1]
 
     def totals(self, values: list, gradients: bool = False) -> list:
         """Σ over each ray's points of each of `values`, per ray: in one order, unlike atomic sums. `gradients`: the

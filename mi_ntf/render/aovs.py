@@ -63,6 +63,12 @@ def _channels(name: str, lights: int) -> tuple[str, ...]:
     return tuple(f"{i}.Y" for i in range(lights)) if name == "visibility_lights" else CHANNELS[name]
 
 
+def _tau(shadow, table, x, light, active):
+    """τ from field points `x` to light `light` of the table."""
+    wi, _, distance = table.sample(light, x, True)
+    return shadow.tau(x, wi, distance, light, active) if shadow else mi.Float(1)
+
+
 class Sums:
     """Σ w v and Σ w of `rays` camera rays, for the `wanted` names and `lights` lights in all.
 
@@ -75,27 +81,31 @@ class Sums:
         self.sums = {n: [dr.zeros(mi.Float, rays) for _ in _channels(n, lights)]
                      for n in wanted if n not in ("opacity", "visibility_lights")}
         self.layers = dr.zeros(mi.Float, rays * lights) if "visibility_lights" in wanted else None
-        self.opacity, self.stopped, self.stopped_by_fields = (dr.zeros(mi.Float, rays) for _ in range(3))
+        self.opacity = dr.zeros(mi.Float, rays)
+        self.stopped = [dr.zeros(mi.Float, rays) for _ in range(2)]  # by anything, by fields
 
     @property
     def needs_points(self) -> bool:
         """Whether there is more to know than what :meth:`add_opacity` is told."""
         return any(name != "opacity" for name in self.wanted)
 
-    def add_field(self, frame, points, index, t, weight, table, shadow) -> None:
-        """Shading `points` (field coordinates of `frame`) of rays `index`, `t` scene units from their origins.
-        `table`: the lights of this run, `shadow`: their visibility method, None: nothing is dimmed."""
-        if any(name in self.wanted for name in OF_LIGHTS):
-            tau = self._visibility(points, index, weight, table, shadow)
-            if "visibility" in self.sums:
-                self._add(self.sums["visibility"], [tau], index, weight)
-        if self.later:
-            return
-        values = {"depth": lambda: [t], "normal": lambda: frame.direction_to_world(points.normal),
-                  "albedo": lambda: points.albedo, "roughness": lambda: [points.roughness]}
-        for name in values.keys() & self.sums.keys():
-            self._add(self.sums[name], values[name](), index, weight)
-        self._add([self.stopped, self.stopped_by_fields], [1, 1], index, weight)
+    def add_field(self, i: int, part, points, samples, kept, distance, shadow) -> None:
+        """What the camera's samples are in the field `part`, strand `i`.
+
+        `points`: those of the `samples` that lie in this field, in order; `kept`: which these are, None: all of them;
+        `distance`: theirs from the rays' origins, scene units. `shadow`: visibility method of the run's lights, None
+        where nothing is dimmed; lights at the camera share the view's transmittance."""
+        values = []
+        if self.layers is not None:
+            self._add_layers(i, part.table, samples, shadow)
+        elif "visibility" in self.sums:
+            values.append((self.sums["visibility"], [self._visibility(points, part.table, samples, kept, shadow)]))
+        if not self.later:
+            of_points = {"depth": lambda: [distance], "normal": lambda: part.frame.direction_to_world(points.normal),
+                         "albedo": lambda: points.albedo, "roughness": lambda: [points.roughness]}
+            values += [(self.sums[name], list(of_points[name]())) for name in of_points if name in self.sums]
+            values.append((self.stopped, [mi.Float(1)] * 2))
+        self._add(values, samples, samples.weights[i], kept)
 
     def add_opacity(self, opacity) -> None:
         """Share of each ray that ends on something."""
@@ -111,46 +121,95 @@ class Sums:
         weight = dr.select(hit, transmittance, 0)
         values = {"depth": lambda: [si.t], "normal": lambda: si.sh_frame.n,
                   "albedo": lambda: si.bsdf().eval_diffuse_reflectance(si, hit)}
-        for name in values.keys() & self.sums.keys():
+        for name in (n for n in values if n in self.sums):
             self.sums[name] = [total + dr.select(hit, value, 0) * weight
                                for total, value in zip(self.sums[name], values[name](), strict=True)]
-        self.stopped = self.stopped + weight
+        self.stopped[0] = self.stopped[0] + weight
 
-    def _add(self, sums, values, index, weight) -> None:
-        for total, value in zip(sums, values, strict=True):
-            dr.scatter_reduce(dr.ReduceOp.Add, total, weight * value, index)
+    def _add(self, pairs, samples, weight, kept) -> None:
+        """Add to each sum of the `pairs` its values at the samples `kept`, times their weight."""
+        if kept is not None:
+            weight = dr.gather(mi.Float, weight, kept)
+        spread = []
+        for value in (v for _, values in pairs for v in values):
+            value = value * weight
+            if kept is not None:
+                whole = dr.zeros(mi.Float, dr.width(samples.t))
+                dr.scatter(whole, value, kept)
+                value = whole
+            spread.append(value)
+        dr.eval(spread)
+        totals = iter(samples.totals(spread, dr.grad_enabled(spread)))
+        for sums, _ in pairs:
+            sums[:] = [total + next(totals) for total in sums]
 
-    def _visibility(self, points, index, weight, table, shadow):
-        """Σ of the table's lights of τ at `points`, over the number of all; each one's, times `weight`, goes to its
-        layer."""
-        everything, count, first = (dr.opaque(mi.UInt32, n) for n in (self.lights, table.count, self.first))
+    def _visibility(self, points, table, samples, kept, shadow):
+        """Σ of the table's lights of τ at `points`, over the number of all."""
+        count = dr.opaque(mi.UInt32, table.count)
+        if samples.view is not None:
+            view = samples.view if kept is None else dr.gather(mi.Float, samples.view, kept)
+            return view * (mi.Float(count) / dr.opaque(mi.Float, self.lights))
 
         def body(i, total):
-            wi, _, distance = table.sample(i, points.x, True)
-            tau = shadow.tau(points.x, wi, distance, i, mi.Bool(True)) if shadow else mi.Float(1)
-            if self.layers is not None:
-                dr.scatter_reduce(dr.ReduceOp.Add, self.layers, weight * tau, index * everything + first + i)
-            return i + 1, total + tau
+            return i + 1, total + _tau(shadow, table, points.x, i, mi.Bool(True))
 
         n = dr.width(points.x[0])
-        state = (dr.zeros(mi.UInt32, n), dr.zeros(mi.Float, n))
-        _, total = dr.while_loop(state=state, cond=lambda i, total: i < count, body=body, label="visibility")
-        return total / mi.Float(everything)
+        _, total = dr.while_loop(
+            state=(dr.zeros(mi.UInt32, n), dr.zeros(mi.Float, n)), cond=lambda i, total: i < count, body=body,
+            label="visibility",
+        )  # fmt: skip
+        return total / dr.opaque(mi.Float, self.lights)
+
+    def _add_layers(self, strand: int, table, samples, shadow) -> None:
+        """Add Σ w τ of strand `strand` to each light's layer: a lane for each ray and light of the run."""
+        everything, first = (dr.opaque(mi.UInt32, n) for n in (self.lights, self.first))
+        lane = dr.arange(mi.UInt32, self.rays * table.count)
+        ray = lane // dr.opaque(mi.UInt32, table.count)
+        light = lane - ray * dr.opaque(mi.UInt32, table.count)
+        begin, count = (dr.gather(mi.UInt32, a, ray) for a in (samples.first, samples.count))
+        line = samples.line(strand, ray)
+
+        def body(k, total):
+            sample = begin + k
+            weight = dr.gather(mi.Float, samples.weights[strand], sample)
+            if samples.view is None:
+                x = samples.along(strand, line, dr.gather(mi.Float, samples.t, sample))
+                tau = _tau(shadow, table, x, light, weight > 0)
+            else:
+                tau = dr.gather(mi.Float, samples.view, sample)
+            return k + 1, total + dr.select(weight > 0, weight * tau, 0)
+
+        _, total = dr.while_loop(
+            state=(dr.zeros(mi.UInt32, dr.width(lane)), dr.zeros(mi.Float, dr.width(lane))),
+            cond=lambda k, total: k < count, body=body, label="visibility of each light",
+        )  # fmt: skip
+        dr.scatter_reduce(dr.ReduceOp.Add, self.layers, total, ray * everything + first + light,
+                          mode=dr.ReduceMode.NoConflicts)  # fmt: skip
+
+    def _mean_of_layers(self, layers: list):
+        total = layers[0]
+        for layer in layers[1:]:
+            total = total + layer
+        return total / dr.opaque(mi.Float, self.lights)
 
     def values(self) -> list:
         """Σ w v of every channel, in the order of :func:`channel_names`, then Σ w of all and Σ w of fields."""
         ray = dr.arange(mi.UInt32, self.rays)
         count = dr.opaque(mi.UInt32, self.lights)
-        found = []
+        found, layers = [], []
+        if self.layers is not None:
+            layers = [dr.gather(mi.Float, self.layers, ray * count + dr.opaque(mi.UInt32, i))
+                      for i in range(self.lights)]  # fmt: skip
         for name in self.wanted:
             if name == "opacity":
                 found.append(self.opacity)
             elif name == "visibility_lights":
-                found += [dr.gather(mi.Float, self.layers, ray * count + dr.opaque(mi.UInt32, i))
-                          for i in range(self.lights)]
+                found += layers
+            elif name == "visibility" and layers:
+                found.append(self._mean_of_layers(layers))
             else:
                 found += self.sums[name]
-        return [*found, self.stopped, self.stopped_by_fields]
+        return [*found, *self.stopped]
 
 
 class Picture:

@@ -241,9 +241,8 @@ class Composition:
         points = shade.Points(x, tuple(-c for c in along), part.source.reflectance(x))
         points.evaluate()
         if sums:
-            shadow = Known(view) if view is not None else self._shadow(part, "mapped")
             distance = (dr.gather(mi.Float, samples.bundle.base, index) + t) * unit
-            sums.add_field(part.frame, points, index, distance, weight, part.table, shadow)
+            sums.add_field(i, part, points, samples, kept, distance, self._shadow(part, "mapped"))
         if self.effects.lit:
             for channel, value in zip(light, self.reflect(part, points, stream, view), strict=True):
                 where = dr.arange(mi.UInt32, dr.width(t)) if kept is None else kept
