@@ -302,7 +302,7 @@ def _walk(bundle, offset, depth, emit, state):
         sample = begin - dr.log(1 - lost) * rate, *shares, transmittance * (1 - lost)
         state = emit(active & bundle.counts(shares, step), sample, state)
         transmittance = dr.select(active, transmittance - w, transmittance)
-        t = t + _onward(skip, step)
+        t = t + onward(skip, step)
         active = active & (t < bundle.end) & (transmittance > MIN_TRANSMITTANCE)
         return t, transmittance, state, active
 
@@ -315,7 +315,7 @@ def _walk(bundle, offset, depth, emit, state):
     return dr.select(transmittance > MIN_TRANSMITTANCE, transmittance, 0), state
 
 
-def _onward(skip, step):
+def onward(skip, step):
     """From one cell to the next, or beyond all whose middles are as `skip` says clear: whole cells, so that skipping
     changes no other cell."""
     return dr.select(skip > 0, step * (dr.floor(skip / step) + 1), step)
@@ -343,7 +343,7 @@ def free_flight(strands, maxt, offset, depth, which):
         for sigma_i in sigmas[:-1]:
             rest = rest - sigma_i
             index = dr.select(hit & (rest >= 0), index + 1, index)
-        t = t + _onward(skip, step)
+        t = t + onward(skip, step)
         active = active & ~hit & (t < bundle.end)
         return t, after, end, index, active
 

@@ -136,11 +136,10 @@ def test_rigid_motion_and_scale(name, balls, seed):
         back = np.array(frame.point_to_field(mi.Point3f(*np.ascontiguousarray(p.T))), np.float64).T.reshape(x.shape)
         taus.append(rf.look(rf.build(name, balls.medium(), moved), moved, back))
     error = np.abs(taus[0] - taus[1])
-    worst(f"motion {name}", np.quantile(error, 0.99), 1e-4)
-    # Scene points of float32, four units off, are 3e-7 apart; skins of σ = 665 turn that into 4e-4. Measured 1.4e-3.
-    # What a network reads of a ray jumps where the ray's depth passes a level.
-    single = np.quantile(error, 0.998) if "net" in name or "neural" in name else error.max()
-    worst(f"motion, single rays {name}", single, 2e-3)
+    # All but one ray in a thousand: marches jump where a ray passes an edge of the occupancy grid, networks where its
+    # depth passes a level. Measured over a hundred batches: 2e-5, and 4e-3 for the worst of 200 000 rays.
+    worst(f"motion {name}", np.quantile(error, 0.999), 1e-4)
+    worst(f"motion, single rays {name}", error.max(), 8e-3)
 
 
 def _placement(rng) -> Frame:
