@@ -17,8 +17,14 @@ EXPLAINED = {
 }
 
 
-def compare(image: Path, reference: Path) -> dict[str, float]:
-    """The metrics of :mod:`.metrics` by name, both images composited on black.
+VARIANTS = {"aligned": "aligned", "masked": "object", "masked_aligned": "object, aligned"}
+"""Beside the raw figures: name and title."""
+INSIDE = 0.5
+"""Pixels of the reference with more alpha than this are the object."""
+
+
+def compare(image: Path, reference: Path) -> dict:
+    """The metrics of :mod:`.metrics` by name, both images composited on black; see :func:`compare_arrays`.
 
     EXR is read as linear and premultiplied, its AOV layers are dropped; PNG as sRGB with straight alpha. Raises
     :class:`MiNtfError` where a file is missing or unreadable, sizes differ, or a pixel is not finite.
@@ -26,12 +32,32 @@ def compare(image: Path, reference: Path) -> dict[str, float]:
     a, b = read_image(image), read_image(reference)
     if a.shape != b.shape:
         raise MiNtfError(f"{image} has {_size(a)} pixels, {reference} has {_size(b)}; render both at one size")
-    return compare_arrays(a[..., :3], b[..., :3])
+    return compare_arrays(a[..., :3], b[..., :3], b[..., 3])
 
 
-def compare_arrays(image: np.ndarray, reference: np.ndarray) -> dict[str, float]:
-    """:func:`compare` for linear RGB arrays (h, w, 3), composited on black."""
-    return {name: getattr(metrics, name)(image, reference) for name in EXPLAINED}
+def compare_arrays(image: np.ndarray, reference: np.ndarray, alpha: np.ndarray | None = None) -> dict:
+    """:func:`compare` for linear RGB arrays (h, w, 3), composited on black, and the reference's alpha (h, w).
+
+    The raw figures by their names. Below ``aligned`` the same after one factor a channel, which stand there as
+    ``factors``: published comparisons of relit objects take out the scale of the albedo that way. Below ``masked`` and
+    ``masked_aligned`` those of the object's own pixels, a share ``coverage`` of the picture, where `alpha` tells the
+    object from a background.
+    """
+    result = _figures(image, reference, None) | {"aligned": _aligned(image, reference, None)}
+    inside = None if alpha is None else alpha > INSIDE
+    if inside is not None and 0 < inside.sum() < inside.size:
+        result["masked"] = _figures(image, reference, inside) | {"coverage": float(inside.mean())}
+        result["masked_aligned"] = _aligned(image, reference, inside)
+    return result
+
+
+def _figures(image, reference, mask) -> dict:
+    return {name: getattr(metrics, name)(image, reference, mask) for name in EXPLAINED}
+
+
+def _aligned(image, reference, mask) -> dict:
+    factors = metrics.alignment(image, reference, mask)
+    return _figures(image * factors, reference, mask) | {"factors": [float(f) for f in factors]}
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -53,16 +79,22 @@ def read_image(path: Path) -> np.ndarray:
     return pixels
 
 
-def print_table(result: dict[str, float]) -> None:
+def print_table(result: dict) -> None:
     """Print what :func:`compare` returned, with each metric's definition."""
     from rich.console import Console
     from rich.table import Table
 
-    table = Table("metric", "value", "on")
-    for name, value in result.items():
-        title, definition = EXPLAINED[name]
-        table.add_row(title, f"{value:.4g}", definition)
-    Console().print(table)
+    variants = {title: result[name] for name, title in VARIANTS.items() if name in result}
+    table = Table("metric", "raw", *variants, "on")
+    for name, (title, definition) in EXPLAINED.items():
+        table.add_row(title, *(f"{figures[name]:.4g}" for figures in (result, *variants.values())), definition)
+    console = Console()
+    console.print(table)
+    for title, figures in variants.items():
+        if "factors" in figures:
+            console.print(f"{title}: red, green, blue times " + ", ".join(f"{f:.4f}" for f in figures["factors"]))
+        if "coverage" in figures:
+            console.print(f"{title}: {figures['coverage']:.1%} of the pixels, alpha above {INSIDE:g} in the reference")
 
 
 def _size(pixels: np.ndarray) -> str:

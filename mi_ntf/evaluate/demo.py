@@ -42,7 +42,7 @@ class Shot:
     def measure(self, reference: np.ndarray, marched: np.ndarray) -> dict:
         """JSON of this shot: :func:`.compare.compare_arrays` to the path-traced meshes, relative RMSE to `raymarch`."""
         return {"light": self.light, "visibility": self.visibility, "seconds": round(self.seconds, 2),
-                **compare_arrays(self.image[..., :3], reference[..., :3]),
+                **compare_arrays(self.image[..., :3], reference[..., :3], reference[..., 3]),
                 "relative_rmse_to_raymarch": relative_rmse(self.image[..., :3], marched[..., :3])}
 
 

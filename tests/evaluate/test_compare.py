@@ -8,7 +8,7 @@ from skimage import io
 
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.evaluate import metrics
-from mi_ntf.evaluate.compare import EXPLAINED, compare, print_table, read_image
+from mi_ntf.evaluate.compare import EXPLAINED, compare, compare_arrays, print_table, read_image
 
 
 @pytest.fixture
@@ -32,7 +32,7 @@ def test_exr_round_trip_and_comparison(tmp_path, rgba):
     np.testing.assert_array_equal(read_image(tmp_path / "a.exr"), rgba)
     write_exr(tmp_path / "b.exr", rgba[..., :3] * 1.1)
     result = compare(tmp_path / "b.exr", tmp_path / "a.exr")
-    assert list(result) == list(EXPLAINED)
+    assert list(result)[: len(EXPLAINED)] == list(EXPLAINED)
     assert result["relative_rmse"] == pytest.approx(0.1, rel=1e-5)
     assert result["max_abs"] == pytest.approx(0.1 * rgba[..., :3].max(), rel=1e-5)
     assert result["psnr"] == pytest.approx(metrics.psnr(rgba[..., :3] * 1.1, rgba[..., :3]), rel=1e-5)
@@ -91,7 +91,43 @@ def test_errors_name_the_fault(tmp_path, rgba):
         read_image(tmp_path / "depth.exr")
 
 
+def test_aligned_and_masked_figures(rng):
+    """An object of wrong albedo over a background that is wrong in its own way."""
+    truth = rng.uniform(0.1, 1, (24, 24, 3))
+    alpha = np.zeros((24, 24))
+    alpha[6:18, 4:20] = 1
+    inside = alpha > 0
+    truth[~inside] *= 0.2
+    image = truth * np.array([1.25, 0.8, 2.0])
+    result = compare_arrays(image, truth, alpha)
+    assert result["aligned"]["factors"] == pytest.approx([0.8, 1.25, 0.5])
+    assert result["aligned"]["relative_rmse"] < 1e-12 and result["aligned"]["ssim"] == pytest.approx(1)
+    assert result["masked"]["coverage"] == pytest.approx(12 * 16 / 24**2)
+    image[~inside] = rng.uniform(0, 5, (24 * 24 - 12 * 16, 3))
+    result = compare_arrays(image, truth, alpha)
+    assert result["masked_aligned"]["factors"] == pytest.approx([0.8, 1.25, 0.5])
+    assert result["masked_aligned"]["relative_rmse"] < 1e-12 < 0.1 < result["aligned"]["relative_rmse"]
+    expected = np.sqrt(((image - truth)[inside] ** 2).mean() / (truth[inside] ** 2).mean())
+    assert result["masked"]["relative_rmse"] == pytest.approx(expected)
+    assert result["masked"]["max_abs"] == pytest.approx(np.abs(image - truth)[inside].max())
+    errors = metrics.srgb(image) - metrics.srgb(truth)
+    assert result["masked"]["psnr"] == pytest.approx(-10 * np.log10((errors[inside] ** 2).mean()))
+
+
+@pytest.mark.parametrize("alpha", [None, np.ones((16, 16)), np.zeros((16, 16))], ids=["none", "full", "empty"])
+def test_no_mask_where_alpha_tells_nothing(alpha, rng):
+    truth = rng.uniform(size=(16, 16, 3))
+    assert "masked" not in compare_arrays(truth, truth, alpha)
+
+
+def test_black_channels_stay_black(rng):
+    truth = rng.uniform(size=(16, 16, 3)) * [1, 0, 1]
+    assert compare_arrays(truth / 2, truth)["aligned"]["factors"] == pytest.approx([2, 1, 2])
+
+
 def test_table_shows_every_metric(capsys):
-    print_table(dict.fromkeys(EXPLAINED, 0.125))
+    figures = dict.fromkeys(EXPLAINED, 0.125)
+    print_table(figures | {"aligned": figures | {"factors": [0.5, 1.0, 2.0]}, "masked": figures | {"coverage": 0.25}})
     text = capsys.readouterr().out
-    assert text.count("0.125") == len(EXPLAINED) and "HDR-FLIP" in text
+    assert text.count("0.125") == 3 * len(EXPLAINED) and "HDR-FLIP" in text
+    assert "aligned: red, green, blue times 0.5000, 1.0000, 2.0000" in text and "object: 25.0%" in text

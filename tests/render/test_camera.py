@@ -55,7 +55,7 @@ def test_reconstruction_equals_the_films_own(blobs, rfilter, border, monkeypatch
 @pytest.mark.parametrize(
     "options",
     [{}, {"visibility": "transmittance_map"}, {"max_depth": 4}, {"light_samples": 2}, {"aovs": "depth,visibility"},
-     {"aovs": "normal,visibility,visibility_lights"}],  # fmt: skip
+     {"aovs": "normal,visibility,visibility_lights"}],
     ids=str,
 )
 def test_one_seed_one_image(blobs, rfilter, options):
