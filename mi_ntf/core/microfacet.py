@@ -45,21 +45,42 @@ def lobes(ops, wi, wo, n, roughness):
     return cos_i * INV_PI, gloss * cos_i
 
 
-def scattering(ops, wi, wo, n, roughness):
-    """The two lobes of the field's phase function f = ρ (⟨n,ω_i⟩ + ⟨n,ω_o⟩), 0 unless both cosines are positive; as
-    :func:`lobes`.
+def scattering(ops, wi, wo, n, roughness, softness=0.0):
+    """The two lobes of the field's phase function f = ρ (c_i + c_o) min(⟨n,ω_i⟩/c_i, ⟨n,ω_o⟩/c_o), 0 unless both
+    cosines are positive; as :func:`lobes`.
 
-    Why the sum: a half space of any density profile that scatters once with f returns f ⟨n,ω_i⟩/(⟨n,ω_i⟩ + ⟨n,ω_o⟩)
-    (Lommel and Seeliger; Chandrasekhar 1960, section 6), because the light too is dimmed on its way through the skin to
-    the scattering point. With this f that is ρ ⟨n,ω_i⟩: an opaque field looks like the surface, from all sides and
-    under all lights. With the paper's ρ ⟨n,ω_i⟩ alone it would lose half of the light and fade towards grazing light. f
-    is reciprocal over the whole sphere, as a phase function has to be. Nothing goes to below the horizon: such light
-    would scatter again in the skin that it has just left, and every further bounce would add energy that the surface
-    does not have.
+    c = (⟨n,ω⟩ + √(⟨n,ω⟩² + `softness` (1 − ⟨n,ω⟩²)))/2 is ⟨n,ω⟩ in a flat skin, of softness 0, and more at grazing
+    angles of a curved one (:mod:`mi_ntf.core.skin`): the optical depth to the outside is that along the normal over c.
+
+    Why the sum: a half space of any density profile that scatters once with f returns f c_i/(c_i + c_o) (Lommel and
+    Seeliger; Chandrasekhar 1960, section 6), because the light too is dimmed on its way through the skin to the
+    scattering point. With this f that is ρ ⟨n,ω_i⟩: an opaque field looks like the surface, from all sides and under
+    all lights. With the paper's ρ ⟨n,ω_i⟩ alone it would lose half of the light and fade towards grazing light.
+
+    Why the lesser: c_i ρ ⟨n,ω_o⟩/c_o where light falls in more steeply than the viewer looks. A curved skin is wider
+    than the surface where it is seen at grazing angles, so what it sends there has to be less, if f is to be reciprocal
+    over the whole sphere, as a phase function has to be. A white field never sends out more than comes in; with
+    ⟨n,ω_i⟩ + ⟨n,ω_o⟩ a white sphere whose skin is 1/25 of its radius thick shines 1.08 in a white furnace. Light and
+    viewer in one direction see ρ ⟨n,ω⟩ exactly.
+
+    Nothing goes to below the horizon: such light would scatter again in the skin that it has just left, and every
+    further bounce would add energy that the surface does not have.
     """
     cos_i, cos_o, gloss = _cosines(ops, wi, wo, n, roughness)
-    both = ops.where(ops.minimum(cos_i, cos_o) > 0, cos_i + cos_o, 0.0 * cos_i)
+    both = joint_cosine(ops, cos_i, cos_o, softness)
     return both * INV_PI, gloss * both
+
+
+def joint_cosine(ops, cos_i, cos_o, softness):
+    """(c_i + c_o) min(⟨n,ω_i⟩/c_i, ⟨n,ω_o⟩/c_o), see :func:`scattering`; 0 unless both cosines are positive."""
+    c_i, c_o = (soft_cosine(ops, c, softness) for c in (cos_i, cos_o))
+    share = ops.minimum(cos_i / c_i, cos_o / c_o)
+    return ops.where(share > 0, (c_i + c_o) * share, 0.0 * share)
+
+
+def soft_cosine(ops, cos, softness):
+    """c of :func:`scattering` for ⟨n,ω⟩ = `cos` ≥ 0."""
+    return (cos + ops.sqrt(cos * cos + softness * (1 - cos * cos) + 1e-30)) / 2
 
 
 def _cosines(ops, wi, wo, n, roughness):

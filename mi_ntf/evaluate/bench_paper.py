@@ -135,7 +135,7 @@ def camera_cost(sensor, medium, paper: PaperField, sizes: Sizes):
     def view():
         found = march.camera_samples([strand], far, middle, middle)
         x, along = found.place(0, found.ray, found.t)
-        p = shade.Points(x, tuple(-c for c in along), paper.reflectance(x))
+        p = shade.Points(x, tuple(-c for c in along), (*paper.reflectance(x), medium.field.softness(x)))
         last[:] = [p]
         return [*p.x, *p.wo, *p.normal, *p.albedo, p.roughness, p.specular]
 

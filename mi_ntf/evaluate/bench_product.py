@@ -94,7 +94,7 @@ def _inside(medium, count: int) -> shade.Points:
     low, high = medium.field.grid.bounds
     x = _floats(low + np.random.default_rng(0).uniform(size=(count, 3)) * (high - low))
     wo = tuple(dr.full(mi.Float, c, count) for c in (0.0, 0.6, 0.8))
-    points = shade.Points(x, wo, medium.field.grid.reflectance(x))
+    points = shade.Points(x, wo, medium.reflectance(x))
     points.evaluate()
     return points
 

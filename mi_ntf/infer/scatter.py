@@ -1,7 +1,7 @@
 """Importance sampling of the field's phase function: directions to the light, given the viewer (field coordinates).
 
 Three densities over the side that the normal faces, with c = ⟨n,ω_o⟩⁺: cosine and uniform, which together follow the
-diffuse lobe ∝ ⟨n,ω_i⟩ + c exactly, and the GGX half vector (Walter et al. 2007, eqs. 35, 36).
+diffuse lobe of a flat skin, ∝ ⟨n,ω_i⟩ + c, exactly, and the GGX half vector (Walter et al. 2007, eqs. 35, 36).
 """
 
 import drjit as dr
@@ -12,10 +12,10 @@ from . import ops
 
 
 def evaluate(wi, wo, reflectance):
-    """``(value, pdf)`` of light from `wi` scattered to `wo`: the phase function ρ (⟨n,ω_i⟩ + ⟨n,ω_o⟩) (3-tuple, 1/sr)
+    """``(value, pdf)`` of light from `wi` scattered to `wo`: the phase function (3-tuple, 1/sr)
     and the density of :func:`sample`, both 0 for a viewer below the horizon."""
-    normal, albedo, roughness, specular = reflectance
-    diffuse, gloss = microfacet.scattering(ops, wi, wo, normal, roughness)
+    normal, albedo, roughness, specular, softness = reflectance
+    diffuse, gloss = microfacet.scattering(ops, wi, wo, normal, roughness, softness)
     value = tuple((1 - specular) * k * diffuse + specular * gloss for k in albedo)
     half = normalize(ops, tuple(a + b for a, b in zip(wi, wo, strict=True)))
     cos_h = dr.maximum(dot(normal, half), 0)
@@ -23,7 +23,8 @@ def evaluate(wi, wo, reflectance):
     jacobian = dr.rcp(4 * dr.maximum(dot(wo, half), 1e-6))
     pdf_gloss = microfacet.ggx(dot(across, across), roughness * roughness) * cos_h * jacobian
     share, above = _gloss_share(wo, reflectance)
-    pdf = (1 - share) * diffuse / (1 + 2 * above) + share * pdf_gloss
+    flat = (dot(normal, wi) + above) * microfacet.INV_PI
+    pdf = (1 - share) * flat / (1 + 2 * above) + share * pdf_gloss
     # Half vectors can mirror to below the surface. Nothing comes from there: such samples are void.
     return value, dr.select(diffuse > 0, pdf, 0)
 
@@ -31,7 +32,7 @@ def evaluate(wi, wo, reflectance):
 def sample(wo, reflectance, u1, u2):
     """A direction to the light. `u1`: scalar, `u2`: pair, uniform in [0, 1). Returns the unit 3-tuple `wi`; its density
     is :func:`evaluate`'s."""
-    normal, _, roughness, _ = reflectance
+    normal, _, roughness, _, _ = reflectance
     share, above = _gloss_share(wo, reflectance)
     gloss = u1 < share
     uniform = (u1 - share) * (1 + 2 * above) > 1 - share
@@ -50,7 +51,7 @@ def sample(wo, reflectance, u1, u2):
 def _gloss_share(wo, reflectance):
     """Probability of the specular lobe, its share of the albedo within [0.1, 0.9] (0 seen from behind), and
     ⟨n,ω_o⟩⁺."""
-    normal, albedo, _, specular = reflectance
+    normal, albedo, _, specular, _ = reflectance
     above = dr.maximum(dot(normal, wo), 0)
     diffuse = (1 - specular) * (albedo[0] + albedo[1] + albedo[2]) / 3
     share = dr.clip(specular / dr.maximum(specular + diffuse, 1e-6), 0.1, 0.9)

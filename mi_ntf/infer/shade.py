@@ -75,11 +75,12 @@ def _lobes(wi, points, skin: bool, specular: bool):
     if not specular:
         cos = dr.maximum(dot(points.normal, wi), 0)
         if skin:
-            above = dot(points.normal, points.wo)
-            cos = dr.select((cos > 0) & (above > 0), cos + above, 0)
+            cos = microfacet.joint_cosine(ops, cos, dr.maximum(dot(points.normal, points.wo), 0), points.softness)
         return cos > 0, cos * microfacet.INV_PI, None
-    model = microfacet.scattering if skin else microfacet.lobes
-    diffuse, gloss = model(ops, wi, points.wo, points.normal, points.roughness)
+    direction = wi, points.wo, points.normal, points.roughness
+    diffuse, gloss = (
+        microfacet.scattering(ops, *direction, points.softness) if skin else microfacet.lobes(ops, *direction)
+    )
     return diffuse > 0, (1 - points.specular) * diffuse, points.specular * gloss
 
 
@@ -88,8 +89,13 @@ class Points:
 
     def __init__(self, x, wo, reflectance):
         self.x, self.wo = x, wo
-        self.normal, self.albedo, self.roughness, self.specular = reflectance
+        self.normal, self.albedo, self.roughness, self.specular, self.softness = reflectance
+
+    @property
+    def reflectance(self) -> tuple:
+        """``(normal, albedo, roughness, specular, softness)``."""
+        return self.normal, self.albedo, self.roughness, self.specular, self.softness
 
     def evaluate(self) -> None:
         """Compute them now: what follows loops over lights."""
-        dr.eval(self.x, self.wo, self.normal, self.albedo, self.roughness, self.specular)
+        dr.eval(self.x, self.wo, self.normal, self.albedo, self.roughness, self.specular, self.softness)

@@ -34,11 +34,12 @@ def calibrate(medium) -> cost.Constants:
         ("transmittance_volume", few, small), ("neural_transmittance", few, options))}
     if medium.field.header.architecture.visibility is not None:
         methods["visibility_mlp"] = visibility.build("visibility_mlp", medium, few, options), few
-    points = _points(grid)
+    points = _points(medium)
     work = {name: (lambda pair=pair: _tau(*pair, points.x)) for name, pair in methods.items()}
     work |= {"map": lambda: visibility.build("transmittance_map", medium, few, options).values,
              "volume": lambda: visibility.build("transmittance_volume", medium, few, small).values,
-             "camera": lambda: _camera(grid).t, "reflect": lambda: _flat(grid.reflectance(points.x)),
+             "camera": lambda: _camera(grid).t,
+             "reflect": lambda: [*_flat(grid.reflectance(points.x)), medium.field.softness(points.x)],
              "shade": lambda: shade.reflect(points, many, None), "density": lambda: network.density(points.x)}
     found = seconds(work, 5, min)  # the machine's own prices: other work only adds to them
     pairs = {name: WIDTH * pair[1].count for name, pair in methods.items()}
@@ -85,14 +86,15 @@ def _timed(run: Callable[[], Any]) -> float:
     return time.perf_counter() - start
 
 
-def _points(grid) -> shade.Points:
+def _points(medium) -> shade.Points:
     """Where random camera rays meet the field, WIDTH points."""
+    grid = medium.field.grid
     found = _camera(grid)
     lane = dr.arange(mi.UInt32, WIDTH) % dr.opaque(mi.UInt32, max(dr.width(found.t), 1))
     ray, t = dr.gather(mi.UInt32, found.ray, lane), dr.gather(mi.Float, found.t, lane)
     x, along = found.place(0, ray, t)
-    points = shade.Points(x, tuple(-c for c in along), grid.reflectance(x))
-    dr.eval(points.x, points.wo, points.normal, points.albedo, points.roughness, points.specular)
+    points = shade.Points(x, tuple(-c for c in along), (*grid.reflectance(x), medium.field.softness(x)))
+    points.evaluate()
     return points
 
 
@@ -129,5 +131,5 @@ def _tau(method, table, x):
 
 
 def _flat(reflectance) -> list:
-    normal, albedo, roughness, specular = reflectance
-    return [*normal, *albedo, roughness, specular]
+    normal, albedo, *rest = reflectance
+    return [*normal, *albedo, *rest]

@@ -238,7 +238,7 @@ class Composition:
         if not dr.width(index):
             return
         x, along = samples.place(i, index, t)
-        points = shade.Points(x, tuple(-c for c in along), part.source.reflectance(x))
+        points = shade.Points(x, tuple(-c for c in along), part.medium.reflectance(x))
         points.evaluate()
         if sums:
             distance = (dr.gather(mi.Float, samples.bundle.base, index) + t) * unit
@@ -253,7 +253,7 @@ class Composition:
 
         def reflect(i, x, view):
             part = self.in_view[i]
-            points = shade.Points(x, tuple(-c for c in strands[i].d), part.source.reflectance(x))
+            points = shade.Points(x, tuple(-c for c in strands[i].d), part.medium.reflectance(x))
             return shade.reflect(points, part.table, Known(view), self.effects.specular)
 
         return reflect

@@ -68,11 +68,10 @@ class EmitterSamples:
         candidates = dr.gather(mi.UInt32, self._candidates, index, active)
         share = dr.gather(mi.Float, self._share, index, active)
         p = self.points
-        reflectance = (p.normal, p.albedo, p.roughness, p.specular)
 
         def body(k, kept, of_kept, total):
             ds, irradiance = self._draw(index, k, it, active)
-            value, _ = scatter.evaluate(self.frame.direction_to_field(ds.d), p.wo, reflectance)
+            value, _ = scatter.evaluate(self.frame.direction_to_field(ds.d), p.wo, p.reflectance)
             # Light may be negative. Scaled, so that the sum of the brightest that floats hold is still one.
             target = dr.abs(sum(SHARE * e * v for e, v in zip(irradiance, value, strict=True)))
             total = total + target

@@ -13,16 +13,18 @@ from ..core.architecture import Header
 from ..infer.backend import module
 from ..infer.grid import GridField
 from ..infer.network import NetworkField
+from ..infer.skin import Softness
 
 
 @dataclass(frozen=True)
 class LoadedField:
-    """A field file in both representations. `digest`: hash of the networks that were read, whatever has become of the
-    file since."""
+    """A field file in both representations, and how soft its skins are. `digest`: hash of the networks that were read,
+    whatever has become of the file since."""
 
     header: Header
     network: NetworkField
     grid: GridField
+    softness: Softness
     digest: str
 
 
@@ -38,7 +40,8 @@ def _load(path: str, _stamp: tuple | None, resolution: int, variant: str) -> Loa
     dj = module(variant)
     header, tensors = field_file.load(path)
     network = NetworkField(header, tensors, dj)
-    return LoadedField(header, network, GridField(network, resolution, dj), _digest(header, tensors))
+    grid = GridField(network, resolution, dj)
+    return LoadedField(header, network, grid, Softness(grid, dj), _digest(header, tensors))
 
 
 def _digest(header: Header, tensors: dict) -> str:

@@ -59,7 +59,7 @@ def medium_class(phase_class: type) -> type:
             self.frame = Frame(self.field.header.similarity, to_world, scale)
             self.path = path
             phase = phase_class(mi.Properties("nrf"))
-            phase.attach(self.frame, self.source)
+            phase.attach(self.frame, self.reflectance)
             props["phase"] = phase
             mi.Medium.__init__(self, props)
             self.phase = phase
@@ -72,6 +72,11 @@ def medium_class(phase_class: type) -> type:
             low, high = self.field.grid.bounds
             self._low, self._high = (mi.Point3f(*map(float, side)) for side in (low, high))
             dr.make_opaque(self._low, self._high)
+
+        def reflectance(self, x):
+            """``(normal, albedo, roughness, specular, softness)`` at the field point `x`, as
+            :meth:`mi_ntf.infer.network.NetworkField.reflectance` and :class:`mi_ntf.infer.skin.Softness`."""
+            return *self.source.reflectance(x), self.field.softness(x)
 
         def extinction(self, p):
             """σ_t at the scene point `p`, 1/scene unit."""

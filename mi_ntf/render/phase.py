@@ -22,9 +22,9 @@ def phase_class() -> type:
         (none)             the ``nrf`` medium creates its phase function by itself
         =========== ====== ===================================================================
 
-        Value: f = ρ(R(x), ω_o, ω_i, n(x)) (⟨n,ω_i⟩ + ⟨n,ω_o⟩) between directions on the normal's side, linear RGB,
-        1/sr, which makes an opaque skin reflect like a surface of the microfacet ρ
-        (:func:`mi_ntf.core.microfacet.scattering`). Its integral is no probability. Stock ``volpath`` and
+        Value: f = ρ(R(x), ω_o, ω_i, n(x)) (⟨n,ω_i⟩ + ⟨n,ω_o⟩), less at grazing angles of curved skins, between
+        directions on the normal's side, linear RGB, 1/sr, which makes an opaque skin reflect like a surface of the
+        microfacet ρ (:func:`mi_ntf.core.microfacet.scattering`). Its integral is no probability. Stock ``volpath`` and
         ``prbvolpath`` at `max_depth` 2 solve the same equation as the ``nrf`` integrator (Bi et al. 2020, eq. 2).
 
         Does not support: use outside an ``nrf`` medium; polarised and spectral variants; adjoint (importance)
@@ -33,17 +33,17 @@ def phase_class() -> type:
 
         def __init__(self, props):
             mi.PhaseFunction.__init__(self, props)
-            self.frame, self.source = None, None
+            self.frame, self.reflectance = None, None
             self.m_flags = int(mi.PhaseFunctionFlags.Anisotropic)
 
-        def attach(self, frame, source):
-            """Called by the medium: its placement and field."""
-            self.frame, self.source = frame, source
+        def attach(self, frame, reflectance):
+            """Called by the medium: its placement, and what it reflects at a point."""
+            self.frame, self.reflectance = frame, reflectance
 
         def _look(self, mei):
-            if self.source is None:
+            if self.reflectance is None:
                 raise MiNtfError("phase function nrf stands alone; remove it: the nrf medium creates its own")
-            return (self.frame.direction_to_field(mei.wi), self.source.reflectance(self.frame.point_to_field(mei.p)))
+            return (self.frame.direction_to_field(mei.wi), self.reflectance(self.frame.point_to_field(mei.p)))
 
         def eval_pdf(self, ctx, mei, wo, active=True):
             viewer, reflectance = self._look(mei)

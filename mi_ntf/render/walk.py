@@ -85,14 +85,13 @@ class Walk:
         """Paths that meet a point of `part` at the distance `t`; at `depth` 2 its direct light is known already."""
         frame = part.frame
         x = frame.point_to_field(paths.ray.o + t * paths.ray.d)
-        points = shade.Points(x, tuple(-c for c in frame.direction_to_field(paths.ray.d)), part.source.reflectance(x))
+        points = shade.Points(x, tuple(-c for c in frame.direction_to_field(paths.ray.d)), part.medium.reflectance(x))
         points.evaluate()
         if depth > 2:
             self.add(paths, mi.Color3f(*self.scene.reflect(part, points, self.stream + dr.opaque(mi.UInt32, depth))))
         u = [paths.rng.next_float32() for _ in range(3)]
-        reflectance = (points.normal, points.albedo, points.roughness, points.specular)
-        wi = scatter.sample(points.wo, reflectance, u[0], (u[1], u[2]))
-        value, pdf = scatter.evaluate(wi, points.wo, reflectance)
+        wi = scatter.sample(points.wo, points.reflectance, u[0], (u[1], u[2]))
+        value, pdf = scatter.evaluate(wi, points.wo, points.reflectance)
         weight = paths.weight * dr.select(pdf > 1e-8, mi.Color3f(*value) / pdf, 0)
         ray = mi.Ray3f(frame.point_to_world(x), frame.direction_to_world(wi))
         return replace(paths, ray=ray, weight=weight, pdf=dr.zeros(mi.Float, dr.width(t)))

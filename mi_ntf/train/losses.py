@@ -39,6 +39,17 @@ def normals(image: Image, d: torch.Tensor, baked: Baked):
     return toward, (w * away**2).sum() / count
 
 
+ROUGH = 30.0
+"""How much dearer the roughest lobe is than a sharp one."""
+
+
+def gloss(image: Image, count: int) -> torch.Tensor:
+    """The specular weight, the dearer the rougher: (1 + ROUGH α²) s per ray, α = roughness². What α = 1 adds under a
+    flash, a diffuse lobe of a quarter of its weight adds as well, and only that is right under other lights."""
+    roughness, specular = image.gloss
+    return (image.weight.detach() * specular * (1 + ROUGH * roughness**4)).sum() / count
+
+
 def evenness(networks: Networks, image: Image, count: int, generator: torch.Generator) -> torch.Tensor:
     """Squared change of ln σ along the surface, in random directions perpendicular to the (detached) predicted normals.
 

@@ -21,7 +21,8 @@ from .rays import Rays
 
 SURFACE = 2.0
 """``microfacet.scattering`` over ``microfacet.lobes_collocated``: the field scatters with ρ (⟨n,ω_i⟩ + ⟨n,ω_o⟩), which
-makes an opaque field look like a surface of reflectance ρ from all sides; collocated, that is 2ρ⟨n,ω_i⟩."""
+makes an opaque field look like a surface of reflectance ρ from all sides; collocated, that is 2ρ⟨n,ω_i⟩, on curved
+skins too."""
 MIN_WEIGHT = 1e-4
 """Samples with a smaller alpha weight are not shaded."""
 
@@ -37,7 +38,7 @@ class Image:
     index: torch.Tensor
     weight: torch.Tensor
     normal: torch.Tensor
-    specular: torch.Tensor
+    gloss: tuple[torch.Tensor, torch.Tensor]
     radiance: torch.Tensor
     raw: torch.Tensor
 
@@ -62,12 +63,13 @@ def scatter_sum(value: torch.Tensor, ray: torch.Tensor, count: int) -> torch.Ten
 
 
 def shade(networks: Networks, x: torch.Tensor, d: torch.Tensor, t: torch.Tensor, light: torch.Tensor):
-    """``(radiance, normal, specular)``: what the points `x` scatter back along −d per unit of light weight v."""
+    """``(radiance, normal, (roughness, specular))``: what the points `x` scatter back along −d per unit of light weight
+    v."""
     normal, albedo, roughness, specular = networks.reflectance(x)
     cos = -(normal * d).sum(1)
     diffuse, glossy = microfacet.lobes_collocated(ops, cos, roughness)
     lobe = (1 - specular)[:, None] * albedo * diffuse[:, None] + (specular * glossy)[:, None]
-    return SURFACE * lobe * light / (t * t)[:, None], normal, specular
+    return SURFACE * lobe * light / (t * t)[:, None], normal, (roughness, specular)
 
 
 def render(networks: Networks, rays: Rays, samples, step: float | torch.Tensor) -> Image:
@@ -79,6 +81,6 @@ def render(networks: Networks, rays: Rays, samples, step: float | torch.Tensor) 
     alpha = scatter_sum(w, ray, len(rays))
     near = (w.detach() > MIN_WEIGHT).nonzero()[:, 0]
     ray, t, x = ray[near], t[near], x[near]
-    radiance, normal, specular = shade(networks, x, rays.d[ray], t, rays.light[ray])
+    radiance, normal, gloss = shade(networks, x, rays.d[ray], t, rays.light[ray])
     color = scatter_sum(v[near, None] * radiance, ray, len(rays))
-    return Image(color, alpha, x, ray, near, w[near], normal, specular, radiance, raw)
+    return Image(color, alpha, x, ray, near, w[near], normal, gloss, radiance, raw)

@@ -109,7 +109,7 @@ class Stepper(Descent):
         terms["even"] = c.even * losses.evenness(self.nets, image, 2048, g)
         matter = image.raw[image.index].clamp(max=MAX_LOG_DENSITY)
         terms["sharp"] = -c.sharp * self.opaque * (image.weight.detach() * matter).sum() / len(batch)
-        terms["gloss"] = c.gloss * (image.weight.detach() * image.specular).sum() / len(batch)
+        terms["gloss"] = c.gloss * losses.gloss(image, len(batch))
         x = self.occupancy.must_be_empty(1536, g)
         if len(x):
             terms["empty"] = c.empty * losses.emptiness(self.nets, x)

@@ -164,9 +164,32 @@ def test_phase_function_scatters_from_above_to_above_alone_and_is_reciprocal(wi,
     diffuse, specular = microfacet.scattering(ops, wi, wo, N, roughness)
     if min(wi[2], wo[2]) <= 0:
         assert diffuse == 0 and specular == 0
-    else:
+    elif min(wi[2], wo[2]) > 1e-12:  # below that c is no longer the cosine, but 5e-16
         assert diffuse == pytest.approx((wi[2] + wo[2]) / np.pi) and specular >= 0
     assert microfacet.scattering(ops, wo, wi, N, roughness) == pytest.approx((diffuse, specular), rel=1e-11)
+
+
+@given(sphere, sphere, st.floats(0.15, 1), st.floats(0, 5))
+def test_soft_skins_are_reciprocal_and_send_no_more_than_flat_ones(wi, wo, roughness, softness):
+    found = microfacet.scattering(ops, wi, wo, N, roughness, softness)
+    assert microfacet.scattering(ops, wo, wi, N, roughness, softness) == pytest.approx(found, rel=1e-11)
+    flat = microfacet.scattering(ops, wi, wo, N, roughness)
+    assert all(0 <= a <= b * (1 + 1e-12) for a, b in zip(found, flat, strict=True))
+
+
+@pytest.mark.parametrize("softness", [0.0, 0.01, 0.1, 1.0])
+def test_white_soft_skin_never_shines(softness):
+    """∫ f c_i/(c_i + c_o) dω_i, what a skin of softness k sends to ω_o in a white furnace: at most 1, 1 to above."""
+    mu, weights = np.polynomial.legendre.leggauss(2000)
+    mu, weights = (mu + 1) / 2, weights / 2
+    c_i = microfacet.soft_cosine(ops, mu, softness)
+    for cos_o in (1.0, 0.5, 0.1, 0.01):
+        c_o = microfacet.soft_cosine(ops, cos_o, softness)
+        f = microfacet.joint_cosine(ops, mu, np.full_like(mu, cos_o), softness) / np.pi
+        sent = (2 * np.pi * weights * f * c_i / (c_i + c_o)).sum()
+        assert sent < 1 + 1e-6
+        if cos_o == 1 or softness == 0:
+            assert sent == pytest.approx(1, abs=1e-6)
 
 
 @pytest.mark.parametrize("cosines", [(1.0, 1.0), (0.2, 0.9), (0.95, 0.1)])

@@ -71,9 +71,10 @@ def test_value_is_the_formula_and_weight_is_value_over_density(medium, rng):
     # Peaks of GGX amplify the rounding of sampled directions.
     np.testing.assert_allclose(np.array(weight) * np.array(pdf), np.array(value), rtol=5e-3, atol=1e-5)
     roughness, specular = (float(v[0]) for v in medium.source.reflectance(tuple(mi.Float(c) for c in NORMAL_POINT))[2:])
+    softness = float(medium.field.softness(tuple(mi.Float(c) for c in NORMAL_POINT))[0])
     d = np.array(wo, np.float64)
     diffuse, gloss = microfacet.scattering(
-        ops, tuple(d), tuple(np.full(count, c) for c in viewer), (0.0, 0.0, 1.0), roughness
+        ops, tuple(d), tuple(np.full(count, c) for c in viewer), (0.0, 0.0, 1.0), roughness, softness
     )
     for channel, albedo in enumerate((0.7, 0.5, 0.3)):
         truth = (1 - specular) * albedo * diffuse + specular * gloss

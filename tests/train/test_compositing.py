@@ -188,7 +188,7 @@ def test_evenness_sees_slopes_along_the_surface_alone():
     def image(normal):
         n = 500
         return render.Image(color=None, alpha=None, x=torch.zeros(n, 3), shaded=None, index=None, weight=torch.ones(n),
-                            specular=None, normal=torch.tensor(normal).expand(n, 3), radiance=None, raw=None)
+                            gloss=None, normal=torch.tensor(normal).expand(n, 3), radiance=None, raw=None)
 
     generator = torch.Generator().manual_seed(0)
     # float32 rounding of offsets of 0.02
@@ -234,3 +234,11 @@ def test_held_out_score_of_a_network_that_knows_no_shadow():
     # 4096 pairs of deviation 0.3, and voxels of 1/96 that smear the surface
     assert found["bias"] == pytest.approx(1 - (1 - math.log(2)) / 2, abs=0.03)
     assert found["bias"] < found["rms"] < 1
+
+
+def test_rough_lobes_cost_more():
+    """Σ w s (1 + 30 α²) per ray."""
+    gloss = torch.tensor([1.0, 0.5]), torch.tensor([0.2, 0.4])
+    image = render.Image(color=None, alpha=None, x=None, shaded=None, index=None, weight=torch.tensor([0.5, 0.25]),
+                         normal=None, gloss=gloss, radiance=None, raw=None)
+    assert float(losses.gloss(image, 4)) == pytest.approx((0.5 * 0.2 * 31 + 0.25 * 0.4 * (1 + 30 / 16)) / 4)

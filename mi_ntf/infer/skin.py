@@ -1,0 +1,98 @@
+"""The skins of a field, measured where it is baked (:mod:`mi_ntf.core.skin`)."""
+
+from types import ModuleType
+
+import drjit as dr
+import numpy as np
+
+from ..core import skin
+from . import ops
+from .grid import REFLECTANCE_RESOLUTION
+from .march import clear_distance, onward, safe_inverse
+
+
+class Softness:
+    """The softness of the skins of `grid` (a :class:`mi_ntf.infer.grid.GridField`), at its reflectance's voxel centres,
+    trilinear between; 0 for flat skins, and for smoke."""
+
+    def __init__(self, grid, dj: ModuleType):
+        self.dj = dj
+        values = _measure(grid, min(grid.resolution, REFLECTANCE_RESOLUTION), dj)
+        self._texture = dj.Texture3f(dj.TensorXf(values[..., None]), use_accel=False, wrap_mode=dr.WrapMode.Clamp)
+
+    def __call__(self, p):
+        """At the field points `p`."""
+        return self._texture.eval(self.dj.Array3f(*(0.5 * c + 0.5 for c in p)))[0]
+
+
+def _measure(grid, n: int, dj: ModuleType) -> np.ndarray:
+    """(z, y, x) float32."""
+    result, known = np.zeros((n, n, n), np.float32), np.zeros((n, n, n), bool)
+
+    def look(index):
+        x = tuple(dj.Float((index[:, k] + 0.5) * (2 / n) - 1) for k in (2, 1, 0))
+        normal = grid.reflectance(x)[0]
+        dr.eval(x, normal)
+        return x, normal
+
+    index = _occupied(grid, n, dj)
+    if len(index):
+        out = _depth(grid, *look(index), skin.DEEPEST).numpy()
+        seen = (out > 0) & (out < skin.DEEPEST)
+        index, out = index[seen], out[seen]
+    if len(index):
+        x, normal = look(index)
+        out = dj.Float(out)
+        below = _depth(grid, x, tuple(-c for c in normal), skin.SOLID)
+        sigma, total = grid.density(x), dj.Float(0)
+        for turn in skin.TURNS:
+            d = skin.across(ops, normal, tuple(dr.opaque(dj.Float, c) for c in turn))
+            total = total + skin.share(ops, out, _depth(grid, x, d, skin.FLATTEST * out), sigma)
+            dr.eval(total)
+        result[tuple(index.T)] = skin.softness(ops, total / skin.AZIMUTHS, out, below).numpy()
+        known[tuple(index.T)] = True
+    return spread(result, known)
+
+
+def _occupied(grid, n: int, dj: ModuleType) -> np.ndarray:
+    """Voxels (k, 3), z first, of n³ that hold density."""
+    axis = dj.Float((np.arange(n) + 0.5) * (2 / n) - 1)
+    z, y, x = dr.meshgrid(axis, axis, axis, indexing="ij")
+    return np.argwhere((grid.density((x, y, z)).numpy() > 0).reshape(n, n, n))
+
+
+def _depth(grid, x, d, most):
+    """∫ σ from `x` along `d` as far as ``skin.LENGTH``, or until it passes `most`."""
+    floats = type(x[0])
+    step, length = dr.opaque(floats, 1 / grid.resolution), skin.LENGTH
+    inverse = safe_inverse(d)
+
+    def body(t, depth, active):
+        p = tuple(a + (t + 0.5 * step) * b for a, b in zip(x, d, strict=True))
+        skip = clear_distance(grid, p, inverse)
+        depth = depth + dr.select(active & (skip <= 0), grid.density(p) * step, 0)
+        t = t + onward(skip, step)
+        return t, depth, active & (t < length) & (depth < most)
+
+    n = dr.width(x)
+    state = (dr.zeros(floats, n), dr.zeros(floats, n), dr.full(dr.mask_t(floats), True, n))
+    return dr.while_loop(state=state, cond=lambda t, depth, active: active, body=body, label="skin")[1]
+
+
+def spread(values: np.ndarray, known: np.ndarray, passes: int = 2) -> np.ndarray:
+    """`values` (z, y, x), continued from where they are `known` to their neighbours' neighbours: what lies between is
+    interpolated."""
+    for _ in range(passes):
+        weight = _box(known.astype(np.float32))
+        mean = _box(np.where(known, values, 0)) / np.maximum(weight, 1e-6)
+        values, known = np.where(known, values, mean), weight > 0.5
+    return values.astype(np.float32)
+
+
+def _box(values: np.ndarray) -> np.ndarray:
+    """Sums over 3³ neighbours."""
+    for axis in range(3):
+        padded = np.pad(values, [(1, 1) if a == axis else (0, 0) for a in range(3)])
+        n = values.shape[axis]
+        values = sum(padded.take(range(k, k + n), axis) for k in range(3))
+    return values
