@@ -24,7 +24,7 @@ FILLED = 0.98
 def study(field: Path, dataset: Path, mesh: Path | None = None, spp: int = 32) -> dict[str, float]:
     """``psnr`` (dB) and ``ssim``, means over the test views; with `mesh`, ``normal_error`` (degrees)."""
     split = load_dataset(dataset, lambda note: None)["test"]
-    ball = _ball(field)
+    ball = field_ball(field)
     originals = None if mesh is None else mi.load_file(str(mesh))
     scores, angles = [], []
     for i, photograph in enumerate(split.images):
@@ -61,7 +61,7 @@ def sensor(split, i: int):
     })  # fmt: skip
 
 
-def _ball(field: Path) -> dict:
+def field_ball(field: Path) -> dict:
     """The field in its unit sphere, where it was captured."""
     similarity = field_file.load_header(field).similarity
     return {"type": "sphere", "center": list(similarity.center), "radius": similarity.radius, "bsdf": {"type": "null"},
