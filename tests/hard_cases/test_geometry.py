@@ -59,7 +59,8 @@ PLACEMENTS = {
     "scale 1e5": (1e5, (0, 0, 0), 0, 2e-5),
     "turned": (1.0, (0, 0, 0), 117, 2e-5),
     "scale 1e5, turned and moved": (1e5, (3e5, -2e5, 1e5), 117, 2e-5),
-    "moved by 100": (1.0, (100, -100, 50), 0, 3e-5),
+    # 8e-6 apart.
+    "moved by 100": (1.0, (100, -100, 50), 0, 1e-4),
     # float32 places there are 1e-3 apart.
     "moved by 1e4": (1.0, (1e4, -1e4, 5e3), 0, 2e-3),
     "scale 1e-5, moved by 0.1": (1e-5, (0.1, 0, -0.1), 0, 2e-3),
