@@ -13,6 +13,16 @@ from .frame import SCALES, Frame
 REPRESENTATIONS = ("grid", "network")
 
 
+def _reflectance(source, softness):
+    """``(normal, albedo, roughness, specular, softness)`` of field points, as a function. The phase function keeps it,
+    and must not keep the medium, which keeps the phase function: nothing would ever let go of the two."""
+
+    def reflectance(x):
+        return *source.reflectance(x), softness(x)
+
+    return reflectance
+
+
 def medium_class(phase_class: type) -> type:
     """The plugin class for the current variant; `phase_class`: the variant's ``nrf`` phase function."""
 
@@ -56,6 +66,7 @@ def medium_class(phase_class: type) -> type:
             read.flag("sample_emitters", True)
             self.field = field.load(path, resolution)
             self.source = self.field.grid if self.representation == "grid" else self.field.network
+            self.reflectance = _reflectance(self.source, self.field.softness)
             self.frame = Frame(self.field.header.similarity, to_world, scale)
             self.path = path
             phase = phase_class(mi.Properties("nrf"))
@@ -72,11 +83,6 @@ def medium_class(phase_class: type) -> type:
             low, high = self.field.grid.bounds
             self._low, self._high = (mi.Point3f(*map(float, side)) for side in (low, high))
             dr.make_opaque(self._low, self._high)
-
-        def reflectance(self, x):
-            """``(normal, albedo, roughness, specular, softness)`` at the field point `x`, as
-            :meth:`mi_ntf.infer.network.NetworkField.reflectance` and :class:`mi_ntf.infer.skin.Softness`."""
-            return *self.source.reflectance(x), self.field.softness(x)
 
         def extinction(self, p):
             """σ_t at the scene point `p`, 1/scene unit."""

@@ -1,5 +1,8 @@
 """The ``nrf`` phase function: sampling against density, and against the formula."""
 
+import gc
+import weakref
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -8,6 +11,7 @@ from helpers import scenes
 
 import mi_ntf.render
 from mi_ntf.core import microfacet, ops
+from mi_ntf.render import field
 
 
 @pytest.fixture(params=[(0.3, 0.4), (0.8, 0.1)], ids=["glossy", "rough"])
@@ -80,6 +84,17 @@ def test_value_is_the_formula_and_weight_is_value_over_density(medium, rng):
         truth = (1 - specular) * albedo * diffuse + specular * gloss
         # Baked normals are off by 1e-3 between voxels.
         np.testing.assert_allclose(np.array(value)[channel], truth, rtol=0.03, atol=2e-3)
+
+
+def test_a_medium_that_is_gone_lets_go_of_its_field(medium):
+    """Medium and phase function know each other: a cycle of theirs would keep every field for good."""
+    path = medium.path
+    other = mi.load_dict({"type": "nrf", "filename": path, "resolution": 24})
+    grid = weakref.ref(other.field.grid)
+    del other
+    field._load.cache_clear()
+    gc.collect()
+    assert grid() is None
 
 
 def test_alone_it_says_what_to_do(variant):
