@@ -30,4 +30,4 @@ def test_a_balls_skin_is_as_bright_under_all_lights(tmp_path):
     assert list(found) == ["flash", "lamp", "sun", "constant", "sky"]
     for name, row in found.items():
         assert (1 + row["brightness"]) / (1 + found["flash"]["brightness"]) == pytest.approx(1, abs=0.035), name
-        assert row["aligned"] <= row["relative_rmse"] < 0.35  # the skin is 3 % wider than the ball
+        assert row["aligned"] <= row["relative_rmse"]  # of silhouettes: the skin is 3 % wider than the ball
