@@ -18,6 +18,9 @@ from .ops import cross, dot, normalize
 
 MIN_ROUGHNESS = 0.15
 INV_PI = 1 / math.pi
+HORIZON = 1e-8
+"""Cosines up to which a direction counts as one along the surface: the square of less is no float32 number that
+derivatives could divide by."""
 
 
 def ggx(sin2_h, alpha):
@@ -72,10 +75,16 @@ def scattering(ops, wi, wo, n, roughness, softness=0.0):
 
 
 def joint_cosine(ops, cos_i, cos_o, softness):
-    """(c_i + c_o) min(⟨n,ω_i⟩/c_i, ⟨n,ω_o⟩/c_o), see :func:`scattering`; 0 unless both cosines are positive."""
-    c_i, c_o = (soft_cosine(ops, c, softness) for c in (cos_i, cos_o))
-    share = ops.minimum(cos_i / c_i, cos_o / c_o)
-    return ops.where(share > 0, (c_i + c_o) * share, 0.0 * share)
+    """(c_i + c_o) min(⟨n,ω_i⟩/c_i, ⟨n,ω_o⟩/c_o), see :func:`scattering`; 0 unless both cosines are above HORIZON.
+
+    ⟨n,ω⟩/c grows with ⟨n,ω⟩, so the lesser is that of the lesser cosine; as 2/(1 + √(1 + `softness` tan²)) it is
+    exactly 1 in flat skins, and its derivative exactly 0: the quotient's loses its digits at grazing angles.
+    """
+    lesser = ops.minimum(cos_i, cos_o)
+    across = (1 - lesser * lesser) / ops.maximum(lesser * lesser, HORIZON**2)
+    share = 2 / (1 + ops.sqrt(1 + softness * across))
+    both = (soft_cosine(ops, cos_i, softness) + soft_cosine(ops, cos_o, softness)) * share
+    return ops.where(lesser > HORIZON, both, 0.0 * both)
 
 
 def soft_cosine(ops, cos, softness):

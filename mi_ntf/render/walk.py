@@ -66,6 +66,8 @@ class Walk:
         if self.scene.parts:
             draws = [paths.rng.next_float32() for _ in range(3)]
             hit, t, which = self.scene.fly(paths.ray, t, draws[0], -dr.log(1 - draws[1]), draws[2])
+            if self.scene.effects.visibility == "none":
+                hit = hit & (paths.pdf != 0)  # nothing dims what leaves a field, so nothing scatters it either
         dr.eval(hit, t, which, paths.rng.state)
         onward = paths.take(dr.arange(mi.UInt32, n))
         onward = replace(onward, weight=dr.zeros(mi.Color3f, n))

@@ -48,7 +48,7 @@ def test_reciprocity(roughness, softness, backend, check):
         turned = turned[3:] + turned[:3]
         scale = max(float(np.abs(g).max()) for g in gradients)
         error = [(a - b) / scale for a, b in zip(gradients, turned, strict=True)]
-        check(name, backend, "reciprocity of the gradient", error, 5e-5)  # rounding over a grazing cosine
+        check(name, backend, "reciprocity of the gradient", error, 1e-5)
 
 
 def single(cosine_o, roughness, albedo, specular):
@@ -87,12 +87,12 @@ def test_energy_of_the_phase_function(roughness, cosine, check):
 
 
 FURNACES = {
-    ("plane", 2): 0.028,  # measured 0.015, 0.023 by maps: 128 lights stand for the sky; with 512, 0.007
-    ("sphere", 2): 0.094,  # measured 0.078
-    ("sphere", 1): 0.072,  # measured 0.060
+    ("plane", 2): 0.028,  # measured 0.013, 0.022 by maps: 128 lights stand for the sky; with 512, 0.006
+    ("sphere", 2): 0.013,  # measured 0.0099
+    ("sphere", 1): 0.018,  # measured 0.013
 }
-"""Kind of skin and its width in voxels: how far above 1 it shines. Grazing light leaves a curved skin sooner than a
-flat one, in which f does not vanish: the limit of skins in place of surfaces, which shrinks with their width."""
+"""Kind of skin and its width in voxels: how far above 1 it shines. The phase function knows how much more light grazing
+rays meet in a curved skin than in a flat one by one number a place, the softness, and the sky by 128 directions."""
 
 
 @pytest.fixture(scope="module")
@@ -116,7 +116,7 @@ def white(tmp_path_factory):
 @pytest.mark.parametrize("method", ["raymarch", "transmittance_map, 2 logistics"])
 @pytest.mark.parametrize(("kind", "voxels"), FURNACES)
 def test_white_furnace(white, kind, voxels, method, depth, check):
-    """Radiance 1 from everywhere: a white field shows at most 1 more than what its skin's width adds."""
+    """Radiance 1 from everywhere: a white field shows 1, within what its bound states."""
     things = {"sensor": pictures.camera((0, 1.5, 3.7), fov=6.0, size=8), "sky": {"type": "constant"},
               "ball": pictures.ball(white(kind, voxels))}
     image = pictures.render(method, things, spp=16, max_depth=depth, environment_lights=128)
@@ -135,4 +135,4 @@ def test_convex_fields_look_alike_at_every_depth(white, kind, light, check):
     means = [pictures.render("raymarch", things, spp=64, max_depth=d, environment_lights=128)[..., :3].mean()
              for d in (2, 3, 6, -1)]
     for depth, mean in zip((3, 6, -1), means[1:], strict=True):
-        check(f"convex {kind}, {light}", "raymarch", f"depth {depth} over depth 2", mean / means[0] - 1, 0.02)
+        check(f"convex {kind}, {light}", "raymarch", f"depth {depth} over depth 2", mean / means[0] - 1, 1e-3)

@@ -39,8 +39,6 @@ def white_ball(folder, log_density: float, radius: float):
 @FEW
 def test_white_furnace(name, depth, tmp_path_factory, log_density, radius):
     """Where light of radiance 1 comes from everywhere, nothing is brighter: means of 4×4 pixels, sky and all."""
-    if name == "none" and depth != 2:
-        pytest.skip("light that no field dims is reflected at every bounce within a skin")
     loaded = scenes.scene(
         white_ball(tmp_path_factory.getbasetemp(), log_density, radius),
         integrator(name, max_depth=depth, hide_emitters=False), {"sky": {"type": "constant"}},
@@ -48,9 +46,9 @@ def test_white_furnace(name, depth, tmp_path_factory, log_density, radius):
     )  # fmt: skip
     image = scenes.render(loaded)[..., :3]
     assert np.isfinite(image).all() and image.min() >= 0
-    # The phase function is exact for a flat skin. These are as thick as a tenth of the ball, and grazing light leaves
-    # a curved one sooner: measured 1.062. With none, 1.001 by noise.
-    assert ztest.block_means(image, 4).max() < (1.002 if name == "none" else 1.09)
+    # Skins as thick as a tenth of the ball: measured 1.012 where the thinnest is lit by rays along it, others 1.004.
+    # With none, 1.0016 by noise.
+    assert ztest.block_means(image, 4).max() < (1.002 if name == "none" else 1.018)
 
 
 def two_fields(blobs, turned: bool) -> dict:
