@@ -80,6 +80,8 @@ class Train:
     """Learn transmittance on camera rays alone."""
     no_colour_loss: bool = False
     """Do not compare pixels lit by the learned transmittance with the photographs."""
+    no_bounces: bool = False
+    """The photographs hold no light that the object throws on itself, as renderings with one bounce."""
     visibility_mlp: bool = False
     """Also train NeRV's visibility network, of a point and a direction, on the same transmittance."""
     field: Path | None = None
@@ -97,7 +99,7 @@ class Train:
         report = train(self.dataset, self.output, preset=self.preset, minutes=self.minutes, steps=self.steps,
                        seed=self.seed, tensorboard=self.tensorboard, field=self.field, ntf=self.ntf,
                        augmentation=not self.no_augmentation, colour_loss=not self.no_colour_loss,
-                       visibility_mlp=self.visibility_mlp)
+                       visibility_mlp=self.visibility_mlp, bounces=not self.no_bounces)
         if report:  # under torchrun, only the first process has one
             _report(report, self.json, _print_training)
 

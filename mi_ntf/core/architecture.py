@@ -178,7 +178,7 @@ _JSON = {dict: "an object", list: "a list", str: "text"}
 
 
 FAST = Architecture(
-    density=Network(Encoding("planes", (64, 128), 8), (32,)),
+    density=Network(Encoding("planes", (64, 192), 8), (32,)),
     reflectance=Network(Encoding("planes", (48, 128), 10), (64,)),
     transmittance=Network(Encoding("depth"), (32, 32), components=2),
 )

@@ -10,7 +10,7 @@ EDGE = 0.02
 """Cosines over which derivatives spread the jump of the phase function between light from below and from above."""
 
 
-def reflect(points, lights, visibility, specular=True, gradients=False):
+def reflect(points, lights, visibility, specular=True, gradients=False, skin=True):
     """Σ over lights of irradiance · τ · f, f the phase function of :func:`mi_ntf.core.microfacet.scattering`: the h(x,
     ω_o) of method.md, section 1.
 
@@ -19,6 +19,7 @@ def reflect(points, lights, visibility, specular=True, gradients=False):
     visibility  has ``tau`` (:mod:`mi_ntf.infer.visibility`); None: no shadow. The light then does not pass the skin
                 either, so a point reflects as a surface does, ρ ⟨n,ω_i⟩⁺
     specular    whether the field has a specular lobe; without, all its albedo is diffuse
+    skin        whether the points lie in a skin; otherwise on a surface, as without shadow
     gradients   whether a parameter is attached: the loop can then be differentiated in reverse. Transmittances are held
                 fixed unless the lights' own places are attached (``lights.moving``)
 
@@ -31,7 +32,7 @@ def reflect(points, lights, visibility, specular=True, gradients=False):
 
     def body(i, r, g, b):
         wi, irradiance, distance = lights.sample(i, points.x, True)
-        lit, diffuse, gloss = _lobes(wi, points, bool(visibility), specular)
+        lit, diffuse, gloss = _lobes(wi, points, skin and bool(visibility), specular)
         tau = _tau(visibility, points.x, wi, distance, i, lit, gradients and not moving) if visibility else 1
         if moving and visibility:
             tau = tau * _edge(wi, points.normal)

@@ -13,11 +13,11 @@ from .march import clear_distance, onward, safe_inverse
 
 class Softness:
     """The softness of the skins of `grid` (a :class:`mi_ntf.infer.grid.GridField`), at its reflectance's voxel centres,
-    trilinear between; 0 for flat skins, and for smoke."""
+    trilinear between; 0 for flat skins, and for smoke. `solid`: the share of them that are opaque."""
 
     def __init__(self, grid, dj: ModuleType):
         self.dj = dj
-        values = _measure(grid, min(grid.resolution, REFLECTANCE_RESOLUTION), dj)
+        values, self.solid = _measure(grid, min(grid.resolution, REFLECTANCE_RESOLUTION), dj)
         self._texture = dj.Texture3f(dj.TensorXf(values[..., None]), use_accel=False, wrap_mode=dr.WrapMode.Clamp)
 
     def __call__(self, p):
@@ -25,8 +25,9 @@ class Softness:
         return self._texture.eval(self.dj.Array3f(*(0.5 * c + 0.5 for c in p)))[0]
 
 
-def _measure(grid, n: int, dj: ModuleType) -> np.ndarray:
-    """(z, y, x) float32."""
+def _measure(grid, n: int, dj: ModuleType) -> tuple[np.ndarray, float]:
+    """Softness (z, y, x), float32, and the share of skins that are opaque."""
+    solid = 0.0
     result, known = np.zeros((n, n, n), np.float32), np.zeros((n, n, n), bool)
 
     def look(index):
@@ -51,7 +52,8 @@ def _measure(grid, n: int, dj: ModuleType) -> np.ndarray:
             dr.eval(total)
         result[tuple(index.T)] = skin.softness(ops, total / skin.AZIMUTHS, out, below).numpy()
         known[tuple(index.T)] = True
-    return spread(result, known)
+        solid = float(np.mean((out + below).numpy() > skin.SOLID))
+    return spread(result, known), solid
 
 
 def _occupied(grid, n: int, dj: ModuleType) -> np.ndarray:

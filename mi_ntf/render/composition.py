@@ -9,6 +9,7 @@ from ..core.errors import MiNtfError
 from ..infer import march, shade
 from ..infer.visibility import outside
 from . import effects, environment, lights, visibility
+from .bounced import Bounced
 from .surfaces import Surfaces
 from .walk import Paths, Walk
 
@@ -85,6 +86,9 @@ class Composition:
         if self.effects.surfaces:
             shapes = effects.ordinary_shapes(scene)
             self.surfaces = Surfaces(scene, shapes, integrator.hide_emitters, self.transmittance)
+        self._bounced = None
+        if self.effects.bounces == "radiosity" and self.parts:
+            self._bounced = self._with_all_lights(lambda: Bounced(self, integrator.max_depth))
 
     def _runs(self) -> list:
         """Runs of the table's lights, (first, last), whose maps fit into memory together; [None] for all at once, as
@@ -161,8 +165,19 @@ class Composition:
         hit, t, index, bundle = march.free_flight(strands, maxt / unit, offset, depth, which)
         return hit, (bundle.base + t) * unit, index
 
-    def reflect(self, part: Part, points, stream, view=None):
-        """Radiance that `points` of `part` reflect from all lights; `view`: their transmittance, if lights share it."""
+    def _with_all_lights(self, do):
+        """What `do()` returns where those of other runs shine too, marched to."""
+        parts = self.parts
+        if len(self.runs) > 1:
+            self.parts = [replace(p, table=p.lights, mapped=p.drawn) for p in parts]
+        try:
+            return do()
+        finally:
+            self.parts = parts
+
+    def reflect(self, part: Part, points, stream, view=None, surface=False):
+        """Radiance that `points` of `part` reflect from all lights; `view`: their transmittance, if lights share it;
+        `surface`: whether they are diffuse points of a surface above the skin."""
         total = [dr.zeros(mi.Float, dr.width(points.x[0])) for _ in range(3)]
         for source, mapped in self.lights.sources(part.table, part.frame, points, stream):
             if self.run and not mapped:
@@ -170,7 +185,8 @@ class Composition:
             # Maps and volumes stay where the lights were.
             kind = "mapped" if mapped and not part.table.moving else "drawn"
             shadow = Known(view) if view is not None else self._shadow(part, kind)
-            light = shade.reflect(points, source, shadow, self.effects.specular, self.effects.gradients)
+            light = shade.reflect(points, source, shadow, self.effects.specular and not surface,
+                                  self.effects.gradients, not surface)  # fmt: skip
             total = [a + b for a, b in zip(total, light, strict=True)]
         return total
 
@@ -192,8 +208,8 @@ class Composition:
         offset, depth = sampler.next_1d(), sampler.next_1d()
         if self.in_view:
             transmittance = self._fields(ray, hit, offset, depth, total, stream, sums)
-        if (self.surfaces or found.bounces) and not self.run:
-            self._bounces(ray, hit, transmittance, offset, total, stream)
+        if (self.surfaces or found.bounces == "paths") and not self.run:
+            self._with_all_lights(lambda: self._bounces(ray, hit, transmittance, offset, total, stream))
         opacity = 1 - transmittance
         radiance = mi.Color3f(*total)
         missed = True
@@ -244,7 +260,8 @@ class Composition:
             distance = (dr.gather(mi.Float, samples.bundle.base, index) + t) * unit
             sums.add_field(i, part, points, samples, kept, distance, self._shadow(part, "mapped"))
         if self.effects.lit:
-            for channel, value in zip(light, self.reflect(part, points, stream, view), strict=True):
+            reflected = self._with_bounces(part, points, self.reflect(part, points, stream, view))
+            for channel, value in zip(light, reflected, strict=True):
                 where = dr.arange(mi.UInt32, dr.width(t)) if kept is None else kept
                 dr.scatter_reduce(dr.ReduceOp.Add, channel, value * weight, where, mode=dr.ReduceMode.NoConflicts)
 
@@ -254,15 +271,20 @@ class Composition:
         def reflect(i, x, view):
             part = self.in_view[i]
             points = shade.Points(x, tuple(-c for c in strands[i].d), part.medium.reflectance(x))
-            return shade.reflect(points, part.table, Known(view), self.effects.specular)
+            light = shade.reflect(points, part.table, Known(view), self.effects.specular)
+            return self._with_bounces(part, points, light)
 
         return reflect
 
+    def _with_bounces(self, part: Part, points, light):
+        """`light` that `points` reflect of a run, and, in the first, what comes to them by way of others."""
+        if not self._bounced or self.run:
+            return light
+        return [a + b for a, b in zip(light, self._bounced.reflect(part, points), strict=True)]
+
     def _bounces(self, ray, hit, transmittance, offset, total, stream):
         """Adds the light of surfaces that the camera sees, and of paths of more than one bounce."""
-        n, parts = dr.width(ray.o), self.parts
-        if len(self.runs) > 1:
-            self.parts = [replace(p, table=p.lights, mapped=p.drawn) for p in parts]
+        n = dr.width(ray.o)
         walk = Walk(self, self.integrator.max_depth, total, stream)
         # Neighbouring sequences of one start are alike.
         start, sequence = mi.sample_tea_32(stream, dr.arange(mi.UInt32, n))
@@ -276,7 +298,6 @@ class Composition:
                 self._surface_paths(walk, camera, si, hit)
         if self.effects.bounces and self.in_view:
             self._field_paths(walk, camera, hit, transmittance, offset)
-        self.parts = parts
 
     def _surface_paths(self, walk, camera, si, hit):
         """Direct light on the surfaces that the camera sees, and what comes after."""

@@ -30,7 +30,7 @@ class Effects:
     in_view     of each medium, whether the camera may see matter of it
     surfaces    there are shapes other than the media's bounds
     specular    a field has a specular lobe
-    bounces     light scatters more than once
+    bounces     how light that scatters more than once is found, ``paths`` or ``radiosity``; "": it is not looked for
     gradients   a scene parameter is attached
     """
 
@@ -44,7 +44,7 @@ class Effects:
     in_view: tuple[bool, ...]
     surfaces: bool
     specular: bool
-    bounces: bool
+    bounces: str
     gradients: bool
 
     @property
@@ -145,6 +145,7 @@ def describe(scene, integrator, sensor, spp: int, media: list, light) -> Effects
     gradients = gradient_checks.check(scene, light)
     # Derivatives by a light's place need the light's own transmittance.
     collocated = lit and not gradients and integrator.visibility != "none" and _at_camera(light, sensor, media)
+    surfaces = len(ordinary_shapes(scene)) > 0
     width, height = sensor.film().crop_size()
     method, reason = _method(integrator, width * height * spp, exhaustive, media)
     if collocated:
@@ -158,11 +159,28 @@ def describe(scene, integrator, sensor, spp: int, media: list, light) -> Effects
         reason=reason,
         collocated=collocated,
         in_view=_in_view(sensor, media),
-        surfaces=len(ordinary_shapes(scene)) > 0,
+        surfaces=surfaces,
         specular=any(m.field.grid.gloss > MIN_GLOSS for m in media),
-        bounces=lit and not 0 <= depth <= 2,
+        bounces=_bounces(integrator.bounces, media, method, surfaces, gradients) if lit and not 0 <= depth <= 2 else "",
         gradients=gradients,
     )
+
+
+SOLID = 0.5
+"""Fields with fewer opaque skins than this share are smoke, whose bounces radiosity does not know."""
+
+
+def _bounces(name: str, media: list, method: str, surfaces: bool, gradients: bool) -> str:
+    """How further bounces are found: `name`, or the fast way where it knows all that takes part."""
+    unknown = [what for what, there in (
+        ("surfaces", surfaces), ("derivatives", gradients), ("visibility=none", method == "none"),
+        ("smoke", any(m.field.softness.solid < SOLID for m in media if m.field.grid.majorant > 0))) if there]
+    if name == "radiosity" and unknown:
+        raise MiNtfError(
+            f"nrf integrator: bounces=radiosity is light between the opaque skins of fields, but here are "
+            f"{' and '.join(unknown)}; choose bounces=paths"
+        )
+    return name if name != "auto" else "paths" if unknown else "radiosity"
 
 
 def _method(integrator, rays: int, exhaustive: bool, media: list) -> tuple[str, str]:

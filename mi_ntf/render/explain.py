@@ -119,7 +119,8 @@ def _effects(scene, found, integrator, count: int) -> dict:
         "fields in view": (any(found.in_view), f"{sum(found.in_view)} of {len(found.in_view)}"),
         "ordinary surfaces": (
             found.surfaces, f"{others} shapes beside the fields' bounds" if others else "there are none"),
-        "multiple scattering": (found.bounces, f"max_depth is {integrator.max_depth}"),
+        "multiple scattering": (
+            found.bounces, f"max_depth is {integrator.max_depth}" + (f", by {found.bounces}" if found.bounces else "")),
         "gradients": (found.gradients, "a parameter is attached" if found.gradients else "no parameter is attached"),
     }
     return {name: {"on": bool(on), "why": why} for name, (on, why) in answers.items()}

@@ -45,6 +45,9 @@ def integrator_class() -> type:
         max_depth           integer longest path in edges: 1 shows emitters alone, 2 is single scattering, more is
                                     multiple scattering in fields and between surfaces, −1 has no limit and ends paths
                                     by Russian roulette from depth 5 on (default: 2)
+        bounces             string  how light of `max_depth` > 2 is found: ``paths``, traced, exact and noisy;
+                                    ``radiosity``, without noise, between opaque fields alone, whose skins count as
+                                    diffuse; ``auto``: ``radiosity`` where nothing else takes part (default: auto)
         aovs                string  further outputs, a comma-separated list of ``depth``, ``normal``, ``albedo``,
                                     ``roughness``, ``opacity``, ``visibility``, ``visibility_lights``: see
                                     :mod:`mi_ntf.render.aovs` (default: none)
@@ -83,6 +86,7 @@ def integrator_class() -> type:
             self.map_memory = read.number("map_memory", 1024.0, 0.0, 2.0**24)
             self.map_file = read.text("map_file", "")
             self.max_depth = read.whole("max_depth", 2, -1, 1 << 20)
+            self.bounces = read.choice("bounces", "auto", ("auto", "paths", "radiosity"))
             self.aovs = aovs.parse(read.text("aovs", ""))
             read.flag("hide_emitters", False)
             self.lights_seen = 0
@@ -108,7 +112,7 @@ def integrator_class() -> type:
                 f"  map_resolution = {self.map_resolution},\n  map_source = {self.map_source},\n"
                 f"  map_components = {self.map_components},\n  map_memory = {self.map_memory},\n"
                 f"  map_file = {self.map_file},\n"
-                f"  max_depth = {self.max_depth},\n  aovs = {', '.join(self.aovs)},\n"
+                f"  max_depth = {self.max_depth},\n  bounces = {self.bounces},\n  aovs = {', '.join(self.aovs)},\n"
                 f"  hide_emitters = {self.hide_emitters},\n  timeout = {self.timeout}\n]"
             )
 

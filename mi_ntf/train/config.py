@@ -50,6 +50,8 @@ class TrainConfig:
     """Learn transmittance on rays of all directions, not those of the cameras alone."""
     colour_loss: bool = True
     """Also compare pixels lit by the learned transmittance with the photographs."""
+    bounces: bool = True
+    """The photographs hold light of the flash that the object throws on itself."""
 
 
 @dataclass(frozen=True)
@@ -93,15 +95,18 @@ NTF = {
 logistic from the ray's end points alone, of a size that CPUs can train."""
 
 
-def configured(preset: str, *, ntf: str | None = None, augmentation: bool = True,
-               colour_loss: bool = True, visibility_mlp: bool = False) -> TrainConfig | HierarchicalConfig:
-    """The recipe `preset` with another transmittance network, without parts of its training, or with the baseline's
-    network (NeRV's, of a point and a direction) trained on the same transmittance beside it."""
+def configured(preset: str, *, ntf: str | None = None, augmentation: bool = True, colour_loss: bool = True,
+               visibility_mlp: bool = False, bounces: bool = True) -> TrainConfig | HierarchicalConfig:
+    """The recipe `preset` with another transmittance network, without parts of its training, for photographs without
+    further `bounces`, or with the baseline's network (NeRV's, of a point and a direction) trained on the same
+    transmittance beside it."""
     if preset not in PRESETS:
         raise MiNtfError(f"preset '{preset}' is unknown; it is one of {', '.join(PRESETS)}")
     if ntf is not None and ntf not in NTF:
         raise MiNtfError(f"--ntf '{ntf}' is unknown; it is one of {', '.join(NTF)}")
     config = replace(PRESETS[preset], augmentation=augmentation, colour_loss=colour_loss)
+    if isinstance(config, TrainConfig):
+        config = replace(config, bounces=bounces)
     architecture = config.architecture
     if ntf is not None:
         architecture = replace(architecture, transmittance=NTF[ntf])

@@ -10,6 +10,7 @@ from ..core.architecture import Header, Similarity
 from ..core.errors import MiNtfError
 from ..data.readers import load_dataset
 from . import device, monitor, networks, parallel, rays
+from .bounced import Bounced
 from .occupancy import Occupancy
 
 FIELD = ("density", "reflectance")
@@ -31,7 +32,10 @@ class Descent:
     def __init__(self, dataset: Path, config, minutes: float | None, steps: int | None, seed: int):
         self.config, self.minutes, self.steps = config, minutes or math.inf, steps or math.inf
         self.splits = load_dataset(dataset, monitor.note if parallel.first() else lambda _: None)
-        self.rays = {name: rays.from_split(split, name) for name, split in self.splits.items()}
+        self.rays, views = {}, 0
+        for name, split in self.splits.items():
+            self.rays[name] = rays.from_split(split, name, views)
+            views += len(split.images)
         self.generator = device.generator(seed)
         self.nets = parallel.share(networks.initial(config.architecture, config.log_density, self.generator))
         target = self.rays["train"].target
@@ -42,6 +46,8 @@ class Descent:
         self.exposure = 1 / max(float(bright.quantile(0.95)) if 0 < len(bright) else 1.0, 1e-6)
         x, y, z = map(float, self.splits["train"].center)
         self.similarity = Similarity((x, y, z), float(self.splits["train"].radius))
+        self.bounced: Bounced | None = None
+        """Light of the flashes that bounced, of a recipe that counts with it."""
         self.given: dict | None = None
         """How the field was trained that :meth:`take` took."""
         self.step, self.spent = 0, 0.0

@@ -22,15 +22,16 @@ def srgb(x: torch.Tensor) -> torch.Tensor:
 
 @torch.no_grad()
 def render_all(networks: Networks, rays: Rays, occupancy: Occupancy, step: float, generator: torch.Generator,
-               passes: int = 1, chunk: int = 8192):
-    """``(color (n, 3), alpha (n,), normal (n, 3))`` of all rays; `passes` jittered evaluations are averaged."""
+               bounced=None, passes: int = 1, chunk: int = 8192):
+    """``(color (n, 3), alpha (n,), normal (n, 3))`` of all rays; `passes` jittered evaluations are averaged; `bounced`
+    as for :func:`render`."""
     index, kept = occupancy.tighten(rays)
     color, alpha, normal = torch.zeros(len(rays), 3), torch.zeros(len(rays)), torch.zeros(len(rays), 3)
     for first in range(0, len(kept), chunk):
         part = kept[slice(first, first + chunk)]
         where = index[first:first + chunk]
         for _ in range(passes):
-            image = render(networks, part, occupancy.samples(part, step, generator), step)
+            image = render(networks, part, occupancy.samples(part, step, generator), step, bounced, generator)
             color[where] += image.color / passes
             alpha[where] += image.alpha / passes
             normal[where] += scatter_sum(image.weight[:, None] * image.normal, image.shaded, len(part)) / passes
@@ -46,10 +47,11 @@ def psnr(predicted: torch.Tensor, target: torch.Tensor, images: int) -> dict[str
     return {"srgb": mean(srgb(predicted), srgb(target)), "linear": mean(predicted, target)}
 
 
-def score(networks: Networks, rays: Rays, images: int, step: float, cells: int = 128) -> dict[str, float]:
+def score(networks: Networks, rays: Rays, images: int, step: float, bounced=None,
+          cells: int = 128) -> dict[str, float]:
     """PSNR of a whole split, from the networks alone: what they put outside the visual hull is seen too."""
     generator = device.generator(1)
     occupancy = from_networks(networks, cells, CUT, generator)
-    color, alpha, _ = render_all(networks, rays, occupancy, step, generator, passes=2)
+    color, alpha, _ = render_all(networks, rays, occupancy, step, generator, bounced, passes=2)
     error = (alpha - rays.target[:, 3]).square().mean()
     return psnr(color, rays.target[:, :3], images) | {"alpha_rmse": math.sqrt(float(error))}

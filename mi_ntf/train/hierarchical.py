@@ -126,7 +126,8 @@ class Hierarchical(Descent):
         m, h = chords(m, toward)
         far = torch.maximum(self.distance, h + 0.01)
         n = len(m)
-        return Rays(m + far[:, None] * toward, -toward, far - h, far + h, torch.zeros(n, 4), self.light.expand(n, 3))
+        return Rays(m + far[:, None] * toward, -toward, far - h, far + h, torch.zeros(n, 4), self.light.expand(n, 3),
+                    torch.zeros(n, dtype=torch.long))
 
     def ntf_loss(self, seen: View, rays: Rays, target: torch.Tensor) -> dict[str, torch.Tensor]:
         """L_nt of `rays` whose pixels should be `target` (n, 3): Σ_x (τ_nrf − τ_nt)² + ‖I_nt − I‖², means over rays."""

@@ -176,4 +176,5 @@ def transmittance_color(networks: Networks, marched: Marched, image: Image, rays
     _, mix = networks.ray_mixture(o, toward, marched.march(m, toward, h, STEPS))
     lit = tau(mix[ray], (x * toward[ray]).sum(1, keepdim=True))
     pixel = scatter_sum(image.weight[near, None].detach() * lit * image.radiance[near].detach(), ray, count)
-    return color(pixel, rays.target[:count, :3], exposure)
+    other = image.bounced[:count].detach() if torch.is_tensor(image.bounced) else 0.0
+    return color(pixel + other, rays.target[:count, :3], exposure)

@@ -116,7 +116,8 @@ def _spans(rays: Rays, full: torch.Tensor, extent: float, step: float, chunk: in
         ends.append(torch.minimum(part.t0[some] + (b + 1.5) * step, part.t1[some]))
     index = torch.cat(keep)
     kept = rays[index]
-    return index, Rays(kept.o, kept.d, torch.cat(starts), torch.cat(ends), kept.target, kept.light)
+    return index, Rays(kept.o, kept.d, torch.cat(starts), torch.cat(ends), kept.target, kept.light,
+                       kept.view)
 
 
 @torch.no_grad()

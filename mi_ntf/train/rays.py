@@ -16,7 +16,8 @@ from . import ops
 @dataclass(frozen=True)
 class Rays:
     """n camera rays: `o`, `d` (n, 3) field coordinates, `t0`, `t1` (n,) the piece to march, `target` (n, 4) linear
-    premultiplied RGBA, `light` (n, 3) the light's radiant intensity over radius²: I/d² = light/t² in scene units."""
+    premultiplied RGBA, `light` (n, 3) the light's radiant intensity over radius²: I/d² = light/t² in scene units;
+    `view` (n,): number of the photograph."""
 
     o: torch.Tensor
     d: torch.Tensor
@@ -24,16 +25,18 @@ class Rays:
     t1: torch.Tensor
     target: torch.Tensor
     light: torch.Tensor
+    view: torch.Tensor
 
     def __len__(self) -> int:
         return len(self.o)
 
     def __getitem__(self, index) -> "Rays":
-        return Rays(*(getattr(self, k)[index] for k in ("o", "d", "t0", "t1", "target", "light")))
+        return Rays(*(getattr(self, k)[index] for k in ("o", "d", "t0", "t1", "target", "light", "view")))
 
 
-def from_split(split: Split, name: str) -> Rays:
-    """All pixels of a split, frame by frame, row by row. The light must be at the camera (method.md, section 2)."""
+def from_split(split: Split, name: str, first: int = 0) -> Rays:
+    """All pixels of a split, frame by frame, row by row; photographs are numbered from `first` on. The light must be at
+    the camera (method.md, section 2)."""
     n, height, width = split.images.shape[:3]
     away = np.linalg.norm(split.light_pos - split.c2w[:, :3, 3], axis=1) / split.radius
     if away.max() > 0.02:
@@ -45,7 +48,14 @@ def from_split(split: Split, name: str) -> Rays:
     o, d, light = (torch.as_tensor(np.array(a, np.float32).reshape(-1, 3)) for a in
                    (origins, directions, intensity))
     t0, t1 = sphere_span(o, d)
-    return Rays(o, d, t0, t1, torch.as_tensor(split.images.reshape(-1, 4)), light)
+    view = torch.arange(first, first + n).repeat_interleave(height * width)
+    return Rays(o, d, t0, t1, torch.as_tensor(split.images.reshape(-1, 4)), light, view)
+
+
+def flashes(split: Split) -> tuple[torch.Tensor, torch.Tensor]:
+    """Where the lights of the photographs are (frames, 3), field coordinates, and their :class:`Rays`' `light`."""
+    place, power = (split.light_pos - split.center) / split.radius, split.light_intensity / split.radius**2
+    return torch.as_tensor(place).float(), torch.as_tensor(power).float()
 
 
 def sphere_span(o: torch.Tensor, d: torch.Tensor):

@@ -29,7 +29,8 @@ MIN_WEIGHT = 1e-4
 
 @dataclass(frozen=True)
 class Image:
-    """Rendered rays and, for the losses, their shaded samples: of ray `shaded`, sample `index` of `raw`."""
+    """Rendered rays and, for the losses, their shaded samples: of ray `shaded`, sample `index` of `raw`. `bounced`:
+    what of `color` did not come from the flash directly."""
 
     color: torch.Tensor
     alpha: torch.Tensor
@@ -41,6 +42,7 @@ class Image:
     gloss: tuple[torch.Tensor, torch.Tensor]
     radiance: torch.Tensor
     raw: torch.Tensor
+    bounced: torch.Tensor | float
 
 
 def weights(sigma: torch.Tensor, ray: torch.Tensor, step: float | torch.Tensor):
@@ -62,18 +64,27 @@ def scatter_sum(value: torch.Tensor, ray: torch.Tensor, count: int) -> torch.Ten
     return value.new_zeros(count, *value.shape[1:]).index_add(0, ray, value)
 
 
-def shade(networks: Networks, x: torch.Tensor, d: torch.Tensor, t: torch.Tensor, light: torch.Tensor):
-    """``(radiance, normal, (roughness, specular))``: what the points `x` scatter back along −d per unit of light weight
-    v."""
-    normal, albedo, roughness, specular = networks.reflectance(x)
+def shade(reflectance: tuple, d: torch.Tensor, t: torch.Tensor, light: torch.Tensor) -> torch.Tensor:
+    """What points of this `reflectance` scatter back along −d per unit of light weight v: radiance (n, 3)."""
+    normal, albedo, roughness, specular = reflectance
     cos = -(normal * d).sum(1)
     diffuse, glossy = microfacet.lobes_collocated(ops, cos, roughness)
     lobe = (1 - specular)[:, None] * albedo * diffuse[:, None] + (specular * glossy)[:, None]
-    return SURFACE * lobe * light / (t * t)[:, None], normal, (roughness, specular)
+    return SURFACE * lobe * light / (t * t)[:, None]
 
 
-def render(networks: Networks, rays: Rays, samples, step: float | torch.Tensor) -> Image:
-    """Colour and alpha of `rays` from packed ``(ray, t)`` samples in cells of `step`, one length or each its own."""
+def send_on(reflectance: tuple, irradiance: torch.Tensor) -> torch.Tensor:
+    """Radiance (n, 3) that points of this `reflectance` make of `irradiance` (n, 3), as diffuse surfaces."""
+    _, albedo, roughness, specular = reflectance
+    return microfacet.diffuse_albedo(albedo, roughness[:, None], specular[:, None]) * irradiance * microfacet.INV_PI
+
+
+def render(networks: Networks, rays: Rays, samples, step: float | torch.Tensor, bounced=None,
+           generator: torch.Generator | None = None) -> Image:
+    """Colour and alpha of `rays` from packed ``(ray, t)`` samples in cells of `step`, one length or each its own.
+
+    `bounced` (:class:`mi_ntf.train.bounced.Bounced`, drawn from by `generator`): further bounces of the flashes' light.
+    """
     ray, t = samples
     x = torch.addcmul(rays.o[ray], rays.d[ray], t[:, None])
     raw = networks.log_density(x)
@@ -81,6 +92,11 @@ def render(networks: Networks, rays: Rays, samples, step: float | torch.Tensor) 
     alpha = scatter_sum(w, ray, len(rays))
     near = (w.detach() > MIN_WEIGHT).nonzero()[:, 0]
     ray, t, x = ray[near], t[near], x[near]
-    radiance, normal, gloss = shade(networks, x, rays.d[ray], t, rays.light[ray])
-    color = scatter_sum(v[near, None] * radiance, ray, len(rays))
-    return Image(color, alpha, x, ray, near, w[near], normal, gloss, radiance, raw)
+    reflectance = networks.reflectance(x)
+    radiance = shade(reflectance, rays.d[ray], t, rays.light[ray])
+    color, indirect = scatter_sum(v[near, None] * radiance, ray, len(rays)), 0.0
+    if bounced is not None and bounced.known:
+        sent = send_on(reflectance, bounced(rays.view[ray], x, reflectance[0], generator))
+        indirect = scatter_sum(w[near, None] * sent, ray, len(rays))
+        color = color + indirect
+    return Image(color, alpha, x, ray, near, w[near], reflectance[0], reflectance[2:], radiance, raw, indirect)

@@ -7,11 +7,16 @@ import torch
 from ..core.architecture import MAX_LOG_DENSITY, Header
 from . import losses, rays, render
 from .baked import Baked
+from .bounced import Bounced
 from .config import TrainConfig
 from .descent import FIELD, Descent, total
 from .marched import Marched
 from .occupancy import LOG_EMPTY, Occupancy
 
+ROUNDS = (0.3, 0.45, 0.6, 0.75)
+"""Shares of the run at which the light that bounced is found: the skin has formed, and albedo follows at once."""
+SOLID = 0.5
+"""Share of the object's pixels that nothing may shine through, or it is smoke, whose bounces are others."""
 REFRESH = 32
 """Steps between two updates of the occupancy grid; the baked density is renewed at every fourth of them."""
 
@@ -22,8 +27,9 @@ NEAR = 96
 class Stepper(Descent):
     """The recipe of the project's own: planes, an occupancy grid in the visual hull, transmittance after the field."""
 
-    HELD = (*Descent.HELD, "samples_per_ray", "last_bake")
-    GRIDS = (("occupancy", ("sigma", "level", "stray")), ("baked", ("slope",)), ("marched", ("log_sigma", "reach")))
+    HELD = (*Descent.HELD, "samples_per_ray", "last_bake", "rounds")
+    GRIDS = (("occupancy", ("sigma", "level", "stray")), ("baked", ("slope",)), ("marched", ("log_sigma", "reach")),
+             ("bounced", ("table", "light")))
     config: TrainConfig
 
     def __init__(self, dataset: Path, config: TrainConfig, minutes: float | None, steps: int | None, seed: int):
@@ -34,6 +40,11 @@ class Stepper(Descent):
         _, self.seen = self.occupancy.tighten(self.rays["train"])
         self.baked, self.marched = Baked(config.bake), Marched()
         self.samples_per_ray, self.last_bake = 30.0, 0
+        self.rounds = 0
+        """How often the bounced light was found."""
+        if config.bounces and self.opaque > SOLID:
+            flashes = [rays.flashes(split) for split in self.splits.values()]
+            self.bounced = Bounced(*(torch.cat(parts) for parts in zip(*flashes, strict=True)))
 
     def _optimizer(self, *names: str) -> torch.optim.Adam:
         tensors = {k: v for k, v in self.nets.tensors.items() if k.split(".")[0] in names}
@@ -57,6 +68,7 @@ class Stepper(Descent):
         super().take(path, header, tensors)
         for _ in range(12):  # each looks at one point a cell; skins fill a fraction of theirs
             self.occupancy.update(self.nets, self.generator)
+        self.find_bounced()
 
     def occupied(self) -> Occupancy:
         return self.occupancy
@@ -80,6 +92,15 @@ class Stepper(Descent):
         due = self.step % (4 * REFRESH) == 0 and not (done and self.step > self.last_bake + 8 * REFRESH)
         if due or (self.progress() >= self.config.ntf_from and not hasattr(self.marched, "log_sigma")):
             self.bake()
+        if not done and self.rounds < len(ROUNDS) and self.progress() >= ROUNDS[self.rounds]:
+            self.find_bounced()
+
+    def find_bounced(self) -> None:
+        """Bring the light that bounced up to date."""
+        if self.bounced is not None:
+            self.marched.update(self.nets, self.occupancy)
+            self.bounced.update(self.nets, self.marched, self.seen, self.rounds)
+        self.rounds += 1
 
     def bake(self) -> None:
         self.baked.update(self.nets, self.occupancy)
@@ -100,7 +121,7 @@ class Stepper(Descent):
     def field_loss(self, batch: rays.Rays, samples):
         """``(terms, image)``: name → weighted term of the photographs; see :mod:`mi_ntf.train.losses`."""
         c, g = self.config, self.generator
-        image = render.render(self.nets, batch, samples, c.step)
+        image = render.render(self.nets, batch, samples, c.step, self.bounced, g)
         terms = {"colour": losses.color(image.color, batch.target[:, :3], self.exposure),
                  "alpha": c.alpha * (image.alpha - batch.target[:, 3]).square().mean()}
         toward, away = losses.normals(image, batch.d, self.baked)
@@ -142,7 +163,8 @@ class Stepper(Descent):
             ray, t = samples
             few = ray < NEAR
             with torch.no_grad():
-                image = render.render(self.nets, batch[slice(NEAR)], (ray[few], t[few]), c.step)
+                image = render.render(self.nets, batch[slice(NEAR)], (ray[few], t[few]), c.step,
+                                      self.bounced, self.generator)
             self.terms = {}
         else:
             self.terms, image = self.field_loss(batch, samples)

@@ -161,7 +161,8 @@ class _Loop(Descent):
         count, shape = min(4, len(split.images)), split.images.shape[1:3]
         part = self.rays["val"][slice(0, count * shape[0] * shape[1])]
         generator = device.generator(2)
-        color, _, normal = evaluate.render_all(self.nets, part, self.occupied(), self.config.step, generator)
+        color, _, normal = evaluate.render_all(self.nets, part, self.occupied(), self.config.step, generator,
+                                               self.bounced)
         exact = evaluate.psnr(color, part.target[:, :3], count)["srgb"]
         entry = {"step": self.step, "psnr": round(exact, 2)}
         self.history.append(entry)
@@ -260,7 +261,8 @@ class _Loop(Descent):
         field_file.save(self.out, header, tensors)
         stored = networks.from_tensors(self.config.architecture, field_file.load(self.out)[1])
         for name in ("val", "test"):
-            scores = evaluate.score(stored, self.rays[name], len(self.splits[name].images), self.config.step)
+            scores = evaluate.score(stored, self.rays[name], len(self.splits[name].images), self.config.step,
+                                    self.bounced)
             report[name] = {k: round(v, 3 if k != "alpha_rmse" else 5) for k, v in scores.items()}
         report["transmittance"] = held_out.score(stored, self.rays["val"])
         field_file.save(self.out, Header(self.config.architecture, self.similarity, report), tensors)

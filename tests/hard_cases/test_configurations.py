@@ -20,6 +20,7 @@ OPTIONS = {
     "crop": ((), (5, 3, 19, 27), (31, 0, 1, 32)),
     "sample_border": (False, True),
     "max_depth": (2, 4),
+    "bounces": ("auto", "paths"),
 }
 ROWS = pairwise(OPTIONS)
 LUMINANCE = np.array([0.212671, 0.715160, 0.072169])
@@ -32,15 +33,16 @@ def blobs(tmp_path_factory):
     return scenes.write_blobs(tmp_path_factory.mktemp("field"), log_density=3.0)
 
 
-def picture(blobs, method, spp, seed=0, sampler="independent", max_depth=2, **film) -> np.ndarray:
-    loaded = scenes.scene(blobs, pictures.integrator(method, max_depth=max_depth), LIGHT, size=SIZE, spp=spp,
-                          sampler=sampler, film_options=film, medium={"resolution": 96})  # fmt: skip
+def picture(blobs, method, spp, seed=0, sampler="independent", max_depth=2, bounces="auto",
+            **film) -> np.ndarray:
+    loaded = scenes.scene(blobs, pictures.integrator(method, max_depth=max_depth, bounces=bounces), LIGHT, size=SIZE,
+                          spp=spp, sampler=sampler, film_options=film, medium={"resolution": 96})  # fmt: skip
     return scenes.render(loaded, seed).astype(np.float64)
 
 
 @pytest.fixture(scope="module")
 def neutral(blobs):
-    return cache(lambda method, max_depth: picture(blobs, method, 64, 5, max_depth=max_depth))
+    return cache(lambda method, **options: picture(blobs, method, 64, 5, **options))
 
 
 def channels(rgba: np.ndarray, pixel_format: str) -> np.ndarray:
@@ -59,10 +61,10 @@ def name(row: dict) -> str:
                                  for i, r in enumerate(ROWS)], ids=name)
 def test_pairwise(blobs, neutral, row, check):
     """Means of blocks of 8² pixels against an RGBA film with a box filter, over the brightest block."""
-    options = {k: row[k] for k in ("spp", "seed", "sampler", "max_depth")}
+    options = {k: row[k] for k in ("spp", "seed", "sampler", "max_depth", "bounces")}
     film = {"pixel_format": row["pixel_format"], "component_format": row["component_format"],
             "rfilter": {"type": row["rfilter"]}, "sample_border": row["sample_border"]}  # fmt: skip
-    truth = channels(neutral(row["method"], row["max_depth"]), row["pixel_format"])
+    truth = channels(neutral(row["method"], max_depth=row["max_depth"], bounces=row["bounces"]), row["pixel_format"])
     brightest = ztest.block_means(truth, BLOCK).max((0, 1))
     if row["crop"]:
         x, y, width, height = row["crop"]

@@ -112,15 +112,16 @@ def white(tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("depth", [2, 3, -1])
+@pytest.mark.parametrize(("depth", "bounces"), [(2, ""), *((d, b) for d in (3, -1) for b in ("paths", "radiosity"))])
 @pytest.mark.parametrize("method", ["raymarch", "transmittance_map, 2 logistics"])
 @pytest.mark.parametrize(("kind", "voxels"), FURNACES)
-def test_white_furnace(white, kind, voxels, method, depth, check):
+def test_white_furnace(white, kind, voxels, method, depth, bounces, check):
     """Radiance 1 from everywhere: a white field shows 1, within what its bound states."""
     things = {"sensor": pictures.camera((0, 1.5, 3.7), fov=6.0, size=8), "sky": {"type": "constant"},
               "ball": pictures.ball(white(kind, voxels))}
-    image = pictures.render(method, things, spp=16, max_depth=depth, environment_lights=128)
-    name = f"white furnace, {kind}, skin of {voxels} voxels, depth {depth}"
+    image = pictures.render(method, things, spp=16, max_depth=depth, environment_lights=128,
+                            bounces=bounces or "auto")
+    name = f"white furnace, {kind}, skin of {voxels} voxels, depth {depth} {bounces}"
     check(name, method, "radiance above 1", max(image[..., :3].mean() - 1, 0), FURNACES[kind, voxels])
 
 
@@ -132,7 +133,9 @@ def test_convex_fields_look_alike_at_every_depth(white, kind, light, check):
     lights = {"sun": pictures.sun((0.6, 0, 0.8)), "sky": {"type": "constant"}}
     things = {"sensor": pictures.camera((0, 1.5, 3.7), fov=6.0, size=8), "light": lights[light],
               "ball": pictures.ball(white(kind))}
-    means = [pictures.render("raymarch", things, spp=64, max_depth=d, environment_lights=128)[..., :3].mean()
-             for d in (2, 3, 6, -1)]
-    for depth, mean in zip((3, 6, -1), means[1:], strict=True):
-        check(f"convex {kind}, {light}", "raymarch", f"depth {depth} over depth 2", mean / means[0] - 1, 1e-3)
+    cases = [(2, "paths"), *((d, b) for d in (3, 6, -1) for b in ("paths", "radiosity"))]
+    means = [pictures.render("raymarch", things, spp=64, max_depth=d, bounces=b, environment_lights=128)[..., :3].mean()
+             for d, b in cases]
+    for (depth, bounces), mean in zip(cases[1:], means[1:], strict=True):
+        what = f"depth {depth} by {bounces} over depth 2"
+        check(f"convex {kind}, {light}", "raymarch", what, mean / means[0] - 1, 1e-3)

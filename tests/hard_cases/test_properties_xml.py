@@ -24,7 +24,7 @@ KINDS = {
     "Transform": '<transform name="{}"><scale value="4"/></transform>', "Object": '<bsdf type="diffuse" name="{}"/>',
 }  # fmt: skip
 NUMBERS = {"timeout", "map_memory", "scale", "sampling_weight"}
-WORDS = {"visibility", "map_source", "representation", "aovs", "filename", "map_file"}
+WORDS = {"visibility", "bounces", "map_source", "representation", "aovs", "filename", "map_file"}
 FLAGS = {"hide_emitters", "sample_emitters"}
 RANGES = {
     "samples": (8, 8192), "light_samples": (0, 65536), "environment_lights": (1, 65536), "map_resolution": (4, 4096),

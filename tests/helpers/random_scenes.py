@@ -103,7 +103,8 @@ def draw_pair(seed: int, files: dict[str, Path]) -> tuple[Scene, dict]:
     scene["sensor"] = _camera("perspective", eye, centre, film, 16, "independent")
     both = {"max_depth": d.pick("max_depth", (2, 2, 3)), "hide_emitters": bool(d.pick("hide", (0, 1)))}
     drawn = d.pick("light_samples", (2, 4)) if set(SKIES) & set(kinds) else d.pick("light_samples", (0, 0, 3))
-    ours = {"type": "nrf", "visibility": "raymarch", "samples": 768, "light_samples": drawn, **both}
+    ours = {"type": "nrf", "visibility": "raymarch", "samples": 768, "light_samples": drawn, "bounces": "paths",
+            **both}
     return Scene(seed, " ".join(d.notes), scene, ours, False, 3), {"type": "volpath", "rr_depth": 64, **both}
 
 
@@ -221,6 +222,7 @@ def _integrator(d: _Draw) -> dict:
         "map_components": d.pick("map_components", (1, 2)),
         "map_memory": d.pick("map_memory", (0.3, 4.0, 512.0), (1, 1, 4)),
         "max_depth": d.pick("max_depth", (0, 1, 2, 3, 4, -1), (1, 1, 10, 3, 1, 2)),
+        "bounces": d.pick("bounces", ("auto", "paths")),
         "hide_emitters": bool(d.pick("hide", (0, 1))),
     }
     names = ("depth", "normal", "albedo", "roughness", "opacity", "visibility", "visibility_lights")

@@ -1,0 +1,132 @@
+"""Light of the flash that one part of the object throws on another: photographs hold it, and albedo must not.
+
+The radiosity of :mod:`mi_ntf.core.radiosity` between patches of the skin as it has been learned so far, for every
+photograph's flash, found anew now and then. What is learned as albedo before the first time is too much by the share of
+the bounced light, and every round leaves that share of the rest.
+"""
+
+import numpy as np
+import torch
+
+from ..core import microfacet, radiosity
+from .baked import fetch
+from .evaluate import CUT
+from .marched import Marched
+from .networks import Networks
+from .rays import Rays, sphere_span
+
+SEEN = 1 << 16
+"""Camera rays that look for the skin; rays from what they find look into its folds."""
+SIDE = 8
+"""Rays from a patch, squared."""
+STEP = 1 / 128
+BLOCK = 16
+"""Steps between two looks at which rays have ended."""
+
+
+class Bounced:
+    """`table` (6, z, y, x), which patch stands where, and `light` (views, patches + 1, 3), irradiance by other patches,
+    the last 0; from :meth:`update`. `place` (views, 3): the flashes; `power` (views, 3), as :class:`Rays`' `light`."""
+
+    def __init__(self, place: torch.Tensor, power: torch.Tensor):
+        self.place, self.power = place, power
+
+    @property
+    def known(self) -> bool:
+        return hasattr(self, "light")
+
+    def __call__(self, view: torch.Tensor, x: torch.Tensor, normal: torch.Tensor, generator: torch.Generator):
+        """Irradiance (n, 3) at the points `x` (n, 3) of photographs `view` (n,): of one patch near each, drawn so that
+        the mean is what the renderer interpolates."""
+        n, cells = len(x), radiosity.CELLS
+        u = torch.rand(n, 4, generator=generator)
+        squares = normal.detach().square()
+        axis = (u[:, 3:] * squares.sum(1, keepdim=True) > squares.cumsum(1)[:, :2]).sum(1)
+        face = 2 * axis + (normal.gather(1, axis[:, None])[:, 0] < 0)
+        i, j, k = ((x + 1) * (cells / 2) + u[:, :3] - 0.5).long().clamp(0, cells - 1).unbind(1)
+        return self.light[view, self.table[face, k, j, i]]
+
+    @torch.no_grad()
+    def update(self, networks: Networks, marched: Marched, rays: Rays, seed: int) -> None:
+        """Find the patches of the field, what they see of each other, and what of all flashes they send on."""
+        rng = np.random.default_rng(seed)
+        some = rays[torch.as_tensor(rng.integers(len(rays), size=min(SEEN, len(rays))))]
+        _, x, normal = _skin(networks, marched, some.o, some.d)
+        kept = radiosity.thin(x, normal)
+        _, *folds = _skin(networks, marched, *_above(x[kept], normal[kept], 3, rng))
+        x, normal = (np.concatenate([a[kept], b]) for a, b in zip((x, normal), folds, strict=True))
+        kept = radiosity.thin(x, normal)
+        x, normal = x[kept], normal[kept]
+        table, hits = radiosity.table(x, normal), np.full(len(x) * SIDE**2, -1)
+        ray, *there = _skin(networks, marched, *_above(x, normal, SIDE, rng))
+        hits[ray] = table[radiosity.place(*there)]
+        # All photographs at once, three columns each.
+        views, count = len(self.place), len(x)
+        _, albedo, roughness, specular = networks.reflectance(_tensor(x))
+        albedo = microfacet.diffuse_albedo(albedo, roughness[:, None], specular[:, None]).numpy()
+        direct = self._direct(marched, x, normal).transpose(1, 0, 2).reshape(count, -1)
+        light = radiosity.solve(hits.reshape(count, -1), np.tile(albedo, (1, views)), direct, -1)
+        light = np.pad(light, [(0, 1), (0, 0)]).reshape(count + 1, views, 3).transpose(1, 0, 2)
+        self.table = torch.as_tensor(np.where(table < 0, count, table))
+        self.light = torch.as_tensor(np.ascontiguousarray(light, np.float32))
+
+    def _direct(self, marched: Marched, x: np.ndarray, normal: np.ndarray) -> np.ndarray:
+        """(views, patches, 3): irradiance by the flashes alone."""
+        outside = _tensor(x + radiosity.RISE * normal)
+        normal = _tensor(normal)
+        result = torch.zeros(len(self.place), len(x), 3)
+        for place, power, lit in zip(self.place, self.power, result, strict=True):
+            away = place - outside
+            distance = away.norm(dim=1)
+            cos = (away * normal).sum(1) / distance
+            faces = (cos > 0).nonzero()[:, 0]
+            _, depth = _walk(marched, outside[faces], (away / distance[:, None])[faces], 6.0)
+            lit[faces] = (cos[faces] / distance[faces] ** 2 * torch.exp(-depth))[:, None] * power
+        return result.double().numpy()
+
+
+def _above(x: np.ndarray, normal: np.ndarray, side: int, rng: np.random.Generator):
+    """``(o, d)``, tensors (n · side², 3): rays from above the patches, cosine-distributed."""
+    d = radiosity.directions(normal, side, rng)
+    o = np.broadcast_to((x + radiosity.RISE * normal)[:, None], d.shape)
+    return _tensor(o.reshape(-1, 3)), _tensor(d.reshape(-1, 3))
+
+
+def _skin(networks: Networks, marched: Marched, o: torch.Tensor, d: torch.Tensor):
+    """``(ray, x, normal)``, arrays: which rays meet skin that faces them, where (k, 3), and its normals (k, 3)."""
+    t, _ = _walk(marched, o, d)
+    ray = t.isfinite().nonzero()[:, 0]
+    x = torch.addcmul(o[ray], d[ray], t[ray, None])
+    normal = torch.cat([networks.reflectance(part)[0] for part in x.split(65536)])
+    faces = (normal * d[ray]).sum(1) < 0
+    return ray[faces].numpy(), x[faces].double().numpy(), normal[faces].double().numpy()
+
+
+def _tensor(values: np.ndarray) -> torch.Tensor:
+    return torch.as_tensor(np.ascontiguousarray(values, np.float32))
+
+
+def _walk(marched: Marched, o: torch.Tensor, d: torch.Tensor, until: float = radiosity.DEPTH):
+    """``(t, depth)`` of rays from `o` (n, 3) along `d`: where they pass the optical depth `until` (infinity: nowhere
+    within the unit sphere), and the depth at their ends."""
+    t, depth = torch.full((len(o),), torch.inf), torch.zeros(len(o))
+    start, end = sphere_span(o, d)
+    start = torch.where((o * o).sum(1) < 1, 0.0, start)
+    active, first = (end > start).nonzero()[:, 0], 0
+    while len(active):
+        k = first + torch.arange(BLOCK)
+        along = start[active, None] + (k + 0.5) * STEP
+        x = o[active, None] + along[:, :, None] * d[active, None]
+        sigma = fetch(marched.log_sigma, x.reshape(-1, 3))[0].view(along.shape).exp()
+        sigma = torch.where((sigma > CUT) & (along < end[active, None]), sigma, 0.0)
+        total = depth[active, None] + (sigma * STEP).cumsum(1)
+        passed = total >= until
+        some = passed.any(1)
+        place = passed.to(torch.uint8).argmax(1, keepdim=True)
+        over = (total.gather(1, place) - until) / (sigma.gather(1, place) * STEP).clamp(min=1e-9)
+        at = along.gather(1, place) + (0.5 - over.clamp(0, 1)) * STEP
+        t[active] = torch.where(some, at[:, 0], t[active])
+        depth[active] = total[:, -1]
+        first += BLOCK
+        active = active[~some & (start[active] + first * STEP < end[active])]
+    return t, depth
