@@ -3,7 +3,8 @@
     python -m mi_ntf.evaluate.brightness MESH.xml FIELD [--size 96] [--depth 2]
 
 Both under a flash at the camera, a lamp, a sun, a constant environment and one of high contrast: mean brightness of the
-field over the meshes' − 1, relative RMSE as it is and after one factor a channel. `--depth`: ``max_depth`` of both.
+field over the meshes' − 1, relative RMSE as it is and after one factor a channel. `--depth`: ``max_depth`` of both; for
+others than 2 also what the bounces beyond the first add to the mean, of the field and of the meshes.
 """
 
 import argparse
@@ -43,22 +44,26 @@ def lights(scene) -> dict[str, dict]:
 
 
 def study(mesh: Path, field: Path, size: int = 96, depth: int = 2) -> dict[str, dict[str, float]]:
-    """Light → ``brightness``, ``relative_rmse``, ``aligned``."""
+    """Light → ``brightness``, ``relative_rmse``, ``aligned``; where `depth` is not 2, ``bounces`` and
+    ``mesh_bounces``."""
     original = mi.load_file(str(mesh), res=str(size))
-    shapes = {f"shape{i}": s for i, s in enumerate(original.shapes())}
+    bodies = {"mesh": {f"shape{i}": s for i, s in enumerate(original.shapes())}, "field": {"ball": field_ball(field)}}
     sensor, found = original.sensors()[0], {}
+
+    def image(kind: str, light: dict, depth: int) -> np.ndarray:
+        own = {"mesh": {"type": "path"}, "field": {"type": "nrf", "environment_lights": CELLS}}[kind]
+        integrator = {**own, "max_depth": depth, "hide_emitters": True}
+        scene = mi.load_dict({"type": "scene", "integrator": integrator, "light": light, **bodies[kind]})
+        return np.array(mi.render(scene, sensor=sensor, spp=SPP[kind]), np.float64)[..., :3]
+
     for name, light in lights(original).items():
-        images = {}
-        for kind, parts in (("mesh", shapes), ("field", {"ball": field_ball(field)})):
-            integrator = {"type": "path" if kind == "mesh" else "nrf", "max_depth": depth, "hide_emitters": True}
-            if kind == "field":
-                integrator["environment_lights"] = CELLS
-            scene = mi.load_dict({"type": "scene", "integrator": integrator, "light": light, **parts})
-            images[kind] = np.array(mi.render(scene, sensor=sensor, spp=SPP[kind]), np.float64)[..., :3]
-        ours, truth = images["field"], images["mesh"]
+        truth, ours = (image(kind, light, depth) for kind in bodies)
         found[name] = {"brightness": float(ours.mean() / truth.mean() - 1),
                        "relative_rmse": metrics.relative_rmse(ours, truth),
                        "aligned": metrics.relative_rmse(ours * metrics.alignment(ours, truth), truth)}  # fmt: skip
+        if depth != 2:
+            for key, whole, kind in (("mesh_bounces", truth, "mesh"), ("bounces", ours, "field")):
+                found[name][key] = float(whole.mean() / image(kind, light, 2).mean() - 1)
     return found
 
 
@@ -75,9 +80,12 @@ def main() -> None:
     from .. import render
 
     render.register()
-    table = Table("light", "mean brightness", "relative RMSE", "aligned")
+    titles = {"brightness": "mean brightness", "relative_rmse": "relative RMSE", "aligned": "aligned"}
+    if given.depth != 2:
+        titles |= {"bounces": "bounces add", "mesh_bounces": "to the meshes"}
+    table = Table("light", *titles.values())
     for name, row in study(given.mesh, given.field, given.size, given.depth).items():
-        table.add_row(name, f"{row['brightness']:+.1%}", f"{row['relative_rmse']:.1%}", f"{row['aligned']:.1%}")
+        table.add_row(name, *(f"{row[k]:{'+' if k == 'brightness' else ''}.1%}" for k in titles))
     Console().print(table)
 
 

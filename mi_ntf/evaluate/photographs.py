@@ -1,8 +1,9 @@
 """How a field looks beside the photographs that it was not trained on, by the renderer that users have.
 
-    python -m mi_ntf.evaluate.photographs FIELD DATASET [--mesh SCENE.xml] [--spp 32]
+    python -m mi_ntf.evaluate.photographs FIELD DATASET [--mesh SCENE.xml] [--spp 32] [--depth -1]
 
-Test views of the data set: mean PSNR and SSIM (both sRGB) of the field lit as the photograph was. With the captured
+Test views of the data set: mean PSNR and SSIM (both sRGB) of the field lit as the photograph was; `--depth`:
+``max_depth``, 2 for photographs without light that bounced. With the captured
 meshes, the mean angle between their shading normals and the field's, degrees, over pixels that both fill.
 """
 
@@ -21,7 +22,7 @@ FILLED = 0.98
 """Opacity from which on a pixel's normal counts: silhouettes mix it with nothing."""
 
 
-def study(field: Path, dataset: Path, mesh: Path | None = None, spp: int = 32) -> dict[str, float]:
+def study(field: Path, dataset: Path, mesh: Path | None = None, spp: int = 32, depth: int = -1) -> dict[str, float]:
     """``psnr`` (dB) and ``ssim``, means over the test views; with `mesh`, ``normal_error`` (degrees)."""
     split = load_dataset(dataset, lambda note: None)["test"]
     ball = field_ball(field)
@@ -31,7 +32,7 @@ def study(field: Path, dataset: Path, mesh: Path | None = None, spp: int = 32) -
         view = sensor(split, i)
         lamp = {"type": "point", "position": split.light_pos[i].tolist(),
                 "intensity": {"type": "rgb", "value": split.light_intensity[i].tolist()}}
-        integrator = {"type": "nrf", "aovs": "normal,opacity" if mesh else ""}
+        integrator = {"type": "nrf", "max_depth": depth, "aovs": "normal,opacity" if mesh else ""}
         scene = mi.load_dict({"type": "scene", "integrator": integrator, "lamp": lamp, "ball": ball})
         image = np.array(mi.render(scene, sensor=view, spp=spp, seed=i))
         truth = photograph[..., :3].astype(np.float64)
@@ -89,12 +90,13 @@ def main() -> None:
     parser.add_argument("dataset", type=Path)
     parser.add_argument("--mesh", type=Path)
     parser.add_argument("--spp", type=int, default=32)
+    parser.add_argument("--depth", type=int, default=-1)
     given = parser.parse_args()
     mi.set_variant("llvm_ad_rgb")
     from .. import render
 
     render.register()
-    for name, value in study(given.field, given.dataset, given.mesh, given.spp).items():
+    for name, value in study(given.field, given.dataset, given.mesh, given.spp, given.depth).items():
         print(f"{name:<13} {value:.4g}")
 
 

@@ -16,7 +16,7 @@ def swap(scene: Path, field: Path, out: Path) -> None:
     """Write `out`: the scene `scene` with all shapes but emitters and sensors replaced by the field `field`.
 
     The field sits in one bounding ``sphere`` with a ``null`` BSDF; centre and radius, in scene units, are those of the
-    capture. The integrator becomes ``nrf`` with ``<default name="visibility" value="auto"/>`` and keeps
+    capture. The integrator becomes ``nrf`` with ``<default name="visibility" value="auto"/>`` and keeps `max_depth` and
     `hide_emitters`. Sensors, films, emitters, parameters and includes stay; an include that holds shapes or the
     integrator is inlined, with ``$parameters`` in its name at their defaults. BSDFs and textures that nothing uses any
     more are dropped. Paths are rewritten for `out`'s folder. Comments are lost.
@@ -132,9 +132,8 @@ def _replace_integrator(root: ET.Element) -> None:
     ET.SubElement(new, "string", name="visibility", value="$visibility")
     old = root.findall("integrator")
     place = list(root).index(old[0]) if old else 0
-    hide = next((b for i in old for b in i.iter("boolean") if b.get("name") == "hide_emitters"), None)
-    if hide is not None:
-        new.append(hide)
+    for tag, name in (("integer", "max_depth"), ("boolean", "hide_emitters")):
+        new.extend([e for i in old for e in i.iter(tag) if e.get("name") == name][:1])
     for integrator in old:
         root.remove(integrator)
     root.insert(place, new)

@@ -41,13 +41,17 @@ def normals(image: Image, d: torch.Tensor, baked: Baked):
 
 ROUGH = 30.0
 """How much dearer the roughest lobe is than a sharp one."""
+FAINT = 0.005
+"""Specular weights that cost nothing. One that is pressed towards 0 before the highlights have formed ends where its
+sigmoid has no slope, and never comes back: `statue` lost the lobes of its gold that way."""
 
 
 def gloss(image: Image, count: int) -> torch.Tensor:
-    """The specular weight, the dearer the rougher: (1 + ROUGH α²) s per ray, α = roughness². What α = 1 adds under a
-    flash, a diffuse lobe of a quarter of its weight adds as well, and only that is right under other lights."""
+    """The specular weight, the dearer the rougher: (1 + ROUGH α²) (s − FAINT)⁺ per ray, α = roughness². What α = 1 adds
+    under a flash, a diffuse lobe of a quarter of its weight adds as well, and only that is right under other lights."""
     roughness, specular = image.gloss
-    return (image.weight.detach() * specular * (1 + ROUGH * roughness**4)).sum() / count
+    above = torch.relu(specular - FAINT)
+    return (image.weight.detach() * above * (1 + ROUGH * roughness**4)).sum() / count
 
 
 def evenness(networks: Networks, image: Image, count: int, generator: torch.Generator) -> torch.Tensor:

@@ -255,6 +255,7 @@ class _Loop(Descent):
         report = {k: v for k, v in self.identity.items() if k not in ("config", "field", "data")}
         if self.given is not None:
             report["field"] = self.given
+        report["bounces"] = self.bounced is not None
         report |= {"steps_done": self.step, "seconds": round(self.spent, 1), "history": self.history,
                    "kept": self.kept, "faults": self.faults}
         header = Header(self.config.architecture, self.similarity, report)

@@ -26,7 +26,7 @@ def test_a_balls_skin_is_as_bright_under_all_lights(tmp_path):
     (tmp_path / "mesh.xml").write_text(SCENE)
     skin = fields.skin("sphere", 6.0, 0.015, albedo=(0.6, 0.5, 0.4), specular=1e-6)
     path = pictures.save(tmp_path, (skin.header, skin.tensors), "ball")
-    found = brightness.study(tmp_path / "mesh.xml", path, 32)
+    found = brightness.study(tmp_path / "mesh.xml", path, 32, 3)
     assert list(found) == ["flash", "lamp", "sun", "constant", "sky"]
     for name, row in found.items():
         assert (1 + row["brightness"]) / (1 + found["flash"]["brightness"]) == pytest.approx(1, abs=0.035), name

@@ -72,12 +72,13 @@ def test_meshes_become_one_sphere_with_the_field(folder):
     assert medium.find("string").attrib == {"name": "filename", "value": "f.safetensors"}
 
 
-def test_integrator_is_replaced_and_keeps_hide_emitters(folder):
+def test_integrator_is_replaced_and_keeps_depth_and_hide_emitters(folder):
     root = _swap(folder, folder / "scene.xml")
     (integrator,) = root.findall("integrator")
     assert integrator.get("type") == "nrf"
     assert [(e.tag, e.get("name"), e.get("value")) for e in integrator] == [
         ("string", "visibility", "$visibility"),
+        ("integer", "max_depth", "6"),
         ("boolean", "hide_emitters", "true"),
     ]
     assert {d.get("name"): d.get("value") for d in root.findall("default")} == {

@@ -29,7 +29,8 @@ def rays(n=4):
     o[:, 2] = -3.0
     d = torch.tensor([0.0, 0.0, 1.0]).expand(n, 3)
     t0, t1 = sphere_span(o, d)
-    return Rays(o, d, t0, t1, torch.zeros(n, 4), torch.full((n, 3), LIGHT))
+    return Rays(o, d, t0, t1, torch.zeros(n, 4), torch.full((n, 3), LIGHT),
+                torch.zeros(n, dtype=torch.long))
 
 
 class Slab:
@@ -188,7 +189,7 @@ def test_evenness_sees_slopes_along_the_surface_alone():
     def image(normal):
         n = 500
         return render.Image(color=None, alpha=None, x=torch.zeros(n, 3), shaded=None, index=None, weight=torch.ones(n),
-                            gloss=None, normal=torch.tensor(normal).expand(n, 3), radiance=None, raw=None)
+                            gloss=None, normal=torch.tensor(normal).expand(n, 3), radiance=None, raw=None, bounced=0.0)
 
     generator = torch.Generator().manual_seed(0)
     # float32 rounding of offsets of 0.02
@@ -237,8 +238,9 @@ def test_held_out_score_of_a_network_that_knows_no_shadow():
 
 
 def test_rough_lobes_cost_more():
-    """Σ w s (1 + 30 α²) per ray."""
-    gloss = torch.tensor([1.0, 0.5]), torch.tensor([0.2, 0.4])
-    image = render.Image(color=None, alpha=None, x=None, shaded=None, index=None, weight=torch.tensor([0.5, 0.25]),
-                         normal=None, gloss=gloss, radiance=None, raw=None)
+    """Σ w (s − 0.005)⁺ (1 + 30 α²) per ray."""
+    gloss = torch.tensor([1.0, 0.5, 1.0]), torch.tensor([0.205, 0.405, 0.004])
+    image = render.Image(color=None, alpha=None, x=None, shaded=None, index=None,
+                         weight=torch.tensor([0.5, 0.25, 0.25]),
+                         normal=None, gloss=gloss, radiance=None, raw=None, bounced=0.0)
     assert float(losses.gloss(image, 4)) == pytest.approx((0.5 * 0.2 * 31 + 0.25 * 0.4 * (1 + 30 / 16)) / 4)

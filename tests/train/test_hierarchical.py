@@ -80,7 +80,7 @@ def test_view_of_a_half_space():
     n = 50
     o, d = torch.tensor([0.2, 0.0, -3.0]).expand(n, 3), torch.tensor([0.0, 0.0, 1.0]).expand(n, 3)
     t0, t1 = sphere_span(o, d)
-    rays = Rays(o, d, t0, t1, torch.zeros(n, 4), torch.ones(n, 3))
+    rays = Rays(o, d, t0, t1, torch.zeros(n, 4), torch.ones(n, 3), torch.zeros(n, dtype=torch.long))
     seen = hierarchical.view(Slab(), Slab(), rays, (64, 128), torch.Generator().manual_seed(0))
     assert seen.t.shape == (n, 192) and (seen.t.diff(dim=1) >= 0).all()
     assert (seen.t >= t0[:, None]).all() and (seen.t <= t1[:, None] + 1e-5).all()
