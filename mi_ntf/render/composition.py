@@ -9,7 +9,7 @@ from ..core.errors import MiNtfError
 from ..infer import march, shade
 from ..infer.visibility import outside
 from . import effects, environment, lights, visibility
-from .bounced import Bounced
+from .bounced import Bounced, Patches
 from .surfaces import Surfaces
 from .walk import Paths, Walk
 
@@ -88,7 +88,9 @@ class Composition:
             self.surfaces = Surfaces(scene, shapes, integrator.hide_emitters, self.transmittance)
         self._bounced = None
         if self.effects.bounces == "radiosity" and self.parts:
-            self._bounced = self._with_all_lights(lambda: Bounced(self, integrator.max_depth))
+            if not integrator.patches or not integrator.patches.of(self):
+                integrator.patches = Patches(self)
+            self._bounced = self._with_all_lights(lambda: Bounced(self, integrator.patches, integrator.max_depth))
 
     def _runs(self) -> list:
         """Runs of the table's lights, (first, last), whose maps fit into memory together; [None] for all at once, as
@@ -141,8 +143,9 @@ class Composition:
                 tau = tau * _tau(part.frame, part.drawn, p, d, distance, mi.UInt32(0), active)
         return tau
 
-    def strands(self, ray, parts):
-        """``(strands, unit)`` of scene rays through `parts`: t counts in `unit`, scene lengths."""
+    def strands(self, ray, parts, steps=None):
+        """``(strands, unit)`` of scene rays through `parts`: t counts in `unit`, scene lengths. `steps` across the unit
+        sphere's diameter: the integrator's `samples` unless told."""
         several = len(parts) > 1
         unit = min(p.frame.length for p in parts)
         result = [
@@ -151,17 +154,17 @@ class Composition:
                 p.medium.field.grid,
                 p.frame.point_to_field(ray.o),
                 p.frame.direction_to_field(ray.d),
-                dr.opaque(mi.Float, 2 / self.integrator.samples),
+                dr.opaque(mi.Float, 2 / (steps or self.integrator.samples)),
                 dr.opaque(mi.Float, unit / p.frame.length) if several else None,
             )
             for p in parts
         ]
         return result, unit
 
-    def fly(self, ray, maxt, offset, depth, which):
+    def fly(self, ray, maxt, offset, depth, which, steps=None):
         """:func:`mi_ntf.infer.march.free_flight` of scene rays through all fields: ``(hit, t, index)``, t in scene
-        lengths from the ray's origin."""
-        strands, unit = self.strands(ray, self.parts)
+        lengths from the ray's origin. `steps`: as for :meth:`strands`."""
+        strands, unit = self.strands(ray, self.parts, steps)
         hit, t, index, bundle = march.free_flight(strands, maxt / unit, offset, depth, which)
         return hit, (bundle.base + t) * unit, index
 

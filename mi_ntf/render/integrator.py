@@ -90,6 +90,7 @@ def integrator_class() -> type:
             self.aovs = aovs.parse(read.text("aovs", ""))
             read.flag("hide_emitters", False)
             self.lights_seen = 0
+            self.patches = None  # of the fields rendered last, by radiosity
             props["timeout"] = -1.0
             mi.SamplingIntegrator.__init__(self, props)
 
