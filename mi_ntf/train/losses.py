@@ -42,8 +42,7 @@ def normals(image: Image, d: torch.Tensor, baked: Baked):
 ROUGH = 30.0
 """How much dearer the roughest lobe is than a sharp one."""
 FAINT = 0.005
-"""Specular weights that cost nothing. One that is pressed towards 0 before the highlights have formed ends where its
-sigmoid has no slope, and never comes back: `statue` lost the lobes of its gold that way."""
+"""Specular weights that cost nothing: none is pressed on to where its sigmoid has no slope, and no way back."""
 
 
 def gloss(image: Image, count: int) -> torch.Tensor:
