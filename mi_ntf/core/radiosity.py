@@ -82,6 +82,8 @@ def solve(hits: np.ndarray, albedo: np.ndarray, direct: np.ndarray, bounces: int
     bounces  how often light is sent on, at most; −1: until it changes by less than CONVERGED
     """
     light = np.zeros_like(direct)
+    if not len(direct):
+        return light
     for _ in range(MOST_BOUNCES if bounces < 0 else min(bounces, MOST_BOUNCES)):
         sent = np.concatenate([albedo * (direct + light), np.zeros((1, direct.shape[1]))])
         before, light = light, np.stack([c[hits].mean(1) for c in sent.T], 1)

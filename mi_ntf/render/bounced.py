@@ -54,7 +54,9 @@ class Patches:
             origins.append(np.array(skin.frame.point_to_world(_vector(o))))
             ways.append(np.array(skin.frame.direction_to_world(_vector(d))))
         o, d = (mi.Vector3f(np.concatenate(v, 1)) for v in (origins, ways))
-        n = dr.width(o)
+        n, nothing = dr.width(o), (np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, int))
+        if not n:
+            return [nothing] * len(self.skins)
         steps = min(STEPS, composition.integrator.samples)
         hit, t, which = composition.fly(mi.Ray3f(mi.Point3f(o), d), dr.full(mi.Float, dr.inf, n),
                                         mi.Float(rng.random(n)), mi.Float(radiosity.DEPTH), mi.Float(0.5), steps)
@@ -63,6 +65,9 @@ class Patches:
         result = []
         for i, skin in enumerate(self.skins):
             index = np.flatnonzero(hit & (which == i))
+            if not len(index):
+                result.append(nothing)
+                continue
             k = mi.UInt32(index)
             along = dr.gather(mi.Vector3f, d, k)
             x = dr.gather(mi.Vector3f, o, k) + dr.gather(mi.Float, t, k) * along
@@ -96,6 +101,8 @@ class Bounced:
 def _direct(composition, part, skin: "_Skin") -> np.ndarray:
     """(patches, 3): irradiance of the `skin` of `part` by the lights alone."""
     n = len(skin.position)
+    if not n:
+        return np.zeros((0, 3))
     one, zero = dr.ones(mi.Float, n), dr.zeros(mi.Float, n)
     normal = tuple(_vector(skin.normal))
     white = shade.Points(tuple(_vector(skin.outside)), normal, (normal, (one, one, one), one, zero, zero))
@@ -123,6 +130,8 @@ class _Skin:
 
     def reflectance(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Normals and diffuse albedos (n, 3) at field points."""
+        if not len(x):
+            return np.zeros((0, 3)), np.zeros((0, 3))
         normal, albedo, roughness, specular, _ = self._reflectance(tuple(_vector(x)))
         albedo = [microfacet.diffuse_albedo(k, roughness, specular) for k in albedo]
         dr.eval(normal, albedo)

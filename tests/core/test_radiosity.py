@@ -65,3 +65,9 @@ def test_a_closed_box_gathers_the_geometric_series():
     direct = np.ones((5, 3))
     found = radiosity.solve(hits, np.full((5, 3), 0.5), direct, -1)
     np.testing.assert_allclose(direct + found, 2, rtol=2e-3)  # ends when a bounce adds less than 1e-3
+
+
+def test_no_patches_send_no_light():
+    nothing = np.zeros((0, 3))
+    assert (radiosity.table(nothing, nothing) == -1).all() and not len(radiosity.thin(nothing, nothing))
+    assert radiosity.solve(np.zeros((0, 4), int), nothing, nothing, -1).shape == (0, 3)

@@ -49,8 +49,8 @@ def added_to_mesh(light: dict, depth: int) -> np.ndarray:
     return means[1] / means[0] - 1
 
 
-@pytest.mark.parametrize("kind", ["sun", "sky"])
-@pytest.mark.parametrize("depth", [3, -1])
+@pytest.mark.parametrize(("kind", "depth"), [("sun", 3), ("sky", -1), pytest.param("sun", -1, marks=pytest.mark.slow),
+                                             pytest.param("sky", 3, marks=pytest.mark.slow)])  # fmt: skip
 def test_two_spheres_light_each_other_as_surfaces_do(skin, kind, depth):
     light = {"sun": SUN, "sky": {"type": "constant"}}[kind]
     things = {"sensor": look(), "light": light, **pair(skin)}
@@ -95,3 +95,12 @@ def test_what_radiosity_does_not_know_is_traced_or_refused(skin, tmp_path):
             scene.integrator().render(scene, spp=1)
         paths, auto = (pictures.render("raymarch", other, spp=1, max_depth=3, bounces=b) for b in ("paths", "auto"))
         np.testing.assert_array_equal(auto, paths)
+
+
+def test_a_field_that_no_line_meets(tmp_path):
+    """A speck of a thousandth of the sphere: nothing to find, and nothing breaks."""
+    made = fields.blobs([(0.2, 0, 0)], [0.004], log_density=6.5, edge=2)
+    things = {"sensor": pictures.camera((0, 0, 3), fov=1.0), "sun": SUN,
+              "ball": pictures.ball(pictures.save(tmp_path, made), resolution=64)}  # fmt: skip
+    image = pictures.render("raymarch", things, max_depth=-1)
+    assert np.isfinite(image).all()

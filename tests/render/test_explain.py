@@ -100,7 +100,8 @@ def test_table_names_every_effect_and_stage(capsys):
 def test_measured_beside_predicted(tmp_path, capsys):
     """The kernels' seconds are those of the whole render, but for Python and the film. In a process of its own: Dr.Jit
     counts the memory of all that lives in one."""
-    words = ("-Dvisibility=transmittance_map", "-Dlight=point", "-Dres=32", "-Dspp=4", "--measure", "--json")
+    words = ("-Dvisibility=transmittance_map", "-Dlight=point", "-Dres=32", "-Dspp=4", "-Ddepth=2", "--measure",
+             "--json")
     done = run_program("mi-ntf", "explain", SCENE, *words, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
