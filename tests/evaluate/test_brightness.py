@@ -20,13 +20,25 @@ SCENE = """<scene version="3.9.0">
 </scene>"""
 
 
+def test_what_bounces_add(tmp_path, monkeypatch):
+    """To a ball nothing, of either kind."""
+    mi.set_variant(VARIANT)
+    (tmp_path / "mesh.xml").write_text(SCENE)
+    skin = fields.skin("sphere", 6.0, 0.015, albedo=(0.6, 0.5, 0.4), specular=1e-6)
+    path = pictures.save(tmp_path, (skin.header, skin.tensors), "ball")
+    every = brightness.lights
+    monkeypatch.setattr(brightness, "lights", lambda scene: {"sun": every(scene)["sun"]})
+    found = brightness.study(tmp_path / "mesh.xml", path, 16, 3)["sun"]
+    assert found["bounces"] == pytest.approx(0, abs=1e-3) and found["mesh_bounces"] == pytest.approx(0, abs=1e-3)
+
+
 def test_a_balls_skin_is_as_bright_under_all_lights(tmp_path):
     """Relative to the flash, since the skin is wider than the ball. Without softness: 1.08 under the constant light."""
     mi.set_variant(VARIANT)
     (tmp_path / "mesh.xml").write_text(SCENE)
     skin = fields.skin("sphere", 6.0, 0.015, albedo=(0.6, 0.5, 0.4), specular=1e-6)
     path = pictures.save(tmp_path, (skin.header, skin.tensors), "ball")
-    found = brightness.study(tmp_path / "mesh.xml", path, 32, 3)
+    found = brightness.study(tmp_path / "mesh.xml", path, 32)
     assert list(found) == ["flash", "lamp", "sun", "constant", "sky"]
     for name, row in found.items():
         assert (1 + row["brightness"]) / (1 + found["flash"]["brightness"]) == pytest.approx(1, abs=0.035), name

@@ -11,13 +11,13 @@ from mi_ntf.infer.visibility import raymarch
 
 SCENES = Path(__file__).parents[2] / "scenes"
 TOLERANCE = {
-    "raymarch": {"statue": 0.0033, "globe": 0.0026, "knot": 0.0017},
-    "neural_transmittance": {"statue": 0.027, "globe": 0.043, "knot": 0.021},
-    "transmittance_map": {"statue": 0.049, "globe": 0.055, "knot": 0.042},  # texels as wide as the finer shadows
-    "transmittance_volume": {"statue": 0.078, "globe": 0.048, "knot": 0.0135},  # where one skin outshines the next
-    "visibility_mlp": {"statue": 0.43, "globe": 0.39, "knot": 0.25},  # a small network that knows the object by heart
+    "raymarch": {"statue": 0.0033, "globe": 0.0047, "knot": 0.0032},
+    "neural_transmittance": {"statue": 0.027, "globe": 0.041, "knot": 0.021},
+    "transmittance_map": {"statue": 0.055, "globe": 0.073, "knot": 0.052},  # texels as wide as the finer shadows
+    "transmittance_volume": {"statue": 0.07, "globe": 0.075, "knot": 0.046},  # where one skin outshines the next
+    "visibility_mlp": {"statue": 0.43, "globe": 0.43, "knot": 0.37},  # a small network that knows the object by heart
 }
-"""Relative RMSE of the image: 1.08 to 1.4 times that of the emitter that errs most, measured with seed 0."""
+"""Relative RMSE of the image: 1.15 to 1.3 times that of the emitter that errs most, measured with seed 0."""
 DRAWN = ("area", "projector")
 """What they shine is marched under maps and volumes."""
 KINDS = ("point", "spot", "directional", "constant", "envmap", "sunsky", "area", "projector", "directionalarea")
