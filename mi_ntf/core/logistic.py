@@ -84,13 +84,20 @@ def tanh(ops, z):
     return 2 * sigmoid(ops, 2 * z) - 1
 
 
-def through_quantiles(ops, t75, t50, t25):
+def through_quantiles(ops, t75, t50, t25, cos):
     """The logistic through three crossings, ``(a, b)`` in closed form.
 
     `t75`, `t50`, `t25`: where τ is 3/4, 1/2, 1/4 (t75 ≥ t50 ≥ t25: τ falls away from the light, towards smaller t).
-    logit(3/4) − logit(1/4) = 2 ln 3, hence a = 2 ln 3/(t75 − t25). b = t50 for a symmetric profile. Density that rises
-    exponentially into a skin has τ = exp(−e^−t) instead, steeper on the dark side: the least-squares logistic under the
-    camera's own weights then lies 0.35 of the quartiles' asymmetry closer to the light.
+    logit(3/4) − logit(1/4) = 2 ln 3, hence a = 2 ln 3/(t75 − t25).
+
+    b = t50 for a symmetric profile; others are met where cameras look. `cos`, in (0, 1]: the light's, on the skin that
+    the ray enters. Who looks at that skin at a cosine of 2/3 sees τ = uʳ, r = 2/(3 cos), with u uniform in [0, 1]. The
+    mean of S − τ over u vanishes for a b that lies k times the quartiles' asymmetry closer to the light; k here is that
+    of densities that rise exponentially into a skin, τ = exp(−e^−t), and that of constant ones, which are asymmetric
+    the other way, from cos = 1 to 0.05.
     """
     slope = 2.1972245773362196 / ops.maximum(t75 - t25, 1e-6)
-    return ops.minimum(slope, MAX_SLOPE), t50 + 0.35 * ((t75 - t50) - (t50 - t25))
+    bent = (t75 - t50) - (t50 - t25)
+    slant = -ops.log(ops.maximum(cos, 0.05))
+    share = ops.where(bent > 0, 0.45 + slant * (0.25 + 0.125 * slant), 0.54 + 0.025 * slant * slant)
+    return ops.minimum(slope, MAX_SLOPE), t50 + share * bent

@@ -113,7 +113,7 @@ def build(method: str, medium, table, options: Options):
     made_by = (
         map_source.network_source(field.network, reader, _inside(table))
         if network
-        else map_source.field_source(reader, options.map_components)
+        else map_source.field_source(source, reader, options.map_components)
     )
 
     def make(values=None):

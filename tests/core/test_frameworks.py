@@ -88,8 +88,8 @@ FORMULAS = [
     Formula("parameters", lambda o, *c: logistic.parameters(o, *c), (_uniform(-12, 12), _uniform(-5, 5),
             _uniform(0.05, 1)), 3e-6, 1e-5),
     # t75 − t25 ≥ 0.04, rounded by 1e-7. ∂a/∂b is the difference of two terms 2.2/0.04², each rounded by 6e-8.
-    Formula("through_quantiles", lambda o, b, u, v: logistic.through_quantiles(o, b + u, b, b - v),
-            (T, _log_uniform(0.02, 1), _log_uniform(0.02, 1)), 3e-6, 3e-5, 10.0),
+    Formula("through_quantiles", lambda o, b, u, v, c: logistic.through_quantiles(o, b + u, b, b - v, c),
+            (T, _log_uniform(0.02, 1), _log_uniform(0.02, 1), _log_uniform(0.01, 1)), 3e-6, 3e-5, 10.0),
     # dD/dα is a difference of two terms 1000 times its value where it crosses zero.
     Formula("ggx", lambda o, s, a: [microfacet.ggx(s, a)], (_uniform(0, 1), _log_uniform(0.0225, 1)), 1e-6, 3e-5),
     Formula("smith_g1", lambda o, c, a: [microfacet.smith_g1(o, c, a)], (_uniform(0, 1), _log_uniform(0.0225, 1)),
@@ -141,7 +141,7 @@ SINGULAR = {
     "step of no width": (lambda o, x: [logistic.mean_transmittance(o, x, x, 600 * x, 0 * x)], 1.0),
     "huge logit": (lambda o, x: [logistic.sigmoid(o, x), logistic.sigmoid(o, -x), logistic.softplus(o, x)], 1e30),
     "huge raw parameters": (lambda o, x: logistic.parameters(o, x, -x, 0.5 + 0 * x), 1e30),
-    "coinciding quantiles": (lambda o, x: logistic.through_quantiles(o, x, x, x), 0.3),
+    "coinciding quantiles": (lambda o, x: logistic.through_quantiles(o, x, x, x, 0 * x), 0.3),
     "grazing both": (lambda o, x: microfacet.lobes(o, (1 + 0 * x, x, x), (x, 1 + 0 * x, x), (x, x, 1 + 0 * x), 1 + x),
                      0.0),
     "opposite directions": (_opposite, 1.0),

@@ -84,6 +84,15 @@ def _normalised_truth(o, t, h, a1, b1, a2, b2, logit):
 
 
 # z = a (t − b) is rounded by 6e-8·|z|: that times a quarter of τ, and a times it of ∂τ/∂t, whose own size is a/4.
+def _quartiles(o, b, u, v):
+    """The logistic through quartiles `u` above and `v` below the median `b`, lit from overhead."""
+    return logistic.through_quantiles(o, b + u, b, b - v, 1 + 0 * b)
+
+
+def _centre(b, u, v):
+    return b + np.where(np.subtract(u, v) > 0, 0.45, 0.54) * np.subtract(u, v)
+
+
 CASES = [
     Case("slope 0", _tau, _expit, ([-1, 0, 0.5, 1], [0, 1e-30, 1e-7, 0], [0.3, -0.3, 1, -1])),
     Case("slope 0 far away", _tau, _expit, ([-1e4, 1e4], [0, 1e-30], [0.3, -0.3]), gradient=1e-6, unit=1e4),
@@ -126,13 +135,14 @@ CASES = [
     Case("mean over all of a step", lambda o, t, w, a, b: [logistic.mean_transmittance(o, t, t + w, a, b)],
          lambda o, t, w, a, b: [(np.logaddexp(0, a * (t + w - b)) - np.logaddexp(0, a * (t - b))) / (a * w)],
          ([-1, -1, -1, -1e4], [2, 2, 2, 2e4], [STEEPEST, STEEPEST, 1e5, 1], [0.25, 0.5, 0.5, 0.5]), 3e-6, 1e-5),
-    Case("quartiles 1e-2 apart", lambda o, b, u, v: logistic.through_quantiles(o, b + u, b, b - v),
-         lambda o, b, u, v: [2 * np.log(3) / (u + v), b + 0.35 * (u - v)],
+    Case("quartiles 1e-2 apart", _quartiles,
+         lambda o, b, u, v: [2 * np.log(3) / (u + v), _centre(b, u, v)],
          ([0.5, -0.5], [0.005, 0.009], [0.005, 0.001]), 3e-5, 1e-4, 2e4),
-    Case("quartiles that coincide", lambda o, b, u, v: logistic.through_quantiles(o, b + u, b, b - v),
-         lambda o, b, u, v: [STEEPEST + 0 * b, b + 0.35 * (u - v)], ([0.5, -0.5, 0.1], [0] * 3, [0] * 3), 1e-6),
-    Case("quartiles out of order by rounding", lambda o, b, u, v: logistic.through_quantiles(o, b + u, b, b - v),
-         lambda o, b, u, v: [STEEPEST + 0 * b, b + 0.35 * (u - v)], ([0.5, -0.5], [-1e-7, -6e-8], [0, 0]), 1e-6),
+    # A kink: b moves by 0.45 and 0.54 of a bend to either side, and any slope between them is one.
+    Case("quartiles that coincide", _quartiles,
+         lambda o, b, u, v: [STEEPEST + 0 * b, _centre(b, u, v)], ([0.5, -0.5, 0.1], [0] * 3, [0] * 3), 1e-6, 0.05),
+    Case("quartiles out of order by rounding", _quartiles,
+         lambda o, b, u, v: [STEEPEST + 0 * b, _centre(b, u, v)], ([0.5, -0.5], [-1e-7, -6e-8], [0, 0]), 1e-6),
     Case("logits of ±1e30 of the sigmoid", lambda o, z: [logistic.sigmoid(o, z), logistic.softplus(o, z)],
          lambda o, z: [expit(z), np.logaddexp(0, z)], ([1e30, -1e30, 88, -88, 0],), 1e-6, 1e-6),
 ]  # fmt: skip

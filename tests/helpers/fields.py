@@ -85,6 +85,13 @@ def _outward_reflectance(t, albedo, roughness, specular) -> None:
     b1[7] = _logit(specular)
 
 
+def _slopes(t, x, y) -> None:
+    """Normals (x, y, 1), normalised, of the points' first two coordinates, in place of outward ones."""
+    planes = t["reflectance.planes.0"]
+    planes[...] = 1
+    planes[0, :, :, 0], planes[0, :, :, 1] = x, y
+
+
 def empty() -> tuple[Header, dict]:
     """No density anywhere."""
     header, t = blobs([(0, 0, 0)], [0.3])
@@ -126,7 +133,7 @@ class Skin:
 
 
 def skin(kind: str, log_density: float = 5.0, scale: float = 0.01, **options) -> Skin:
-    """`plane`: z < 0; `sphere`: radius ½; `bumps`: z < 0.08 cos 9x cos 9y. Normals: z, or away from the centre."""
+    """`plane`: z < 0; `sphere`: radius ½; `bumps`: z < 0.08 cos 9x cos 9y. Normals are the surface's."""
     u, v = _axes()
     header, t = blobs([(0, 0, 0)], [0.3], **options)
     planes = t["density.planes.0"]
@@ -141,8 +148,7 @@ def skin(kind: str, log_density: float = 5.0, scale: float = 0.01, **options) ->
         height = 0.0 if kind == "plane" else 0.08
         planes[1, :, :, 0], planes[0, :, :, 1] = v, np.cos(9 * u) * np.cos(9 * v)
         weights[0], weights[1], offset = 1, -height, 0.0
-        last = t["reflectance.layers.1.bias"]
-        constant(t, "reflectance", [0, 0, 1, *last[3:]])
+        _slopes(t, 9 * height * np.sin(9 * u) * np.cos(9 * v), 9 * height * np.cos(9 * u) * np.sin(9 * v))
 
         def distance(x):
             return x[:, 2] - height * np.cos(9 * x[:, 0]) * np.cos(9 * x[:, 1])

@@ -82,8 +82,8 @@ def random_rays(rays, index, rng, count=300):
 @pytest.mark.parametrize("name", LIGHTS)
 def test_texel_centre_returns_its_own_ray(grid, network, reader, name, source, rng):
     """A point on a texel's ray sees that ray's own mixture, exactly."""
-    made = {"network": lambda: network_source(network, reader), "field": lambda: field_source(reader),
-            "mixture": lambda: field_source(reader, 2)}[source]()
+    made = {"network": lambda: network_source(network, reader), "field": lambda: field_source(grid, reader),
+            "mixture": lambda: field_source(grid, reader, 2)}[source]()
     tmap = TransmittanceMap(table(name), 32, grid.hull, made, mi)
     o, d, end = random_rays(tmap.rays, 0, rng)
     where = np.minimum(rng.uniform(-0.4, 0.4, 300), end - 0.02)
@@ -117,7 +117,7 @@ def test_interpolation_reproduces_a_smooth_map(grid, name, rng):
 @pytest.mark.parametrize("name", LIGHTS)
 def test_field_source_matches_the_march(grid, reader, name, components, rng):
     """Maps of the field at points in the open and in shadow, wherever the light is."""
-    tmap = TransmittanceMap(table(name), 256, grid.hull, field_source(reader, components), mi)
+    tmap = TransmittanceMap(table(name), 256, grid.hull, field_source(grid, reader, components), mi)
     x = rng.uniform(-0.6, 0.6, (4000, 3))
     truth = marched(grid, x, name)
     error = np.abs(look(tmap, x, name) - truth)
@@ -131,7 +131,7 @@ def test_field_source_matches_the_march(grid, reader, name, components, rng):
 @pytest.mark.parametrize("name", LIGHTS)
 def test_transmittance_along_texel_rays(grid, network, reader, name, source, rng):
     """In [0, 1], growing towards the light, 1 there."""
-    made = network_source(network, reader) if source == "network" else field_source(reader, 2)
+    made = network_source(network, reader) if source == "network" else field_source(grid, reader, 2)
     tmap = TransmittanceMap(table(name), 32, grid.hull, made, mi)
     o, d, end = random_rays(tmap.rays, 0, rng, 100)
     far = np.minimum(end - 1e-3, 1.0)
@@ -174,7 +174,7 @@ def test_which_lights_look_everywhere(grid):
 
 
 def test_outside_and_clear_rays_are_lit(grid, reader):
-    tmap = TransmittanceMap(table("sun"), 16, grid.hull, field_source(reader), mi)
+    tmap = TransmittanceMap(table("sun"), 16, grid.hull, field_source(grid, reader), mi)
     b = np.array(tmap.values)[1::2]
     assert (b == CLEAR).any() and (b > -1.5).any()
     assert look(tmap, np.array([[0.0, 0.9, -0.9]]), "sun") == 1

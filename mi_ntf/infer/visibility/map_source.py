@@ -73,14 +73,16 @@ LEVELS = (1e-3, math.log(4 / 3), math.log(2), math.log(4))
 """Optical depths where matter begins and where τ is 3/4, 1/2 and 1/4."""
 
 
-def field_source(profile, components: int = 1) -> Source:
+def field_source(field, profile, components: int = 1) -> Source:
     """`map_source=field`: march the field once per ray, from the light inwards. One logistic follows in closed form
-    from τ's quartiles, two by least squares on twelve levels of τ."""
+    from τ's quartiles and the slant of the skin there, two by least squares on twelve levels of τ."""
 
     def one(o, d, end):
-        hit, _m, h = spheres.chord(ops, o, d)
+        hit, m, h = spheres.chord(ops, o, d)
         (first, *places), depth = profile(o, d, LEVELS, end)
-        a, b = logistic.through_quantiles(ops, *places)
+        normal = field.reflectance(tuple(mi + places[1] * di for mi, di in zip(m, d, strict=True)))[0]
+        cos = dr.abs(normal[0] * d[0] + normal[1] * d[1] + normal[2] * d[2])
+        a, b = logistic.through_quantiles(ops, *places, cos)
         a_part, b_part = _partial(h, first, depth)
         blocked, clear = depth >= LEVELS[-1], ~hit | (depth < LEVELS[0])
         a, b = dr.select(blocked, a, a_part), dr.select(blocked, b, b_part)
