@@ -8,7 +8,7 @@ import mitsuba as mi
 from ..core.errors import MiNtfError
 from ..infer import march, shade
 from ..infer.visibility import outside
-from . import effects, environment, lights, visibility
+from . import effects, environment, lights, measure, visibility
 from .bounced import Bounced, Patches
 from .surfaces import Surfaces
 from .walk import Paths, Walk
@@ -88,9 +88,10 @@ class Composition:
             self.surfaces = Surfaces(scene, shapes, integrator.hide_emitters, self.transmittance)
         self._bounced = None
         if self.effects.bounces == "radiosity" and self.parts:
-            if not integrator.patches or not integrator.patches.of(self):
-                integrator.patches = Patches(self)
-            self._bounced = self._with_all_lights(lambda: Bounced(self, integrator.patches, integrator.max_depth))
+            with measure.by_clock("bounces"):
+                if not integrator.patches or not integrator.patches.of(self):
+                    integrator.patches = Patches(self)
+                self._bounced = self._with_all_lights(lambda: Bounced(self, integrator.patches, integrator.max_depth))
 
     def _runs(self) -> list:
         """Runs of the table's lights, (first, last), whose maps fit into memory together; [None] for all at once, as
