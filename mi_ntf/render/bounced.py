@@ -12,9 +12,11 @@ CHORDS = 1 << 16
 """Random lines through a field's sphere that look for its skin; rays from what they find look into its folds."""
 STEPS = 256
 """Steps of all these rays across a sphere, at most: thinner sheets than 1/128 of its radius are seldom opaque."""
+FEW = 4
+"""Rays from a patch, squared, that look for further patches."""
 SIDE = 12
-"""Rays from a patch, squared: where a tenth of them meets something, the bounced light is right within a quarter, and
-pictures show the mean of some patches."""
+"""Rays from a patch, squared, for its light: where a tenth of them meets something, the bounced light is right within a
+quarter, and pictures show the mean of some patches."""
 SEED = 7
 
 
@@ -25,8 +27,8 @@ class Patches:
     def __init__(self, composition):
         rng = np.random.default_rng(SEED)
         self.media = [part.medium for part in composition.parts]
-        self.skins = [_Skin(medium, rng) for medium in self.media]
-        for skin, (x, d, _) in zip(self.skins, self._trace(composition, 4, rng), strict=True):
+        self.skins = [Skin(medium, rng) for medium in self.media]
+        for skin, (x, d, _) in zip(self.skins, self._trace(composition, FEW, rng), strict=True):
             skin.add(x, d)
         self.first = np.cumsum([0, *(len(s.position) for s in self.skins)])
         self.albedo = np.concatenate([s.albedo for s in self.skins])
@@ -98,7 +100,7 @@ class Bounced:
                 for k, e in zip(albedo, light, strict=True)]
 
 
-def _direct(composition, part, skin: "_Skin") -> np.ndarray:
+def _direct(composition, part, skin: "Skin") -> np.ndarray:
     """(patches, 3): irradiance of the `skin` of `part` by the lights alone."""
     n = len(skin.position)
     if not n:
@@ -110,7 +112,7 @@ def _direct(composition, part, skin: "_Skin") -> np.ndarray:
     return _rows(light) * np.pi
 
 
-class _Skin:
+class Skin:
     """The patches of one `medium`: `position`, `normal`, `albedo` (n, 3); `outside`, points above them; `table`."""
 
     def __init__(self, medium, rng):
@@ -143,15 +145,20 @@ def _chords(medium, rng) -> tuple[np.ndarray, np.ndarray]:
     o = rng.normal(size=(CHORDS, 3))
     o /= np.linalg.norm(o, axis=1, keepdims=True)
     d = -radiosity.directions(o, 1, rng)[:, 0]
-    start = _vector(o - 0.1 * d)
-    strand = march.Strand(medium.source.density, medium.field.grid, tuple(start), tuple(_vector(d)),
-                          dr.opaque(mi.Float, 2 / STEPS))
-    hit, t, _, bundle = march.free_flight([strand], dr.full(mi.Float, dr.inf, CHORDS), mi.Float(rng.random(CHORDS)),
+    met, x = meet(medium.source.density, medium.field.grid, o - 0.1 * d, d, rng)
+    return x[met], d[met]
+
+
+def meet(density, grid, o: np.ndarray, d: np.ndarray, rng) -> tuple[np.ndarray, np.ndarray]:
+    """Whether rays (n, 3), field coordinates, meet the skin of a field, and where first; `density`, `grid`: as of
+    :class:`mi_ntf.infer.march.Strand`."""
+    n, start, along = len(o), _vector(o), _vector(d)
+    strand = march.Strand(density, grid, tuple(start), tuple(along), dr.opaque(mi.Float, 2 / STEPS))
+    hit, t, _, bundle = march.free_flight([strand], dr.full(mi.Float, dr.inf, n), mi.Float(rng.random(n)),
                                           mi.Float(radiosity.DEPTH), mi.Float(0.5))
-    x = start + (bundle.base + t) * _vector(d)
+    x = start + (bundle.base + t) * along
     dr.eval(x, hit)
-    met = hit.numpy()
-    return _rows(x)[met], d[met]
+    return hit.numpy(), _rows(x)
 
 
 def _vector(rows: np.ndarray):

@@ -9,9 +9,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core import radiosity
 from ..infer import march, shade
 from ..infer.lights import LightTable
-from . import cost, visibility
+from . import bounced, cost, visibility
 
 SAMPLES = 384
 WIDTH = 1 << 15
@@ -41,16 +42,20 @@ def calibrate(medium) -> cost.Constants:
              "camera": lambda: _camera(grid).t,
              "reflect": lambda: [*_flat(grid.reflectance(points.x)), medium.field.softness(points.x)],
              "shade": lambda: shade.reflect(points, many, None), "density": lambda: network.density(points.x)}
+    skin = bounced.Skin(medium, np.random.default_rng(0))
+    if len(skin.position):
+        work["between"] = lambda: _between(grid, skin)
     found = seconds(work, 5, min)  # the machine's own prices: other work only adds to them
     pairs = {name: WIDTH * pair[1].count for name, pair in methods.items()}
     counts = pairs | {"map": FEW * cost.FILLED * MAP**2 * SAMPLES, "volume": FEW * cost.FILLED * VOLUME**2 * SAMPLES,
-                      "camera": WIDTH * SAMPLES, "reflect": WIDTH, "shade": WIDTH * MANY, "density": WIDTH}
+                      "camera": WIDTH * SAMPLES, "reflect": WIDTH, "shade": WIDTH * MANY, "density": WIDTH,
+                      "between": len(skin.position) * bounced.FEW**2}
     ns = {name: 1e9 * value / counts[name] for name, value in found.items()}
     result = cost.Constants(
         camera=ns["camera"], reflect=ns["reflect"], shade=ns["shade"], texel=ns["map"], cell=ns["volume"],
         march=ns["raymarch"] / cost.light_steps(SAMPLES), lookup=ns["transmittance_map"],
         fetch=ns["transmittance_volume"], density=ns["density"], ray=ns["neural_transmittance"],
-        mlp=ns.get("visibility_mlp", cost.Constants().mlp),
+        mlp=ns.get("visibility_mlp", cost.Constants().mlp), between=ns.get("between", cost.Constants().between),
     )
     cost.remember(result)
     return result
@@ -128,6 +133,14 @@ def _tau(method, table, x):
 
     state = (dr.zeros(uint, dr.width(x)), dr.zeros(mi.Float, dr.width(x)))
     return dr.while_loop(state=state, cond=lambda i, total: i < count, body=body, label="calibration")[1]
+
+
+def _between(grid, skin) -> None:
+    """Rays from each patch of the `skin`."""
+    rng = np.random.default_rng(0)
+    d = radiosity.directions(skin.normal, bounced.FEW, rng)
+    o = np.broadcast_to(skin.outside[:, None], d.shape)
+    bounced.meet(grid.density, grid, o.reshape(-1, 3), d.reshape(-1, 3), rng)
 
 
 def _flat(reflectance) -> list:

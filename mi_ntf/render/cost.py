@@ -13,10 +13,12 @@ from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from .. import __version__
+from ..infer.grid import CELLS
 from ..infer.visibility.raymarch import default_steps
-from . import user_cache
+from . import bounced, user_cache
 
 CACHE = "cost.json"
 """Where constants are kept, in the user's cache."""
@@ -47,6 +49,7 @@ class Constants:
     lookup    a point and light, from the map
     cell      an entry of a transmittance volume
     fetch     a point and light, from the volume
+    between   a ray between patches of the skin
     density, ray, mlp   a query of the density, the transmittance and the visibility network
     """
 
@@ -58,6 +61,7 @@ class Constants:
     lookup: float = 5.0
     cell: float = 2.0
     fetch: float = 15.0
+    between: float = 1000.0
     density: float = 60.0
     ray: float = 600.0
     mlp: float = 1500.0
@@ -73,6 +77,7 @@ class Work:
     samples       cells across the unit sphere's diameter
     source        of maps: ``field`` or ``network``
     network       the field is its networks, not its grid, of `voxels`³
+    patches       that light bounces between, 0 where it does not by radiosity
     """
 
     rays: float
@@ -85,6 +90,7 @@ class Work:
     components: int = 1
     network: bool = False
     voxels: int = 192
+    patches: int = 0
 
 
 def light_steps(samples: int) -> int:
@@ -144,28 +150,45 @@ def work(integrator, medium, method: str, rays: int, lights: int = 1) -> Work:
     )
 
 
+def patches(grid) -> int:
+    """About how many patches (:class:`mi_ntf.render.bounced.Patches`) the skin in `grid` has: cells between matter and
+    empty space. Those are smaller than patches' cells, which may have a patch for several faces."""
+    matter = np.pad(np.array(grid.clearance).reshape((CELLS,) * 3) == 0, 1)
+    inner = matter.copy()
+    for axis in range(3):
+        inner &= np.roll(matter, 1, axis) & np.roll(matter, -1, axis)
+    return int(matter.sum() - inner.sum())
+
+
 def seconds(work: Work, c: Constants) -> dict[str, float]:
-    """Predicted wall seconds of each stage, compilation left out."""
+    """Predicted wall seconds of each stage, compilation left out; ``bounces`` where they are by radiosity."""
     query = c.density if work.network else 0
     pairs = work.points * work.lights
     tables = {"transmittance_map": FILLED * work.texels * per_ray(work, c),
               "transmittance_volume": FILLED * work.texels * work.samples * (c.cell + query)}
-    return {
+    lit = c.shade + FACING * per_pair(work, c)
+    stages = {
         "maps or volumes": 1e-9 * work.lights * tables.get(work.method, 0.0),
         "camera march": 1e-9 * work.rays * work.samples * (c.camera + NOT_SKIPPED * query),
         "reflectance": 1e-9 * work.points * (c.reflect + query),
-        "lights": 1e-9 * pairs * (c.shade + FACING * per_pair(work, c)),
+        "lights": 1e-9 * pairs * lit,
     }
+    if work.patches:
+        rays = bounced.CHORDS + work.patches * (bounced.FEW**2 + bounced.SIDE**2)
+        ray = c.between + bounced.STEPS * NOT_SKIPPED * query
+        stages["bounces"] = 1e-9 * (rays * ray + work.patches * work.lights * lit)
+    return stages
 
 
 def memory(work: Work, chunk: int) -> dict[str, int]:
     """Bytes held at a time beside maps, `chunk` camera rays in flight."""
     # Chunks are strips of pixels: those across the object hold more points than others.
     share = work.points / max(work.rays, 1) * (2 if work.rays > chunk else 1)
+    camera, between = min(chunk, work.rays), work.patches * bounced.SIDE**2
     return {
         "field grid": 4 * work.voxels**3 + 32 * min(work.voxels, 128) ** 3,
-        # Some 24 floats a shading point, in arrays that Dr.Jit rounds up to powers of two.
-        "rays in flight": round(min(chunk, work.rays) * max(share, 1) * 128),
+        # Some 24 floats a shading point, 12 a ray between patches, in arrays that Dr.Jit rounds up to powers of two.
+        "rays in flight": round(max(camera * max(share, 1) * 128, between * 72)),
     }
 
 

@@ -60,9 +60,11 @@ def _works(integrator, media: list, found, rays: int, count: int, light) -> list
     """What each medium's part of the render comes to."""
     method = found.visibility if found.needs_visibility else "none"
     pairs = count + _drawn(integrator, light)
+    radiosity = found.bounces == "radiosity"
     works = []
     for medium, seen in zip(media, found.in_view, strict=True):
         work = cost.work(integrator, medium, method, rays if seen else 0, pairs if found.lit else 0)
+        work = replace(work, patches=cost.patches(medium.field.grid) if radiosity else 0)
         works.append(work if found.lit else replace(work, points=0))
     return works
 
@@ -144,7 +146,7 @@ def print_table(report: dict) -> None:
     for name, effect in report["effects"].items():
         table.add_row(name, "yes" if effect["on"] else "–", effect["why"])
     console.print(table)
-    stages = report["seconds"] | {"bounces": 0.0} if real and "bounces" in real["stages"] else report["seconds"]
+    stages = {name: report["seconds"].get(name, 0.0) for name in real["stages"]} if real else report["seconds"]
     table = Table("stage", "predicted", *(["measured"] if real else []),
                   caption=f"prices of the machine: {report['constants']}; compilation is not counted")
     for name, value in stages.items():
