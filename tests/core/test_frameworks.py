@@ -101,6 +101,8 @@ FORMULAS = [
             (_direction, _direction, _direction, _uniform(0.15, 1)), 2e-5, 2e-4),
     Formula("lobes, collocated", lambda o, c, r: microfacet.lobes_collocated(o, c, r),
             (_uniform(-1, 0.999), _uniform(0.15, 1)), 2e-5, 2e-4),
+    Formula("diffuse_albedo", lambda o, *c: [microfacet.diffuse_albedo(*c)],
+            (_uniform(0, 1), _uniform(0.15, 1), _uniform(0, 1)), 5e-7, 5e-7),
     Formula("normalize", lambda o, *c: ops.normalize(o, c), (_point,), 5e-7, 1e-5, 1.0),
 ]
 

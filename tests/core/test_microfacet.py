@@ -134,6 +134,17 @@ def test_albedo_at_normal_incidence_has_a_one_dimensional_closed_form(roughness)
     assert _directional_albedo((0.0, 0.0, 1.0), 0.5, 1.0, roughness) == pytest.approx(e, abs=1e-4)
 
 
+@pytest.mark.parametrize("roughness", np.linspace(microfacet.MIN_ROUGHNESS, 1, 9))
+def test_diffuse_albedo_reflects_as_much_of_light_from_everywhere(roughness):
+    t, w = _nodes(16)
+    # ∫ E(ω) 2c dc: E is smooth, and 32 nodes change it by 2e-6 at most.
+    cosines = (t + 1) / 2
+    gloss = w @ [c * _specular_albedo(_sphere(c, 0.3), roughness) for c in cosines]
+    for k, s in [(0.0, 1.0), (0.6, 0.3), (1.0, 0.7)]:
+        # What the fit claims, of the specular lobe alone.
+        assert microfacet.diffuse_albedo(k, roughness, s) == pytest.approx((1 - s) * k + s * gloss, abs=0.008 * s)
+
+
 @given(hemisphere, hemisphere, st.floats(0, 1), st.floats(0, 1), st.floats(0.15, 1))
 def test_reciprocity(wi, wo, k, s, roughness):
     forward = _rho_cos(wi, wo, N, k, s, roughness) / wi[2]
