@@ -18,6 +18,8 @@ SIDE = 12
 """Rays from a patch, squared, for its light: where a tenth of them meets something, the bounced light is right within a
 quarter, and pictures show the mean of some patches."""
 SEED = 7
+DRAWS = 16
+"""Lights of a patch, where lights are drawn: at least. They are the same for all samples of a pixel, however many."""
 
 
 class Patches:
@@ -108,7 +110,7 @@ def _direct(composition, part, skin: "Skin") -> np.ndarray:
     one, zero = dr.ones(mi.Float, n), dr.zeros(mi.Float, n)
     normal = tuple(_vector(skin.normal))
     white = shade.Points(tuple(_vector(skin.outside)), normal, (normal, (one, one, one), one, zero, zero))
-    light = composition.reflect(part, white, dr.opaque(mi.UInt32, SEED), surface=True)
+    light = composition.reflect(part, white, dr.opaque(mi.UInt32, SEED), surface=True, draws=DRAWS)
     return _rows(light) * np.pi
 
 

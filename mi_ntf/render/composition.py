@@ -179,11 +179,11 @@ class Composition:
         finally:
             self.parts = parts
 
-    def reflect(self, part: Part, points, stream, view=None, surface=False):
+    def reflect(self, part: Part, points, stream, view=None, surface=False, draws: int = 0):
         """Radiance that `points` of `part` reflect from all lights; `view`: their transmittance, if lights share it;
-        `surface`: whether they are diffuse points of a surface above the skin."""
+        `surface`: whether they are diffuse points of a surface above the skin; `draws`: least number of those drawn."""
         total = [dr.zeros(mi.Float, dr.width(points.x[0])) for _ in range(3)]
-        for source, mapped in self.lights.sources(part.table, part.frame, points, stream):
+        for source, mapped in self.lights.sources(part.table, part.frame, points, stream, draws):
             if self.run and not mapped:
                 continue
             # Maps and volumes stay where the lights were.

@@ -25,20 +25,22 @@ class EmitterSamples:
     seed      opaque unsigned integer
     count     lights per point, each from an emitter drawn by weight; 0: of every emitter SAMPLES lights, or 1 where
               it has no extent
+    least     at least so many, of all emitters together or of each with an extent
 
     A light is the one that resampling keeps of CANDIDATES draws, with chances in proportion to the light that each
     would scatter to the viewer, were nothing in the way (Talbot et al. 2005): of the many that could, the few worth a
     visibility. It is weighted so that the mean over all draws is the sum over all emitters.
     """
 
-    def __init__(self, emitters: list, weights: list[float], frame: Frame, points, seed, count: int = 0):
+    def __init__(self, emitters: list, weights: list[float], frame: Frame, points, seed, count: int = 0,
+                 least: int = 0):
         self.frame, self.points = frame, points
         self._emitters = mi.EmitterPtr(emitters)
         self._choice = mi.DiscreteDistribution(weights) if count and len(emitters) > 1 else None
-        rows = [(0, CANDIDATES)] * count or [
+        rows = [(0, CANDIDATES)] * (count and max(count, least)) or [
             (i, 1) if mi.has_flag(e.flags(), mi.EmitterFlags.DeltaPosition) else (i, CANDIDATES)
             for i, e in enumerate(emitters)
-            for _ in range(1 if mi.has_flag(e.flags(), mi.EmitterFlags.DeltaPosition) else SAMPLES)
+            for _ in range(1 if mi.has_flag(e.flags(), mi.EmitterFlags.DeltaPosition) else max(SAMPLES, least))
         ]
         self.count = len(rows)
         of_emitter = [sum(row[0] == i for row in rows) for i in range(len(emitters))]
