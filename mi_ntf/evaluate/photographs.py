@@ -2,9 +2,9 @@
 
     python -m mi_ntf.evaluate.photographs FIELD DATASET [--mesh SCENE.xml] [--spp 32] [--depth -1]
 
-Test views of the data set: mean PSNR and SSIM (both sRGB) of the field lit as the photograph was; `--depth`:
-``max_depth``, 2 for photographs without light that bounced. With the captured
-meshes, the mean angle between their shading normals and the field's, degrees, over pixels that both fill.
+Test views of the data set: mean PSNR and SSIM (both sRGB) of the field lit as the photograph was. `--depth`:
+``max_depth``, 2 for photographs without light that bounced. `--mesh`: the captured meshes; adds the mean angle between
+their shading normals and the field's, degrees, over pixels that both fill.
 """
 
 import argparse

@@ -61,8 +61,8 @@ def integrator_class() -> type:
 
         Any number of ``nrf`` media, which may overlap (densities add), and ordinary shapes with any BSDF: all hide,
         shade and, from `max_depth` 3 on, light each other. Shadow rays of surfaces are marched where `visibility` is a
-        method of maps or volumes. With ``none`` fields cast no shadows and receive none, and light
-        that one scatters meets no field again.
+        method of maps or volumes. With ``none`` fields cast no shadows and receive none, and light that one scatters
+        meets no field again.
 
         The image can be differentiated by the lights: power, an environment's texels, and, of at most 32 lights in the
         scene, position and direction, whose shadows are then marched whatever the method; and by the reflectance of
