@@ -14,9 +14,12 @@ CELLS = 48
 DEPTH = float(np.log(2.0))
 """Optical depth at which a ray has met a patch."""
 RISE = 0.015
-"""Where the rays of a patch begin, above it: out of its own skin."""
+"""Where the rays of a patch begin, above it, in radii of the unit sphere: out of its own skin."""
 CONVERGED = 1e-3
+"""Change of any patch's irradiance by a further bounce, over the brightest's, from which on it is the last: of albedo
+0.9, what is left out is nine times that."""
 MOST_BOUNCES = 64
+"""Ends what hardly loses light, as a closed white room: of albedo 0.9, 1e-3 of it is left after these."""
 
 
 def face(normals: np.ndarray) -> np.ndarray:
@@ -71,6 +74,19 @@ def directions(normals: np.ndarray, side: int, rng: np.random.Generator) -> np.n
     b = np.cross(normals, a)
     parts = radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - u)
     return sum(p[..., None] * axis[:, None] for p, axis in zip(parts, (a, b, normals), strict=True))
+
+
+def above(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Where light comes to the patches (n, 3), and their rays begin."""
+    return points + RISE * normals
+
+
+def rays(points: np.ndarray, normals: np.ndarray, side: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """``(o, d)``, (n · side², 3) each: origins and unit directions of the rays of the patches (n, 3), one patch after
+    the other."""
+    d = directions(normals, side, rng)
+    o = np.broadcast_to(above(points, normals)[:, None], d.shape)
+    return o.reshape(-1, 3), d.reshape(-1, 3)
 
 
 def solve(hits: np.ndarray, albedo: np.ndarray, direct: np.ndarray, bounces: int) -> np.ndarray:

@@ -53,8 +53,7 @@ class Patches:
         both in its own coordinates, and their indices (k,)."""
         origins, ways = [], []
         for skin in self.skins:
-            d = radiosity.directions(skin.normal, side, rng)
-            o = np.broadcast_to(skin.outside[:, None], d.shape)
+            o, d = radiosity.rays(skin.position, skin.normal, side, rng)
             origins.append(np.array(skin.frame.point_to_world(_vector(o))))
             ways.append(np.array(skin.frame.direction_to_world(_vector(d))))
         o, d = (mi.Vector3f(np.concatenate(v, 1)) for v in (origins, ways))
@@ -108,14 +107,14 @@ def _direct(composition, part, skin: "Skin") -> np.ndarray:
     if not n:
         return np.zeros((0, 3))
     one, zero = dr.ones(mi.Float, n), dr.zeros(mi.Float, n)
-    normal = tuple(_vector(skin.normal))
-    white = shade.Points(tuple(_vector(skin.outside)), normal, (normal, (one, one, one), one, zero, zero))
+    x, normal = radiosity.above(skin.position, skin.normal), tuple(_vector(skin.normal))
+    white = shade.Points(tuple(_vector(x)), normal, (normal, (one, one, one), one, zero, zero))
     light = composition.reflect(part, white, dr.opaque(mi.UInt32, SEED), surface=True, draws=DRAWS)
     return _rows(light) * np.pi
 
 
 class Skin:
-    """The patches of one `medium`: `position`, `normal`, `albedo` (n, 3); `outside`, points above them; `table`."""
+    """The patches of one `medium`: `position`, `normal`, `albedo` (n, 3); `table`."""
 
     def __init__(self, medium, rng):
         self.frame, self._reflectance = medium.frame, medium.reflectance
@@ -129,7 +128,6 @@ class Skin:
         normal, albedo = self.reflectance(x)
         kept = radiosity.thin(x, normal)
         self.position, self.normal, self.albedo = x[kept], normal[kept], albedo[kept]
-        self.outside = self.position + radiosity.RISE * self.normal
         self.table = radiosity.table(self.position, self.normal)
 
     def reflectance(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -53,12 +53,12 @@ class Bounced:
         some = rays[torch.as_tensor(rng.integers(len(rays), size=min(SEEN, len(rays))))]
         _, x, normal = _skin(networks, marched, some.o, some.d)
         kept = radiosity.thin(x, normal)
-        _, *folds = _skin(networks, marched, *_above(x[kept], normal[kept], 3, rng))
+        _, *folds = _skin(networks, marched, *_rays(x[kept], normal[kept], 3, rng))
         x, normal = (np.concatenate([a[kept], b]) for a, b in zip((x, normal), folds, strict=True))
         kept = radiosity.thin(x, normal)
         x, normal = x[kept], normal[kept]
         table, hits = radiosity.table(x, normal), np.full(len(x) * SIDE**2, -1)
-        ray, *there = _skin(networks, marched, *_above(x, normal, SIDE, rng))
+        ray, *there = _skin(networks, marched, *_rays(x, normal, SIDE, rng))
         hits[ray] = table[radiosity.place(*there)]
         # All photographs at once, three columns each.
         views, count = len(self.place), len(x)
@@ -72,7 +72,7 @@ class Bounced:
 
     def _direct(self, marched: Marched, x: np.ndarray, normal: np.ndarray) -> np.ndarray:
         """(views, patches, 3): irradiance by the flashes alone."""
-        outside = _tensor(x + radiosity.RISE * normal)
+        outside = _tensor(radiosity.above(x, normal))
         normal = _tensor(normal)
         result = torch.zeros(len(self.place), len(x), 3)
         for place, power, lit in zip(self.place, self.power, result, strict=True):
@@ -85,11 +85,9 @@ class Bounced:
         return result.double().numpy()
 
 
-def _above(x: np.ndarray, normal: np.ndarray, side: int, rng: np.random.Generator):
-    """``(o, d)``, tensors (n · side², 3): rays from above the patches, cosine-distributed."""
-    d = radiosity.directions(normal, side, rng)
-    o = np.broadcast_to((x + radiosity.RISE * normal)[:, None], d.shape)
-    return _tensor(o.reshape(-1, 3)), _tensor(d.reshape(-1, 3))
+def _rays(x: np.ndarray, normal: np.ndarray, side: int, rng: np.random.Generator) -> list[torch.Tensor]:
+    """:func:`mi_ntf.core.radiosity.rays` as tensors."""
+    return [_tensor(v) for v in radiosity.rays(x, normal, side, rng)]
 
 
 def _skin(networks: Networks, marched: Marched, o: torch.Tensor, d: torch.Tensor):

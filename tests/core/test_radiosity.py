@@ -28,6 +28,14 @@ def test_directions_have_the_density_of_a_cosine(rng):
     np.testing.assert_allclose(d.mean(1), 2 / 3 * normals, atol=0.1)
 
 
+def test_rays_begin_above_their_own_patch(rng):
+    points, normals = rng.uniform(-0.5, 0.5, (20, 3)), unit(rng.normal(size=(20, 3)))
+    o, d = radiosity.rays(points, normals, 3, rng)
+    patch = np.repeat(np.arange(20), 9)
+    np.testing.assert_allclose(o, points[patch] + radiosity.RISE * normals[patch], rtol=1e-12)
+    assert ((normals[patch] * d).sum(1) > 0).all()
+
+
 def test_a_table_knows_its_patches_and_both_sides_of_a_sheet(rng):
     points = np.concatenate([rng.uniform(-0.5, 0.5, (2000, 2)).T, rng.uniform(-0.002, 0.002, (1, 2000)) + 0.01]).T
     normals = np.where(np.arange(2000)[:, None] % 2, [0, 0.1, 1], [0.1, 0, -1.0])
