@@ -68,3 +68,16 @@ def test_baseline_asks_where_the_ray_is_inside_the_sphere():
     distance = mi.Float([np.inf, np.inf, np.inf, np.inf, 1.5])
     tau = np.array(visibility.tau(x, arrays(np.tile([1.0, 0, 0], (5, 1))), distance, mi.UInt32(0), True))
     np.testing.assert_allclose(tau, [0.55, 0.25, 1, 1, 1], atol=1e-6)
+
+
+def test_baseline_between_points_and_lights_that_touch_the_sphere(rng):
+    """Nothing is in the way, whatever rounding says."""
+    on = rng.normal(size=(500, 3))
+    on /= np.linalg.norm(on, axis=1, keepdims=True)
+    away = on + 0.3 * rng.normal(size=on.shape)
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    below = VisibilityMLP(Slab()).tau(arrays(on), arrays(-away), mi.Float(np.inf), mi.UInt32(0), True)
+    assert (np.array(below) < 1).all()
+    for x, d, distance in ((on, away, np.inf), (on + 0.5 * away, -away, 0.5)):
+        tau = VisibilityMLP(Slab()).tau(arrays(x), arrays(d), mi.Float(np.float32(distance)), mi.UInt32(0), True)
+        np.testing.assert_array_equal(np.array(tau), 1)

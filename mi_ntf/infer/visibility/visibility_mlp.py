@@ -8,6 +8,9 @@ from ...core.architecture import NO_VISIBILITY
 from ...core.errors import MiNtfError
 from .. import ops
 
+SHORT = 1e-5
+"""Ways through less of the sphere pass nothing: of a light or a point on it, rounding decides on which side it is."""
+
 
 class VisibilityMLP:
     """`field`: a :class:`mi_ntf.infer.network.NetworkField` with the baseline's network (`mi-ntf train
@@ -27,5 +30,6 @@ class VisibilityMLP:
         hit, m, h = spheres.chord(ops, x, wi)
         here = spheres.coordinate(x, wi)
         t = dr.maximum(here, -h)
+        way = dr.minimum(here + distance, h) - t
         tau = self.field.visibility(tuple(a + t * b for a, b in zip(m, wi, strict=True)), wi)
-        return dr.select(hit & (here < h) & (here + distance > -h), tau, 1)
+        return dr.select(hit & (way > SHORT), tau, 1)
