@@ -29,7 +29,7 @@ def variant():
 @pytest.fixture(scope="session")
 def blobs(tmp_path_factory):
     """A field file of the asymmetric object, σ = 20."""
-    return scenes.write_blobs(tmp_path_factory.mktemp("field"), log_density=3.0)
+    return scenes.write_blobs(tmp_path_factory.mktemp("field"), log_density=3.0, visibility=True)
 
 
 @pytest.fixture

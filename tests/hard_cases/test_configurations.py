@@ -12,7 +12,8 @@ SIZE, BLOCK = 32, 8
 OPTIONS = {
     "pixel_format": ("rgba", "rgb", "luminance", "luminance_alpha", "xyz", "xyza"),
     "rfilter": ("box", "tent", "gaussian", "mitchell", "catmullrom", "lanczos"),
-    "method": ("raymarch", "transmittance_map", "transmittance_volume", "neural_transmittance", "none"),
+    "method": ("raymarch", "transmittance_map", "transmittance_volume", "neural_transmittance", "visibility_mlp",
+               "none"),
     "sampler": ("independent", "stratified", "multijitter", "orthogonal", "ldsampler"),
     "spp": (16, 4, 7, 49),
     "seed": (0, 1, 2**31, 2**32 - 1),
@@ -30,7 +31,7 @@ LIGHT = {"light": scenes.light("point")}
 
 @pytest.fixture(scope="module")
 def blobs(tmp_path_factory):
-    return scenes.write_blobs(tmp_path_factory.mktemp("field"), log_density=3.0)
+    return scenes.write_blobs(tmp_path_factory.mktemp("field"), log_density=3.0, visibility=True)
 
 
 def picture(blobs, method, spp, seed=0, sampler="independent", max_depth=2, bounces="auto",

@@ -23,7 +23,7 @@ def variant():
 
 @pytest.fixture(scope="module")
 def blobs(tmp_path_factory):
-    return scenes.write_blobs(tmp_path_factory.mktemp("field"), log_density=2.5, roughness=0.6)
+    return scenes.write_blobs(tmp_path_factory.mktemp("field"), log_density=2.5, roughness=0.6, visibility=True)
 
 
 def sphere(side: int = 240):
@@ -209,7 +209,7 @@ def test_texels_that_are_no_numbers(blobs, value, mode):
         return
     options = {"light_samples": 2} if mode == "drawn" else {}
     scene = scenes.scene(blobs, scenes.nrf(**options), {"sky": skies.emitter(image)}, size=4, spp=1)
-    for visibility in ("raymarch", "none", "neural_transmittance"):
+    for visibility in ("raymarch", "none", "neural_transmittance", "visibility_mlp"):
         scene.integrator().visibility = visibility
         with pytest.raises(MiNtfError, match=r"\(sky\): 3 texels of data are NaN or infinite.*row 5, column 0"):
             scene.integrator().render(scene)
@@ -259,6 +259,7 @@ def picture(scene, parameters=None, seed=3):
         ("none", True),
         pytest.param("raymarch", False, marks=pytest.mark.slow),
         pytest.param("transmittance_map", True, marks=pytest.mark.slow),
+        pytest.param("visibility_mlp", False, marks=pytest.mark.slow),
     ],
 )
 def test_picture_has_the_gradient_of_single_texels(blobs, visibility, dark):

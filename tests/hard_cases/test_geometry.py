@@ -9,13 +9,13 @@ import pytest
 from helpers import fields, pictures
 
 METHODS = ("raymarch", "transmittance_volume", "transmittance_map", "transmittance_map, 2 logistics",
-           "neural_transmittance")  # fmt: skip
+           "neural_transmittance", "visibility_mlp")  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("fields")
-    blobs = fields.blobs([(-0.3, 0.05, 0.0), (0.4, 0.3, 0.15)], [0.5, 0.3], log_density=3.5)
+    blobs = fields.blobs([(-0.3, 0.05, 0.0), (0.4, 0.3, 0.15)], [0.5, 0.3], log_density=3.5, visibility=True)
     fields.middle_of_profile(blobs[1])
     pictures.save(path, blobs, "blobs")
     black = fields.uniform(0.8, specular=1e-9)

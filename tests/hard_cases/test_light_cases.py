@@ -13,7 +13,7 @@ from mi_ntf.core.errors import MiNtfError
 from mi_ntf.render import lights
 
 CENTER, RADIUS = np.array(scenes.SIMILARITY.center), scenes.SIMILARITY.radius
-METHODS = ["raymarch", "transmittance_map", "neural_transmittance", "transmittance_volume", "none"]
+METHODS = ["raymarch", "transmittance_map", "neural_transmittance", "transmittance_volume", "visibility_mlp", "none"]
 TOWARDS = np.array([0.6, 0.64, 0.48])
 
 
@@ -26,7 +26,7 @@ def variant():
 
 @pytest.fixture(scope="module")
 def blobs(tmp_path_factory):
-    return scenes.write_blobs(tmp_path_factory.mktemp("field"), log_density=3.0)
+    return scenes.write_blobs(tmp_path_factory.mktemp("field"), log_density=3.0, visibility=True)
 
 
 def picture(field, method: str, light: dict, spp=4, size=12, **options) -> np.ndarray:

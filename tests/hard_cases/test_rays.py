@@ -38,7 +38,6 @@ RAYS = {
     "from behind": ((0.1, 0.2, 3), (0, 0, 1)),
     "far miss": ((1e6, 3, 0), (0, 0, 1)),
 }
-METHODS = [m for m in hard_cases.METHODS if "network" not in m and "neural" not in m]
 
 
 def inside(o, d, end: float = np.inf) -> float:
@@ -90,7 +89,7 @@ def _chord_gradient(o, d):
 
 @cache
 def ball():
-    return hard_cases.baked(*fields.uniform(SIGMA), 96)
+    return hard_cases.baked(*fields.uniform(SIGMA, visibility=True), 96)
 
 
 BOUNDS = {
@@ -101,7 +100,7 @@ BOUNDS = {
 }
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", hard_cases.MARCHED)
 @pytest.mark.parametrize("name", RAYS)
 def test_light_ray(name, method, check):
     """σ = 1.5 in the whole unit sphere, the shading point at the ray's origin, the light where it leads to."""

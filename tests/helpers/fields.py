@@ -13,11 +13,12 @@ from mi_ntf.infer.network import MIN_DENSITY
 RESOLUTION = 128
 
 
-def architecture(components: int = 2) -> Architecture:
+def architecture(components: int = 2, visibility: bool = False) -> Architecture:
     return Architecture(
         Network(Encoding("planes", (RESOLUTION,), 8), (16,)),
         Network(Encoding("planes", (RESOLUTION,), 4), (16,)),
         Network(Encoding("depth"), (16,), components=components),
+        Network(Encoding("frequency", octaves=1), (16,)) if visibility else None,
     )
 
 
@@ -39,12 +40,12 @@ def _logit(p):
 
 def blobs(
     centers, radii, *, log_density=5.0, edge=8.0, albedo=(0.6, 0.5, 0.4), roughness=0.5, specular=0.2, similarity=None,
-    components=2
+    components=2, visibility=False
 ) -> tuple[Header, dict]:
     """Opaque balls: ln σ rises from −12 to `log_density` over about radius/`edge`.. around each radius. Normals point
     away from the origin. At most 8 balls; a ball is the level set of a Gaussian, which the three planes' product holds
-    exactly."""
-    arch = architecture(components)
+    exactly. `visibility`: with the baseline's network, too, whose τ is anything between 0 and 1 and smooth."""
+    arch = architecture(components, visibility)
     t = {k: np.zeros(s) for k, s in arch.skeleton().items()}
     u, v = _axes()
     for i, (c, r) in enumerate(zip(centers, radii, strict=True)):
@@ -64,10 +65,11 @@ def blobs(
         t["density.layers.0.bias"][8 + i] = t["density.layers.0.bias"][i] - span
         t["density.layers.1.weight"][0, 8 + i] = -1
     _outward_reflectance(t, albedo, roughness, specular)
-    rng = np.random.default_rng(0)
-    for k in t:
-        if k.startswith("transmittance"):
-            t[k] = rng.normal(size=t[k].shape) * 0.5
+    for name, scale in (("transmittance", 0.5), ("visibility", 0.3)):
+        rng = np.random.default_rng(0)
+        for k in t:
+            if k.startswith(name):
+                t[k] = rng.normal(size=t[k].shape) * scale
     return Header(arch, similarity or Similarity()), t
 
 
@@ -92,9 +94,9 @@ def _slopes(t, x, y) -> None:
     planes[0, :, :, 0], planes[0, :, :, 1] = x, y
 
 
-def empty() -> tuple[Header, dict]:
+def empty(**kwargs) -> tuple[Header, dict]:
     """No density anywhere."""
-    header, t = blobs([(0, 0, 0)], [0.3])
+    header, t = blobs([(0, 0, 0)], [0.3], **kwargs)
     constant(t, "density", [MIN_LOG_DENSITY])
     return header, t
 
@@ -161,6 +163,11 @@ def skin(kind: str, log_density: float = 5.0, scale: float = 0.01, **options) ->
     b0[:2] = span - offset / scale - np.array([0, span])
     w1[0, :2] = 1, -1
     return Skin(distance, log_density, scale, header, t)
+
+
+def known_visibility(tensors: dict, tau: float) -> None:
+    """The baseline's network that answers `tau` everywhere."""
+    constant(tensors, "visibility", [_logit(tau)])
 
 
 def middle_of_profile(tensors: dict) -> None:

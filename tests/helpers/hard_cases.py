@@ -35,8 +35,11 @@ METHODS = {
     "transmittance_map, 2 logistics": ("transmittance_map", {"map_components": 2}),
     "transmittance_map, network": ("transmittance_map", {"map_source": "network"}),
     "neural_transmittance": ("neural_transmittance", {}),
+    "visibility_mlp": ("visibility_mlp", {}),
 }
 """What users can choose: name in the table → method and options. Networks are those of the field's file."""
+MARCHED = ("raymarch", "transmittance_volume", "transmittance_map", "transmittance_map, 2 logistics")
+"""Methods that follow the field itself, whatever its networks say."""
 
 
 def baked(header, tensors, resolution: int = 192):

@@ -26,6 +26,7 @@ METHODS = {
     "map, field": ("transmittance_map", {}),
     "map, field, 2": ("transmittance_map", {"map_components": 2}),
     "map, network": ("transmittance_map", {"map_source": "network"}),
+    "visibility_mlp": ("visibility_mlp", {}),
     "none": ("none", {}),
 }
 STEP = 2 / 256
@@ -37,7 +38,8 @@ RESOLUTION = 48
 @dataclass(frozen=True)
 class Balls:
     """A field of up to six overlapping balls, some cut by the unit sphere. `wild`: the ray network has random weights;
-    otherwise its outputs are 0, which is the logistic through the middle of a ray's profile."""
+    otherwise its outputs are 0, which is the logistic through the middle of a ray's profile. The baseline's network
+    has them always."""
 
     seed: int
     count: int = 3
@@ -57,7 +59,7 @@ def _balls(what: Balls, factor: float):
     centres = rng.uniform(-0.5, 0.5, (what.count, 3)) * (not what.central)
     header, tensors = fields.blobs(
         centres, rng.uniform(0.1, 0.45, what.count), log_density=what.log_density, edge=rng.uniform(1, 8),
-        components=what.components,
+        components=what.components, visibility=True,
     )  # fmt: skip
     tensors["density.layers.1.bias"][0] += np.log(factor)
     for name, values in tensors.items():
