@@ -138,9 +138,7 @@ def _tau(method, table, x):
 def _between(grid, skin) -> None:
     """Rays from each patch of the `skin`."""
     rng = np.random.default_rng(0)
-    d = radiosity.directions(skin.normal, bounced.FEW, rng)
-    o = np.broadcast_to(skin.outside[:, None], d.shape)
-    bounced.meet(grid.density, grid, o.reshape(-1, 3), d.reshape(-1, 3), rng)
+    bounced.meet(grid.density, grid, *radiosity.rays(skin.position, skin.normal, bounced.FEW, rng), rng)
 
 
 def _flat(reflectance) -> list:

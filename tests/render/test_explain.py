@@ -109,8 +109,6 @@ def test_measured_beside_predicted(tmp_path, capsys):
     assert 0.3 * real["wall_seconds"] < sum(real["stages"].values()) < 2.5 * real["wall_seconds"]  # on two threads
     # The guess of the shading points is made for objects like this one.
     assert 0.5 < real["points"] / report["points"] < 2
-    # Measured 0.95 to 1.2, and up to 2 where other work came between the two.
-    assert 0.3 < real["stages"]["bounces"] / report["seconds"]["bounces"] < 3
     assert 0.5 < real["peak_bytes"] / sum(report["memory_bytes"].values()) < 2
     assert cost.measured() is not None and report["constants"] == "measured on this machine"
     print_table(report)
