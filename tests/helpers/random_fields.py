@@ -14,6 +14,8 @@ from scipy.special import erf
 
 from helpers import fields
 from helpers.jit import arrays
+from mi_ntf.core import ops
+from mi_ntf.infer import ops as infer_ops
 from mi_ntf.infer.grid import CELLS, GridField
 from mi_ntf.infer.lights import LightTable
 from mi_ntf.infer.network import NetworkField
@@ -95,6 +97,18 @@ class Exact:
             sigma += peak * dr.exp(-sharp * r2)
         return dr.select(p[0] * p[0] + p[1] * p[1] + p[2] * p[2] < 1, sigma, 0)
 
+    def reflectance(self, p):
+        """``(normal,)`` at `p`: of the slab in it, elsewhere away from the ball's centre or, out of the ball, from the
+        nearer of the two points."""
+        v = self._numbers
+        along = sum(a * b for a, b in zip(v[:3], p, strict=True)) - v[3]
+        away = [[a - b for a, b in zip(p, v[i : i + 3], strict=True)] for i in (4, 8, 11)]
+        square = [x * x + y * y + z * z for x, y, z in away]
+        in_slab, in_ball = (dr.abs(along) < self.half) & (v[16] > 0), (square[0] < v[7] * v[7]) & (v[17] > 0)
+        near = [dr.select(square[1] < square[2], a, b) for a, b in zip(*away[1:], strict=True)]
+        normal = [dr.select(in_slab, n, dr.select(in_ball, b, c)) for n, b, c in zip(v[:3], away[0], near, strict=True)]
+        return (ops.normalize(infer_ops, tuple(normal)),)
+
     def optical_depth(self, x, d, length):
         """∫ σ from the points `x` (n, 3) along `d`, as far as `length` or the unit sphere."""
         begin, end = _inside(x, d, 1.0)
@@ -118,7 +132,7 @@ class Exact:
         corners = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), -1).reshape(-1, 3)
         grid = SimpleNamespace(clearance=dr.zeros(mi.Float, CELLS**3), hull=corners, density=self.density)
         network = Balls(0).medium().field.network
-        return SimpleNamespace(source=SimpleNamespace(density=self.density),
+        return SimpleNamespace(source=SimpleNamespace(density=self.density, reflectance=self.reflectance),
                                field=SimpleNamespace(network=network, grid=grid))
 
 
