@@ -28,19 +28,26 @@ class LoadedField:
     digest: str
 
 
-def load(path: str, resolution: int) -> LoadedField:
-    """Read `path` and bake it at `resolution`³; cached by path, the file's identity and time, resolution and
-    variant."""
+def voxels(header: Header) -> int:
+    """Voxels per side that a field is baked to unless told: four of three texels of its finest density planes, and
+    192 at least. Fewer thin out skins: of 192² planes, 192 took 1.4 % of the light under the flash, 256 0.4 %."""
+    finest = max(header.architecture.density.encoding.resolutions, default=0)
+    return min(max(192, 4 * finest // 3), 512)
+
+
+def load(path: str, resolution: int | None) -> LoadedField:
+    """Read `path` and bake it at `resolution`³, None for :func:`voxels`; cached by path, the file's identity and time,
+    resolution and variant."""
     stat = Path(path).stat() if Path(path).is_file() else None
     return _load(path, stat and (stat.st_mtime_ns, stat.st_size, stat.st_ino), resolution, mi.variant())
 
 
 @lru_cache(maxsize=4)
-def _load(path: str, _stamp: tuple | None, resolution: int, variant: str) -> LoadedField:
+def _load(path: str, _stamp: tuple | None, resolution: int | None, variant: str) -> LoadedField:
     dj = module(variant)
     header, tensors = field_file.load(path)
     network = NetworkField(header, tensors, dj)
-    grid = GridField(network, resolution, dj)
+    grid = GridField(network, resolution or voxels(header), dj)
     return LoadedField(header, network, grid, Softness(grid, dj), _digest(header, tensors))
 
 

@@ -36,7 +36,7 @@ def medium_class(phase_class: type) -> type:
         to_world         transform placement after `scale`; rotation, translation, uniform scale (default: identity)
         scale            float     scene units per capture unit, > 0 (default: 1)
         representation   string    ``grid``: baked voxels; ``network``: the networks, exact and slower (default: grid)
-        resolution       integer   voxels per side of the baked grid, 16 to 512 (default: 192; 4 bytes each)
+        resolution       integer   voxels per side of the baked grid, 16 to 512 (default: by the field, 192 or more)
         sample_emitters  boolean   as of any medium: for stock volumetric integrators (default: true)
         ================ ========= ====================================================================================
 
@@ -62,7 +62,7 @@ def medium_class(phase_class: type) -> type:
             to_world = read.placement("to_world")
             scale = read.number("scale", 1.0, *SCALES)
             self.representation = read.choice("representation", "grid", REPRESENTATIONS)
-            resolution = read.whole("resolution", 192, 16, 512)
+            resolution = read.whole("resolution", None, 16, 512)
             read.flag("sample_emitters", True)
             self.field = field.load(path, resolution)
             self.source = self.field.grid if self.representation == "grid" else self.field.network

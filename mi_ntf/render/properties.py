@@ -55,11 +55,11 @@ class Reader:
         """A boolean."""
         return self._value(name, default, ("Bool",), "a boolean, true or false")
 
-    def whole(self, name: str, default: int, low: int, high: int) -> int:
-        """An integer in [`low`, `high`]."""
+    def whole(self, name: str, default: int | None, low: int, high: int) -> int | None:
+        """An integer in [`low`, `high`], or the default."""
         expected = f"an integer, {low} to {high}"
         value = self._value(name, default, ("Integer",), expected)
-        return value if low <= value <= high else self._refuse(name, expected)
+        return value if value is None or low <= value <= high else self._refuse(name, expected)
 
     def number(self, name: str, default: float, low: float = -math.inf, high: float = math.inf) -> float:
         """A finite number in [`low`, `high`]."""

@@ -1,5 +1,6 @@
 """The ``nrf`` integrator against stock ``volpath`` on the same field, analytic fields, the mesh, its own promises."""
 
+import dataclasses
 import time
 
 import mitsuba as mi
@@ -9,13 +10,15 @@ from helpers import fields, scenes, ztest
 from helpers.scenes import nrf
 
 from mi_ntf.core import field_file
+from mi_ntf.core.architecture import FAST, Encoding, Header
+from mi_ntf.render import field
 
 LIGHTS = ("directional", "point", "env")
 SEEDS = 4
 
 
-def renders(field, integrator, kind, spp, **options):
-    loaded = scenes.scene(field, integrator, {"light": scenes.light(kind)}, spp=spp, **options)
+def renders(path, integrator, kind, spp, **options):
+    loaded = scenes.scene(path, integrator, {"light": scenes.light(kind)}, spp=spp, **options)
     return [scenes.render(loaded, seed) for seed in range(SEEDS)]
 
 
@@ -252,3 +255,17 @@ def test_placement_by_to_world_and_scale(tmp_path):
     # Equal seeds draw equal samples; float32 coordinates differ in the last digits, which flips samples at borders.
     np.testing.assert_allclose(scenes.render(moved), plain, atol=0.02)
     assert np.abs(scenes.render(moved) - plain).mean() < 1e-4
+
+
+@pytest.mark.parametrize(("planes", "voxels"), [((), 192), ((64, 128), 192), ((192, 64), 256), ((1024,), 512)])
+def test_voxels_follow_the_finest_planes(tmp_path, planes, voxels):
+    """Four of three texels, 192 at least, 512 at most; what a scene names comes first."""
+    kind = "planes" if planes else "frequency"
+    network = dataclasses.replace(FAST.density, encoding=Encoding(kind, planes, 1 if planes else 0))
+    header = Header(dataclasses.replace(FAST, density=network))
+    assert field.voxels(header) == voxels
+    if voxels == 256:
+        tensors = {k: np.zeros(s, np.float32) for k, s in header.architecture.skeleton().items()}
+        field_file.save(tmp_path / "field", header, tensors)
+        for given, found in ((None, 256), (16, 16)):
+            assert field.load(str(tmp_path / "field"), given).grid.resolution == found
