@@ -17,12 +17,10 @@ test:
 	@$(RUN) -m ruff check .
 	@$(RUN) -m pytest -n 2 --dist loadfile -q -m "not slow and not gpu"
 
-# The whole catalogue of hard cases as a table, then 200 random scenes in one process and 60 beside volpath.
+# The whole catalogue of hard cases as a table, with 200 random scenes in one process and 60 beside volpath among them.
 hard-cases:
 	@$(PYTHON) tools/setup_env.py dev
 	@$(RUN) -m pytest -n 2 --dist loadfile -q tests/hard_cases --catalogue
-	@$(RUN) tests/hard_cases/soak.py --scenes 200
-	@$(RUN) tests/hard_cases/soak.py --pairs 60
 
 clean:
 	rm -rf .venv build dist out .pytest_cache .ruff_cache .mypy_cache .hypothesis
