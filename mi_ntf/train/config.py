@@ -1,5 +1,6 @@
 """What decides a training run. Times are shares of the whole run, so a schedule scales with --minutes and --steps."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -52,6 +53,13 @@ class TrainConfig:
     """Also compare pixels lit by the learned transmittance with the photographs."""
     bounces: bool = True
     """The photographs hold light of the flash that the object throws on itself."""
+
+    def sharpened(self, pixel: float) -> "TrainConfig":
+        """The recipe for photographs whose pixels are `pixel` wide at the object, in field units. Its own lengths are
+        for 1/64, 128 pixels across the unit sphere; they shrink by the root of the pixels, and by a third at most: a
+        grid's upkeep costs the cube."""
+        finer = min(max(math.sqrt(1 / (64 * pixel)), 1.0), 1.5)
+        return replace(self, step=self.step / finer, cells=round(self.cells * finer), bake=round(self.bake * finer))
 
 
 @dataclass(frozen=True)

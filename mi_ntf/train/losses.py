@@ -41,16 +41,17 @@ def normals(image: Image, d: torch.Tensor, baked: Baked):
 
 ROUGH = 30.0
 """How much dearer the roughest lobe is than a sharp one."""
-FAINT = 0.005
-"""Specular weights that cost nothing: none is pressed on to where its sigmoid has no slope, and no way back."""
+FAINT = -5.0
+"""ln of the specular weight below which it is held: further down its sigmoid has no slope, and there is no way back."""
 
 
 def gloss(image: Image, count: int) -> torch.Tensor:
-    """The specular weight, the dearer the rougher: (1 + ROUGH α²) (s − FAINT)⁺ per ray, α = roughness². What α = 1 adds
-    under a flash, a diffuse lobe of a quarter of its weight adds as well, and only that is right under other lights."""
+    """The specular weight, the dearer the rougher: (1 + ROUGH α²) s per ray, α = roughness². What α = 1 adds under a
+    flash, a diffuse lobe of a quarter of its weight adds as well, and only that is right under other lights. Weights
+    that vanish cost as well: (FAINT − ln s)²/10."""
     roughness, specular = image.gloss
-    above = torch.relu(specular - FAINT)
-    return (image.weight.detach() * above * (1 + ROUGH * roughness**4)).sum() / count
+    lost = torch.relu(FAINT - specular.clamp(min=1e-30).log()).square()
+    return (image.weight.detach() * (specular * (1 + ROUGH * roughness**4) + 0.1 * lost)).sum() / count
 
 
 def evenness(networks: Networks, image: Image, count: int, generator: torch.Generator) -> torch.Tensor:

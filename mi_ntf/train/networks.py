@@ -18,6 +18,9 @@ from ..core.microfacet import MIN_ROUGHNESS
 from ..core.reference import PLANES
 from . import ops
 
+MATT = -3.0
+"""logit of the specular weight at the start: lobes have to show first."""
+
 
 @dataclass(frozen=True)
 class Networks:
@@ -166,6 +169,7 @@ def initial(architecture: Architecture, log_density: float, generator: torch.Gen
     for name, net in architecture.networks().items():
         tensors[f"{name}.layers.{len(net.hidden)}.weight"] *= 0.1
     tensors[f"density.layers.{len(architecture.density.hidden)}.bias"] += log_density
+    tensors[f"reflectance.layers.{len(architecture.reflectance.hidden)}.bias"][7] += MATT
     return Networks(architecture, {k: v.requires_grad_() for k, v in tensors.items()})
 
 

@@ -66,6 +66,12 @@ def sphere_span(o: torch.Tensor, d: torch.Tensor):
     return t0, torch.where(hit, torch.maximum(middle + h, t0), t0)
 
 
+def pixel_width(split: Split) -> float:
+    """Width of a pixel of the median photograph at the unit sphere's centre, field units."""
+    distance = np.linalg.norm(split.c2w[:, :3, 3] - split.center, axis=1) / split.radius
+    return float(np.median(distance / split.focal.max(1)))
+
+
 def visual_hull(split: Split, cells: int) -> torch.Tensor:
     """Cells (cells, cells, cells) bool, [x, y, z], of [−1, 1]³ that no photograph shows empty.
 

@@ -37,6 +37,7 @@ class Stepper(Descent):
 
     def __init__(self, dataset: Path, config: TrainConfig, minutes: float | None, steps: int | None, seed: int):
         super().__init__(dataset, config, minutes, steps, seed)
+        self.config = config = config.sharpened(rays.pixel_width(self.splits["train"]))
         self.optimizers = {"field": self._optimizer(*FIELD), "ntf": self._optimizer("transmittance", "visibility")}
         self.occupancy = Occupancy(rays.visual_hull(self.splits["train"], config.cells))
         # Rays that miss the hull have nothing to teach. All others stay for good: matter may grow into any of them.

@@ -238,9 +238,10 @@ def test_held_out_score_of_a_network_that_knows_no_shadow():
 
 
 def test_rough_lobes_cost_more():
-    """Σ w (s − 0.005)⁺ (1 + 30 α²) per ray."""
-    gloss = torch.tensor([1.0, 0.5, 1.0]), torch.tensor([0.205, 0.405, 0.004])
+    """Σ w ((1 + 30 α²) s + (−5 − ln s)²/10) per ray, the square where s lies below e^−5."""
+    gloss = torch.tensor([1.0, 0.5, 1.0]), torch.tensor([0.2, 0.4, math.exp(-7)])
     image = render.Image(color=None, alpha=None, x=None, shaded=None, index=None,
                          weight=torch.tensor([0.5, 0.25, 0.25]),
                          normal=None, gloss=gloss, radiance=None, raw=None, bounced=0.0)
-    assert float(losses.gloss(image, 4)) == pytest.approx((0.5 * 0.2 * 31 + 0.25 * 0.4 * (1 + 30 / 16)) / 4)
+    wanted = 0.5 * 0.2 * 31 + 0.25 * 0.4 * (1 + 30 / 16) + 0.25 * (math.exp(-7) * 31 + 0.4)
+    assert float(losses.gloss(image, 4)) == pytest.approx(wanted / 4)
