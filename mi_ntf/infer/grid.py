@@ -34,7 +34,7 @@ class GridField:
 
     def __init__(self, field: NetworkField, resolution: int, dj: ModuleType):
         self.dj, self.resolution = dj, resolution
-        log_sigma = _kernel_mean(_bake(lambda p: [field.log_density(p)], 1, resolution, dj))
+        log_sigma = _kernel_mean(_bake(lambda p: [field.log_density(p)], 1, resolution, dj), dj)
         self._log_sigma = _texture(log_sigma, dj)
         values = _bake(lambda p: _flat(field.reflectance(p)), 8, min(resolution, REFLECTANCE_RESOLUTION), dj)
         self._reflectance = _texture(values, dj)
@@ -61,19 +61,22 @@ class GridField:
 
 def _highest_gloss(reflectance: np.ndarray, dense: np.ndarray) -> float:
     """s/(4 α²), the most of all voxels of `reflectance` (z, y, x, 8) that hold some of the voxels `dense`."""
-    at = np.argwhere(dense) * reflectance.shape[0] // dense.shape[0]
-    roughness, specular = reflectance[tuple(at.T)][:, 6:].T
+    at = np.arange(dense.shape[0]) * reflectance.shape[0] // dense.shape[0]
+    roughness, specular = reflectance[_any(dense, at, at, reflectance.shape[0])][:, 6:].T
     return float((specular / (4 * roughness**4)).max(initial=0.0))
 
 
-def _kernel_mean(log_sigma: np.ndarray) -> np.ndarray:
+def _kernel_mean(log_sigma: np.ndarray, dj: ModuleType) -> np.ndarray:
     """Means under the trilinear kernel, ∫ (1 − |x|) f ≈ f + f″/12 along each axis of (z, y, x, 1)."""
-    values = np.maximum(log_sigma, MEAN_FLOOR)
-    for axis in range(3):
-        values = np.moveaxis(values, axis, 0)
-        wide = np.concatenate([values[:1], values, values[-1:]])
-        values = np.moveaxis((wide[:-2] + 10 * wide[1:-1] + wide[2:]) / 12, 0, axis)
-    return values
+    n, values = log_sigma.shape[0], dj.Float(np.maximum(log_sigma, MEAN_FLOOR).ravel())
+    here = dr.arange(dj.UInt32, n**3)
+    for stride in (1, n, n * n):
+        place, step = here // stride % n, dr.opaque(dj.UInt32, stride)
+        sides = (dr.gather(dj.Float, values, dr.select(place == end, here, beside))
+                 for end, beside in ((0, here - step), (n - 1, here + step)))
+        values = (sum(sides) + 10 * values) / 12
+        dr.eval(values)
+    return values.numpy().reshape(log_sigma.shape)
 
 
 def _flat(reflectance) -> list:
@@ -106,15 +109,19 @@ def _bake(evaluate, channels: int, resolution: int, dj: ModuleType) -> np.ndarra
 def _occupied_cells(dense: np.ndarray) -> np.ndarray:
     """Cells (z, y, x) of the occupancy grid that interpolation between the voxels `dense` gives any density."""
     n = dense.shape[0]
-    occupied = np.zeros((CELLS,) * 3, bool)
     # A voxel's density reaches one voxel to each side of its centre.
-    k, j, i = np.nonzero(dense)
-    low = [np.clip(np.floor((c - 0.5) / n * CELLS - 1e-4), 0, CELLS - 1).astype(int) for c in (k, j, i)]
-    high = [np.clip(np.floor((c + 1.5) / n * CELLS + 1e-4), 0, CELLS - 1).astype(int) for c in (k, j, i)]
-    spread = max((int((b - a).max()) for a, b in zip(low, high, strict=True)), default=0) if len(k) else 0
-    for dz, dy, dx in np.ndindex(*(spread + 1,) * 3):
-        occupied[tuple(np.minimum(a + d, b) for a, b, d in zip(low, high, (dz, dy, dx), strict=True))] = True
-    return occupied
+    first = np.floor((np.arange(n) - 0.5) / n * CELLS - 1e-4)
+    last = np.floor((np.arange(n) + 1.5) / n * CELLS + 1e-4)
+    return _any(dense, first, last, CELLS)
+
+
+def _any(dense: np.ndarray, first: np.ndarray, last: np.ndarray, cells: int) -> np.ndarray:
+    """Which of cells³ cells (z, y, x) any of the voxels `dense` reaches, along each axis from the `first` to the `last`
+    of its indices."""
+    for axis in range(3):
+        parts = [dense.compress((first <= k) & (k <= last), axis).any(axis) for k in range(cells)]
+        dense = np.stack(parts, axis)
+    return dense
 
 
 def _support_points(dense: np.ndarray, directions: int = 1200) -> np.ndarray:

@@ -43,16 +43,21 @@ def _measure(grid, n: int, dj: ModuleType) -> tuple[np.ndarray, float]:
         index, out = index[seen], out[seen]
     if len(index):
         x, normal = look(index)
-        out = dj.Float(out)
-        below = _depth(grid, x, tuple(-c for c in normal), skin.SOLID)
+        below = _depth(grid, x, tuple(-c for c in normal), skin.SOLID).numpy()
+        known[tuple(index.T)] = True
+        solid = float(np.mean(out + below > skin.SOLID))
+        # Smoke has no skin: eight marches less for each of its voxels, which may be all there are.
+        firm = out + below > skin.SMOKE
+        index, out, below = index[firm], out[firm], below[firm]
+    if len(index):
+        x, normal = look(index)
+        out, below = dj.Float(out), dj.Float(below)
         sigma, total = grid.density(x), dj.Float(0)
         for turn in skin.TURNS:
             d = skin.across(ops, normal, tuple(dr.opaque(dj.Float, c) for c in turn))
             total = total + skin.share(ops, out, _depth(grid, x, d, skin.FLATTEST * out), sigma)
             dr.eval(total)
         result[tuple(index.T)] = skin.softness(ops, total / skin.AZIMUTHS, out, below).numpy()
-        known[tuple(index.T)] = True
-        solid = float(np.mean((out + below).numpy() > skin.SOLID))
     return spread(result, known), solid
 
 

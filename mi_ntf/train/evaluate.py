@@ -12,6 +12,8 @@ from .render import render, scatter_sum
 
 CUT = 0.1
 """The renderer treats σ below this as empty."""
+CELLS = 128
+"""Cells along an edge of the occupancy grid that finished fields are seen through."""
 
 
 def srgb(x: torch.Tensor) -> torch.Tensor:
@@ -47,11 +49,14 @@ def psnr(predicted: torch.Tensor, target: torch.Tensor, images: int) -> dict[str
     return {"srgb": mean(srgb(predicted), srgb(target)), "linear": mean(predicted, target)}
 
 
-def score(networks: Networks, rays: Rays, images: int, step: float, bounced=None,
-          cells: int = 128) -> dict[str, float]:
-    """PSNR of a whole split, from the networks alone: what they put outside the visual hull is seen too."""
-    generator = device.generator(1)
-    occupancy = from_networks(networks, cells, CUT, generator)
-    color, alpha, _ = render_all(networks, rays, occupancy, step, generator, bounced, passes=2)
+def occupied(networks: Networks) -> Occupancy:
+    """Where the networks put matter, and be it outside the visual hull: a renderer sees that too."""
+    return from_networks(networks, CELLS, CUT, device.generator(1))
+
+
+def score(networks: Networks, occupancy: Occupancy, rays: Rays, images: int, step: float,
+          bounced=None) -> dict[str, float]:
+    """PSNR of a whole split; `occupancy`: of :func:`occupied`."""
+    color, alpha, _ = render_all(networks, rays, occupancy, step, device.generator(1), bounced, passes=2)
     error = (alpha - rays.target[:, 3]).square().mean()
     return psnr(color, rays.target[:, :3], images) | {"alpha_rmse": math.sqrt(float(error))}

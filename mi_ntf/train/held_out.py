@@ -3,23 +3,24 @@
 import torch
 
 from . import device
-from .evaluate import CUT
 from .losses import tau
 from .marched import Marched, chords, uniform_directions
 from .networks import Networks, crossings
-from .occupancy import from_networks
+from .occupancy import Occupancy
 from .rays import Rays
 
 STEPS = 2048
 
 
 @torch.no_grad()
-def score(networks: Networks, rays: Rays, count: int = 4096, chunk: int = 512) -> dict[str, float]:
+def score(networks: Networks, occupancy: Occupancy, rays: Rays, count: int = 4096,
+          chunk: int = 512) -> dict[str, float]:
     """``rms`` and ``bias`` of τ_nt against the field's own marched τ, on about `count` pairs of a shading point of the
-    (held-out) `rays` and a light in a random direction. Empty where no ray sees matter."""
+    (held-out) `rays` and a light in a random direction; `occupancy`: of :func:`mi_ntf.train.evaluate.occupied`. Empty
+    where no ray sees matter."""
     generator = device.generator(4)
     marched = Marched()
-    marched.update(networks, from_networks(networks, 96, CUT, generator))
+    marched.update(networks, occupancy)
     rays = rays[(rays.target[:, 3] > 0.5).nonzero()[:, 0]]
     errors = [torch.zeros(0)]
     for _ in range(0, count if len(rays) else 0, chunk):

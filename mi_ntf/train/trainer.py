@@ -261,11 +261,12 @@ class _Loop(Descent):
         header = Header(self.config.architecture, self.similarity, report)
         field_file.save(self.out, header, tensors)
         stored = networks.from_tensors(self.config.architecture, field_file.load(self.out)[1])
+        occupancy = evaluate.occupied(stored)
         for name in ("val", "test"):
-            scores = evaluate.score(stored, self.rays[name], len(self.splits[name].images), self.config.step,
-                                    self.bounced)
+            scores = evaluate.score(stored, occupancy, self.rays[name], len(self.splits[name].images),
+                                    self.config.step, self.bounced)
             report[name] = {k: round(v, 3 if k != "alpha_rmse" else 5) for k, v in scores.items()}
-        report["transmittance"] = held_out.score(stored, self.rays["val"])
+        report["transmittance"] = held_out.score(stored, occupancy, self.rays["val"])
         field_file.save(self.out, Header(self.config.architecture, self.similarity, report), tensors)
         checkpoint.delete(self.checkpoint)
         return report

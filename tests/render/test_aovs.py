@@ -111,7 +111,7 @@ def test_soft_matter(tmp_path):
     """σ = 0.7 in the unit sphere: depth and opacity of exponential free flight."""
     path = tmp_path / "soft.safetensors"
     field_file.save(path, *fields.uniform(0.7), np.float32)
-    found, _ = layers(path, "depth,opacity", spp=256)
+    found, _ = layers(path, "depth,opacity", lights={}, spp=256)
     x, y, _ = pixels()
     r = np.hypot(x, y)
     inner = r < 0.8

@@ -13,7 +13,8 @@ from mi_ntf.core import field_file
 from mi_ntf.core.architecture import FAST, Encoding, Header
 from mi_ntf.render import field
 
-LIGHTS = ("directional", "point", "env")
+# test_lights.py compares every emitter, in larger blocks.
+LIGHTS = ("directional", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("point", "env")))
 SEEDS = 4
 
 

@@ -44,7 +44,7 @@ def main(dataset: str, out: str, steps: str, death: str = "") -> None:
 
     trainer._Run.advance, trainer._Run.finish, os.replace = recorded, finished, replaced
     trainer._Run.carve = functools.partialmethod(trainer._Run.carve, steps=20)
-    evaluate.score = lambda *_: {"srgb": 0.0}  # seconds, and no matter here
+    evaluate.score, evaluate.CELLS = lambda *_: {"srgb": 0.0}, 32  # seconds, and no matter here
     report = train(Path(dataset), Path(out), steps=int(steps))
     assert bool(report) == (parallel.first() and os.environ.get("RANK", "0") == "0")
 
