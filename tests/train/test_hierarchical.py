@@ -188,6 +188,7 @@ def test_a_network_that_reads_baked_densities_is_refused(photographs, tmp_path):
 @pytest.mark.parametrize("preset", ["fast", "paper"])
 def test_the_baselines_network_learns_beside_and_is_stored(photographs, tmp_path, monkeypatch, preset):
     """Its error falls in some steps."""
+    two_spheres.coarsen(monkeypatch)
     monkeypatch.setitem(config.PRESETS, "paper", SMALL)
     torch.set_num_threads(1)
     settings = config.configured(preset, visibility_mlp=True)

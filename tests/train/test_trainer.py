@@ -33,7 +33,8 @@ def test_short_run_learns_the_spheres(photographs, tmp_path):
     assert list(tmp_path.iterdir()) == [out], "checkpoint and temporary files are gone"
 
 
-def test_a_finished_field_learns_another_transmittance(photographs, tmp_path):
+def test_a_finished_field_learns_another_transmittance(photographs, tmp_path, monkeypatch):
+    two_spheres.coarsen(monkeypatch)
     old, new = tmp_path / "old", tmp_path / "new"
     train(photographs, old, steps=8)
     report = train(photographs, new, steps=25, field=old, ntf="logistic", visibility_mlp=True)

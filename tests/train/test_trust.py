@@ -21,6 +21,7 @@ def photographs(tmp_path_factory):
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
+    two_spheres.coarsen(monkeypatch)
     monkeypatch.setattr(trainer, "KEEP", 4)
     monkeypatch.setattr(trainer._Run, "carve", functools.partialmethod(trainer._Run.carve, steps=5))
     monkeypatch.setattr(evaluate, "score", lambda *_: {"srgb": 0.0})  # seconds, and no matter here
