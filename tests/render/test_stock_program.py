@@ -22,7 +22,8 @@ SCENE = """<scene version="3.9.0">
   {light}
   <shape type="sphere">
     <point name="center" x="0.4" y="-0.2" z="0.3"/><float name="radius" value="1.5"/><bsdf type="null"/>
-    <medium type="nrf" name="interior"><string name="filename" value="blobs.safetensors"/></medium>
+    <medium type="nrf" name="interior">
+      <string name="filename" value="blobs.safetensors"/><integer name="resolution" value="64"/></medium>
   </shape>
 </scene>"""
 POINT = (

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 
 from mi_ntf.data import schema
-from mi_ntf.train import config, evaluate
 
 SPHERES = (((-0.25, 0.0, 0.1), 0.45, (0.7, 0.3, 0.2)), ((0.4, 0.25, -0.2), 0.3, (0.2, 0.4, 0.6)))
 INTENSITY = 30.0
@@ -16,6 +15,8 @@ DISTANCE = 3.2
 def coarsen(monkeypatch) -> None:
     """The preset `fast` on grids whose upkeep takes no longer than its steps: for runs of some steps that need not
     learn."""
+    from mi_ntf.train import config, evaluate
+
     monkeypatch.setitem(config.PRESETS, "fast", dataclasses.replace(config.PRESETS["fast"], cells=48, bake=64))
     monkeypatch.setattr(evaluate, "CELLS", 32)
 
