@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
 BLOCKS = dict(re.findall(r"```(\w+)\n(.*?)```", TEXT, re.S))
 COMMANDS = [line.split("#")[0].split() for line in TEXT.splitlines() if re.match(r"    (mi-ntf|mitsuba|make) ", line)]
-SMALLER = {"--minutes": "0.05", "--steps": "20", "--size": "24"}
+SMALLER = {"--minutes": "0.05", "--steps": "4", "--size": "24"}
 CAPTURE = {"--views": "12", "--size": "24", "--test-views": "1", "--spp": "2"}
 
 

@@ -35,11 +35,17 @@ class Occupancy:
         return (corner + torch.rand(corner.shape, generator=generator)) * (2 / n) - 1
 
     @torch.no_grad()
-    def update(self, networks: Networks, generator: torch.Generator, decay: float = 0.8) -> None:
-        """Take new densities at random points of every cell; old ones fade slowly, so that a thin skin is not lost."""
-        n = self.cells
+    def look(self, networks: Networks, generator: torch.Generator, decay: float = 1.0) -> torch.Tensor:
+        """Densities at a random point of every cell, which raise its level."""
         new = networks.density(self.positions(self.index, generator))
         self.level = torch.maximum(self.level * decay, new)
+        return new
+
+    @torch.no_grad()
+    def update(self, networks: Networks, generator: torch.Generator) -> None:
+        """Look anew; old levels fade slowly, so that a thin skin is not lost."""
+        n = self.cells
+        new = self.look(networks, generator, 0.8)
         grid = torch.zeros(n**3)
         grid[self.index] = (self.level > FULL_BELOW).float()
         near = F.max_pool3d(grid.view(1, 1, n, n, n), 3, 1, 1).view(-1)[self.index] > 0

@@ -70,8 +70,9 @@ class Stepper(Descent):
 
     def take(self, path: Path, header: Header, tensors: dict) -> None:
         super().take(path, header, tensors)
-        for _ in range(12):  # each looks at one point a cell; skins fill a fraction of theirs
-            self.occupancy.update(self.nets, self.generator)
+        for _ in range(11):  # skins fill a fraction of their cells
+            self.occupancy.look(self.nets, self.generator)
+        self.occupancy.update(self.nets, self.generator)
         self.find_bounced()
 
     def occupied(self) -> Occupancy:
