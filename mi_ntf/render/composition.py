@@ -7,9 +7,9 @@ import mitsuba as mi
 
 from ..core.errors import MiNtfError
 from ..infer import march, shade
-from ..infer.visibility import outside
 from . import effects, environment, lights, measure, visibility
 from .bounced import Bounced, Patches
+from .shadow import Known, Shadow, between
 from .surfaces import Surfaces
 from .walk import Paths, Walk
 
@@ -33,41 +33,6 @@ class Part:
     @property
     def source(self):
         return self.medium.source
-
-
-class Shadow:
-    """All that dims a light on its way to points of one field: that field (`own`, a visibility method in the
-    coordinates of `frame`), the others (pairs of frame and method) and `surfaces`. A visibility method itself."""
-
-    def __init__(self, frame, own, others: list, surfaces):
-        self.frame, self.own, self.others, self.surfaces = frame, own, others, surfaces
-
-    def tau(self, x, wi, distance, index, active):
-        """The product of their transmittances, in [0, 1]."""
-        tau = self.own.tau(x, wi, distance, index, active)
-        p, d = self.frame.point_to_world(x), self.frame.direction_to_world(wi)
-        length = distance * self.frame.length
-        for frame, other in self.others:
-            tau = tau * _tau(frame, other, p, d, length, index, active & (tau > 0))
-        if self.surfaces:
-            tau = dr.select(self.surfaces.blocked(p, d, length, active & (tau > 0)), 0, tau)
-        return tau
-
-
-class Known:
-    """A visibility method that knows its answer: that of a light at the camera, which light and view share."""
-
-    def __init__(self, tau):
-        self._tau = tau
-
-    def tau(self, x, wi, distance, index, active):
-        return self._tau
-
-
-def _tau(frame, method, p, d, length, index, active):
-    """A field's transmittance between scene points."""
-    x, wi = frame.point_to_field(p), frame.direction_to_field(d)
-    return outside.tau(method, x, wi, length / frame.length, index, active)
 
 
 class Composition:
@@ -141,7 +106,7 @@ class Composition:
         tau = mi.Float(1)
         for part in self.parts:
             if part.drawn:
-                tau = tau * _tau(part.frame, part.drawn, p, d, distance, mi.UInt32(0), active)
+                tau = tau * between(part.frame, part.drawn, p, d, distance, mi.UInt32(0), active)
         return tau
 
     def strands(self, ray, parts, steps=None):
