@@ -158,10 +158,10 @@ def test_orientation(blobs):
     for emitter, extra in ((scenes.light("directional"), {}), (env, {"environment_lights": 512})):
         lights = {"light": emitter}
         ours = scenes.render(scenes.scene(blobs, nrf(**extra), lights, spp=16))
-        volpath = scenes.scene(blobs, {"type": "volpath", "max_depth": 2, "hide_emitters": True}, lights, spp=64)
+        volpath = scenes.scene(blobs, {"type": "volpath", "max_depth": 2, "hide_emitters": True}, lights)
         volpath = scenes.render(volpath)
         mesh = scenes.scene(
-            None, {"type": "path", "max_depth": 2, "hide_emitters": True}, lights, spp=64, shapes=spheres
+            None, {"type": "path", "max_depth": 2, "hide_emitters": True}, lights, shapes=spheres
         )
         mesh = scenes.render(mesh)
 
