@@ -17,9 +17,11 @@ test:
 	@$(RUN) -m ruff check .
 	@$(RUN) -m pytest -n 2 --dist loadfile -q -m "not slow and not gpu"
 
-# The whole catalogue of hard cases as a table, with 200 random scenes in one process and 60 beside volpath among them.
+# Every slow test, and the whole catalogue of hard cases as a table, with 200 random scenes in one process and 60 beside
+# volpath among them.
 hard-cases:
 	@$(PYTHON) tools/setup_env.py dev
+	@$(RUN) -m pytest -n 2 --dist loadfile -q -m "slow and not gpu" --ignore tests/hard_cases
 	@$(RUN) -m pytest -n 2 --dist loadfile -q tests/hard_cases --catalogue
 
 clean:

@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
 BLOCKS = dict(re.findall(r"```(\w+)\n(.*?)```", TEXT, re.S))
 COMMANDS = [line.split("#")[0].split() for line in TEXT.splitlines() if re.match(r"    (mi-ntf|mitsuba|make) ", line)]
-SMALLER = {"--minutes": "0.05", "--steps": "4", "--size": "24"}
+SMALLER = {"--minutes": "0.1", "--steps": "20", "--size": "24"}
 CAPTURE = {"--views": "12", "--size": "24", "--test-views": "1", "--spp": "2"}
 
 
@@ -65,7 +65,7 @@ def test_command(folder, words):
     if words[0] == "mitsuba" and "scenes/" in words[-1]:  # a swapped one is small by itself
         words[1:1] = ["-D", "res=16"]
     if words[1] in ("explain", "bake"):
-        words += ["-D", "res=16", "-D", "spp=1", "-D", "depth=2"]
+        words += ["-D", "res=16", "-D", "spp=1"]
     printed = check(*words, folder=folder)
     assert words[1] != "info" or "similarity" in printed
 

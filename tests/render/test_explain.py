@@ -115,15 +115,23 @@ def test_measured_beside_predicted(tmp_path, capsys):
     assert "measured" in capsys.readouterr().out
 
 
-def test_the_patches_of_bounced_light_are_a_stage_of_their_own():
+def test_the_patches_of_bounced_light_are_a_stage_of_their_own(monkeypatch):
     """Their kernels are none of the camera's, though they march and sum lights as those do; they count each time."""
-    found = []
+    found, kernels, by_stage = [], [], measure.by_stage
+
+    def counted(history):
+        texts = [k["ir"].getvalue() for k in history if k.get("ir") is not None]
+        kernels.append({label: sum(f"loop: {label}\n" in t for t in texts) for label in measure.LOOPS})
+        return by_stage(history)
+
+    monkeypatch.setattr(measure, "by_stage", counted)
     for depth in ("2", "6"):
         scene = load_scene(SCENE, {"light": "point", "visibility": "raymarch", "res": "16", "spp": "1", "depth": depth})
         found.append(measure.measure(scene, scene.integrator(), 1))
     single, all_ = found
     assert set(all_["stages"]) - set(single["stages"]) == {"bounces"}
     assert all_["points"] == single["points"] > 0
+    assert kernels[0] == kernels[1] and kernels[0]["lights"] > 0
     assert 0 < all_["stages"]["bounces"] < all_["wall_seconds"]
 
 

@@ -13,7 +13,7 @@ from mi_ntf.core import field_file
 from mi_ntf.core.architecture import FAST, Encoding, Header
 from mi_ntf.render import field
 
-# test_lights.py compares every emitter, in larger blocks.
+# test_lights.py compares every emitter, in larger blocks; those of the long run (`make hard-cases`) take two minutes.
 LIGHTS = ("directional", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("point", "env")))
 SEEDS = 4
 

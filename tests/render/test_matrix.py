@@ -21,8 +21,6 @@ TOLERANCE = {
 DRAWN = ("area", "projector")
 """What they shine is marched under maps and volumes."""
 KINDS = ("point", "spot", "directional", "constant", "envmap", "sunsky", "area", "projector", "directionalarea")
-QUICK = {"statue": KINDS, "globe": ("spot", "sunsky", "area"), "knot": ("point", "constant", "projector")}
-"""Every method meets every emitter on one field, a third of them on the others; all on all are slow."""
 
 
 def images(name: str, kind: str, methods) -> dict[str, np.ndarray]:
@@ -45,10 +43,8 @@ def images(name: str, kind: str, methods) -> dict[str, np.ndarray]:
     return {"fine": fine} | {method: image(method) for method in methods}
 
 
-@pytest.mark.parametrize(("name", "kind"), [
-    pytest.param(name, kind, marks=() if kind in quick else pytest.mark.slow)
-    for name, quick in QUICK.items() for kind in KINDS
-])
+@pytest.mark.parametrize("name", ["statue", "globe", "knot"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_every_method_and_emitter(name, kind):
     found = images(name, kind, TOLERANCE)
     truth = found.pop("fine")
