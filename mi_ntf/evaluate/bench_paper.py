@@ -17,6 +17,7 @@ import numpy as np
 from ..core import spheres
 from ..core.architecture import PAPER, Architecture, Header
 from ..infer import march, ops, shade
+from ..infer.bundle import Strand
 from ..infer.network import NetworkField
 from ..infer.profile import DepthProfile
 from ..render.calibrate import seconds, table_of
@@ -129,7 +130,7 @@ def camera_cost(sensor, medium, paper: PaperField, sizes: Sizes):
     o, d, far = _view_rays(sensor, medium.frame, sizes.pixels)
     middle = dr.full(mi.Float, 0.5, dr.width(far))
     step = dr.opaque(mi.Float, 2 / IMAGE_SAMPLES)
-    strand = march.Strand(paper.density, medium.field.grid, o, d, step)
+    strand = Strand(paper.density, medium.field.grid, o, d, step)
     last = []
 
     def view():

@@ -44,6 +44,8 @@ class NetworkField:
         baseline = arch.visibility
         self._visibility = None if baseline is None else _Network(baseline.encoding, "visibility", tensors, dj)
         self.has_visibility = baseline is not None
+        self.quick = arch.reflectance.encoding.kind == "planes"
+        """Whether reflectance costs no more than some fetches."""
 
     def log_density(self, p):
         """ln σ at `p`, clipped to the legal range; without the cuts of :meth:`density`."""

@@ -5,7 +5,7 @@ import drjit as dr
 from ..core import spheres
 from ..core.depth_profile import LEVELS
 from . import ops
-from .march import clear_distance, onward, safe_inverse
+from .bundle import clear_distance, onward, safe_inverse
 
 FOR_NETWORKS = 1.5
 """Steps of the march that networks read, in cells of the camera's march: finer ones change relit images by 0.1 %."""

@@ -7,8 +7,8 @@ import numpy as np
 
 from ..core import skin
 from . import ops
+from .bundle import clear_distance, onward, safe_inverse
 from .grid import REFLECTANCE_RESOLUTION
-from .march import clear_distance, onward, safe_inverse
 
 
 class Softness:

@@ -6,6 +6,7 @@ import numpy as np
 
 from ..core import microfacet, radiosity
 from ..infer import march, shade
+from ..infer.bundle import Strand
 from ..infer.irradiance import Irradiance
 
 CHORDS = 1 << 16
@@ -151,9 +152,9 @@ def _chords(medium, rng) -> tuple[np.ndarray, np.ndarray]:
 
 def meet(density, grid, o: np.ndarray, d: np.ndarray, rng) -> tuple[np.ndarray, np.ndarray]:
     """Whether rays (n, 3), field coordinates, meet the skin of a field, and where first; `density`, `grid`: as of
-    :class:`mi_ntf.infer.march.Strand`."""
+    :class:`mi_ntf.infer.bundle.Strand`."""
     n, start, along = len(o), _vector(o), _vector(d)
-    strand = march.Strand(density, grid, tuple(start), tuple(along), dr.opaque(mi.Float, 2 / STEPS))
+    strand = Strand(density, grid, tuple(start), tuple(along), dr.opaque(mi.Float, 2 / STEPS))
     hit, t, _, bundle = march.free_flight([strand], dr.full(mi.Float, dr.inf, n), mi.Float(rng.random(n)),
                                           mi.Float(radiosity.DEPTH), mi.Float(0.5))
     x = start + (bundle.base + t) * along

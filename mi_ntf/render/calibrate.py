@@ -11,6 +11,7 @@ import numpy as np
 
 from ..core import radiosity
 from ..infer import march, shade
+from ..infer.bundle import Strand
 from ..infer.lights import LightTable
 from . import bounced, cost, visibility
 
@@ -106,7 +107,7 @@ def _points(medium) -> shade.Points:
 def _camera(grid) -> march.Samples:
     o, d = _rays(grid)
     middle = dr.full(mi.Float, 0.5, WIDTH)
-    strand = march.Strand(grid.density, grid, o, d, dr.opaque(mi.Float, 2 / SAMPLES))
+    strand = Strand(grid.density, grid, o, d, dr.opaque(mi.Float, 2 / SAMPLES))
     return march.camera_samples([strand], mi.Float(dr.inf), middle, middle)
 
 

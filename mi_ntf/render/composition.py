@@ -7,6 +7,7 @@ import mitsuba as mi
 
 from ..core.errors import MiNtfError
 from ..infer import march, shade
+from ..infer.bundle import Strand
 from . import effects, environment, lights, measure, visibility
 from .bounced import Bounced, Patches
 from .shadow import Known, Shadow, between
@@ -115,7 +116,7 @@ class Composition:
         several = len(parts) > 1
         unit = min(p.frame.length for p in parts)
         result = [
-            march.Strand(
+            Strand(
                 p.source.density,
                 p.medium.field.grid,
                 p.frame.point_to_field(ray.o),

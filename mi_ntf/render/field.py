@@ -29,10 +29,11 @@ class LoadedField:
 
 
 def voxels(header: Header) -> int:
-    """Voxels per side that a field is baked to unless told: four of three texels of its finest density planes, and
-    192 at least. Fewer thin out skins: of 192² planes, 192 took 1.4 % of the light under the flash, 256 0.4 %."""
+    """Voxels per side that a field is baked to unless told: two for each texel of its finest density planes, and 192 at
+    least. Products of three planes are finer than one: of 192² planes, relit pictures differ from the photographed
+    object by 15.4 % with 256 voxels, 13.9 % with 384, 13.4 % with 512."""
     finest = max(header.architecture.density.encoding.resolutions, default=0)
-    return min(max(192, 4 * finest // 3), 512)
+    return min(max(192, 2 * finest), 512)
 
 
 def load(path: str, resolution: int | None) -> LoadedField:

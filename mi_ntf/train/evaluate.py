@@ -8,7 +8,7 @@ from . import device
 from .networks import Networks
 from .occupancy import Occupancy, from_networks
 from .rays import Rays
-from .render import render, scatter_sum
+from .render import render, scatter_sum, unspent
 
 CUT = 0.1
 """The renderer treats σ below this as empty."""
@@ -33,7 +33,8 @@ def render_all(networks: Networks, rays: Rays, occupancy: Occupancy, step: float
         part = kept[slice(first, first + chunk)]
         where = index[first:first + chunk]
         for _ in range(passes):
-            image = render(networks, part, occupancy.samples(part, step, generator), step, bounced, generator)
+            samples = unspent(networks, part, occupancy.samples(part, step, generator), step)
+            image = render(networks, part, samples, step, bounced, generator)
             color[where] += image.color / passes
             alpha[where] += image.alpha / passes
             normal[where] += scatter_sum(image.weight[:, None] * image.normal, image.shaded, len(part)) / passes

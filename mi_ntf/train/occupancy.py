@@ -10,6 +10,8 @@ FULL_BELOW = 0.3
 """Cells with σ under this (1/radius) count as empty: a whole cell takes less than 1 % of the light."""
 LOG_EMPTY = -4.0
 """ln σ of what counts as empty: a fifth of the renderer's cut at σ = 0.1."""
+LOOKS = 1 << 18
+"""Cells outside the hull that an update looks at, besides those where it found matter the last time."""
 OPAQUE_DEPTH = 10.0
 """Samples behind this optical depth are not drawn: their light came through e^−10 twice."""
 
@@ -48,14 +50,16 @@ class Occupancy:
         new = self.look(networks, generator, 0.8)
         grid = torch.zeros(n**3)
         grid[self.index] = (self.level > FULL_BELOW).float()
-        near = F.max_pool3d(grid.view(1, 1, n, n, n), 3, 1, 1).view(-1)[self.index] > 0
+        near = widest(grid.view(n, n, n)).reshape(-1)[self.index] > 0
         # A cell takes as much light as its thinnest neighbour would: skins, which fill cells in part, hide nothing.
         grid[self.index] = new
-        least = -F.max_pool3d(-grid.view(1, 1, n, n, n), 3, 1, 1).view(-1)[self.index]
+        least = -widest(-grid.view(n, n, n)).reshape(-1)[self.index]
         self.sigma[self.index] = torch.where(near, least, -1.0)
-        x = self.positions(self.outside, generator)
+        some = torch.randint(max(len(self.outside), 1), (min(len(self.outside), LOOKS),), generator=generator)
+        some = torch.cat([self.stray, self.outside[some]]).unique()
+        x = self.positions(some, generator)
         stray = [networks.log_density(p) > LOG_EMPTY for p in x.split(65536)]
-        self.stray = self.outside[torch.cat(stray)] if stray else self.outside
+        self.stray = some[torch.cat(stray)] if stray else some
 
     def must_be_empty(self, count: int, generator: torch.Generator) -> torch.Tensor:
         """Points (≤ 2·count, 3) outside the hull: half anywhere, half in cells where matter has strayed."""
@@ -95,6 +99,17 @@ class Occupancy:
         ahead = depth - sigma.clamp(min=0) * step < OPAQUE_DEPTH
         ray, k = torch.nonzero((sigma >= 0) & ahead & (t < rays.t1[:, None]) & (t > rays.t0[:, None]), as_tuple=True)
         return ray, t[ray, k]
+
+
+def widest(grid: torch.Tensor) -> torch.Tensor:
+    """The most of each value of a grid (k, k, k) and its 26 neighbours; axis by axis, a fifth of max_pool3d's time."""
+    for axis in range(3):
+        n = grid.shape[axis]
+        out = grid.clone()
+        torch.maximum(out.narrow(axis, 0, n - 1), grid.narrow(axis, 1, n - 1), out=out.narrow(axis, 0, n - 1))
+        torch.maximum(out.narrow(axis, 1, n - 1), grid.narrow(axis, 0, n - 1), out=out.narrow(axis, 1, n - 1))
+        grid = out
+    return grid
 
 
 def _spans(rays: Rays, full: torch.Tensor, extent: float, step: float, chunk: int) -> tuple[torch.Tensor, Rays]:

@@ -25,6 +25,10 @@ makes an opaque field look like a surface of reflectance ρ from all sides; coll
 skins too."""
 MIN_WEIGHT = 1e-4
 """Samples with a smaller alpha weight are not shaded."""
+SPENT = 7.0
+"""Optical depth behind which samples are left out: a thousandth of the pixel's alpha, a millionth of its light."""
+ROUND = 12
+"""Samples of a ray that are looked at before it is asked whether it is spent."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +61,30 @@ def weights(sigma: torch.Tensor, ray: torch.Tensor, step: float | torch.Tensor):
     front = (before - before[first]).float()
     t = torch.exp(-front)
     return t * (1 - torch.exp(-depth)), t * t * (1 - torch.exp(-2 * depth)) / 2
+
+
+@torch.no_grad()
+def unspent(networks: Networks, rays: Rays, samples, step: float):
+    """Of packed ``(ray, t)`` samples those in front of the optical depth SPENT. Two of three lie deeper in the matter
+    that the occupancy grid knows; finding out costs one look at the density of the others, without gradient."""
+    ray, t = samples
+    place = torch.arange(len(ray)) - torch.searchsorted(ray, ray)
+    depth, kept, first = torch.zeros(len(rays)), [], 0
+    rest = torch.arange(len(ray))
+    while len(rest):
+        now = rest[place[rest] < first + ROUND]
+        x = torch.addcmul(rays.o[ray[now]], rays.d[ray[now]], t[now, None])
+        here = networks.density(x) * step
+        # Float64: the sum runs over all rays.
+        total = here.double().cumsum(0)
+        before = total - here
+        front = depth[ray[now]] + (before - before[torch.searchsorted(ray[now], ray[now])]).float()
+        kept.append(now[front < SPENT])
+        depth.index_add_(0, ray[now], here)
+        rest = rest[(place[rest] >= first + ROUND) & (depth[ray[rest]] < SPENT)]
+        first += ROUND
+    index = torch.cat(kept).sort().values if kept else rest
+    return ray[index], t[index]
 
 
 def scatter_sum(value: torch.Tensor, ray: torch.Tensor, count: int) -> torch.Tensor:

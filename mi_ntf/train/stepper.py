@@ -120,6 +120,7 @@ class Stepper(Descent):
         count = min(8192, max(256, int(self.config.samples / self.samples_per_ray)))
         batch = self.seen[torch.randint(len(self.seen), (count,), generator=self.generator)]
         samples = self.occupancy.samples(batch, self.config.step, self.generator)
+        samples = render.unspent(self.nets, batch, samples, self.config.step)
         self.samples_per_ray = 0.9 * self.samples_per_ray + 0.1 * max(1.0, len(samples[0]) / count)
         self.trained[0] += count
         self.trained[1] += len(samples[0])

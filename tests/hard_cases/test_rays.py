@@ -12,6 +12,7 @@ from helpers.jit import arrays
 
 from mi_ntf.core import field_file, spheres
 from mi_ntf.infer import march
+from mi_ntf.infer.bundle import Strand
 
 SIGMA = 1.5
 R = np.sqrt(0.5)
@@ -120,7 +121,7 @@ def test_light_ray(name, method, check):
 def test_camera_ray(name, check):
     o, d = (arrays([v]) for v in RAYS[name])
     grid = ball().source
-    strand = march.Strand(grid.density, grid, o, d, mi.Float(2 / 384))
+    strand = Strand(grid.density, grid, o, d, mi.Float(2 / 384))
     halves = [mi.Float(0.5), mi.Float(0.5)]
     for end in (np.inf, 2.5):
         samples = march.camera_samples([strand], mi.Float(end), *halves)

@@ -15,6 +15,7 @@ from helpers.jit import arrays
 
 from mi_ntf.core import field_file
 from mi_ntf.infer import march
+from mi_ntf.infer.bundle import Strand
 
 KINDS = ("plane", "sphere", "bumps")
 COSINES = (1.0, 0.7, 0.5, 0.3, 0.2, 0.1, 0.05)
@@ -99,7 +100,7 @@ def shipped(name: str):
     o = rng.uniform(-0.7, 0.7, (count, 3))
     o += (3 - o @ view)[:, None] * view
     d = arrays(np.tile(-view, (count, 1)))
-    strand = march.Strand(medium.source.density, medium.source, arrays(o), d, mi.Float(2 / 384))
+    strand = Strand(medium.source.density, medium.source, arrays(o), d, mi.Float(2 / 384))
     random = [mi.Float(rng.random(count)) for _ in range(2)]
     samples = march.camera_samples([strand], mi.Float(np.full(count, 1e9)), *random)
     kept = rng.permutation(len(samples.ray))[:1200]

@@ -9,6 +9,7 @@ from helpers.jit import arrays
 from helpers.variants import VARIANT
 
 from mi_ntf.infer import march
+from mi_ntf.infer.bundle import MIN_WEIGHT_RATE, Strand
 from mi_ntf.infer.grid import GridField
 from mi_ntf.infer.network import NetworkField
 from mi_ntf.infer.visibility import raymarch
@@ -50,7 +51,7 @@ def test_transmittance_and_weights(grid, rng):
     o, d = rays(rng, 300)
     step = 2 / 2048
     samples = march.camera_samples(
-        [march.Strand(grid.density, grid, arrays(o), arrays(d), mi.Float(step))],
+        [Strand(grid.density, grid, arrays(o), arrays(d), mi.Float(step))],
         mi.Float(np.full(300, 1e9)),
         mi.Float(rng.random(300)),
         mi.Float(rng.random(300)),
@@ -62,7 +63,7 @@ def test_transmittance_and_weights(grid, rng):
     sums = np.bincount(np.array(index), weights=np.array(w), minlength=300)
     # What MIN_WEIGHT_RATE leaves out, and MIN_TRANSMITTANCE.
     np.testing.assert_allclose(sums, 1 - np.array(transmittance), atol=6e-3)
-    assert (np.array(w) > march.MIN_WEIGHT_RATE * step).all()
+    assert (np.array(w) > MIN_WEIGHT_RATE * step).all()
     x = np.array(samples.place(0, index, t)[0]).T
     assert np.linalg.norm(x, axis=1).max() < 1
 
@@ -72,7 +73,7 @@ def test_samples_follow_free_flight(slab, rng):
     n, sigma = 20000, 1.5
     o, d = np.tile([[0.0, 0.0, 3.0]], (n, 1)), np.tile([[0.0, 0.0, -1.0]], (n, 1))
     samples = march.camera_samples(
-        [march.Strand(slab.density, slab, arrays(o), arrays(d), mi.Float(0.25))],
+        [Strand(slab.density, slab, arrays(o), arrays(d), mi.Float(0.25))],
         mi.Float(np.full(n, 1e9)),
         mi.Float(rng.random(n)),
         mi.Float(rng.random(n)),
@@ -137,7 +138,7 @@ def test_skipping_changes_nothing(grid, rng):
         mi.Float(rng.random(200)),
         mi.Float(rng.random(200)),
     )
-    strands = [[march.Strand(grid.density, g, arrays(o), arrays(d), mi.Float(2 / 300))] for g in (grid, Everywhere)]
+    strands = [[Strand(grid.density, g, arrays(o), arrays(d), mi.Float(2 / 300))] for g in (grid, Everywhere)]
     fast, slow = ((s.ray, s.t, *s.weights) for s in (march.camera_samples(k, *arguments) for k in strands))
     order = [np.lexsort((np.array(r[1]), np.array(r[0]))) for r in (fast, slow)]
     for a, b in zip(fast, slow, strict=True):
@@ -149,7 +150,7 @@ def test_rays_that_miss():
     empty = GridField(NetworkField(*fields.empty(), mi), 32, mi)
     o, d = np.array([[0, 0, 3.0], [5.0, 0, 3.0]]), np.array([[0, 0, -1.0], [0, 0, -1.0]])
     samples = march.camera_samples(
-        [march.Strand(empty.density, empty, arrays(o), arrays(d), mi.Float(0.01))],
+        [Strand(empty.density, empty, arrays(o), arrays(d), mi.Float(0.01))],
         mi.Float([1e9, 1e9]),
         mi.Float([0.3, 0.3]),
         mi.Float([0.5, 0.5]),
@@ -165,7 +166,7 @@ def test_overlapping_fields_add(rng):
     axis = np.tile([[0.0, 0.0, -1.0]], (n, 1))
     # Scene units are those of the dense ball; the thin one is twice its size, its centre 1.2 behind the other's.
     strands = [
-        march.Strand(f.density, f, arrays(np.tile([[0, 0, z]], (n, 1))), arrays(axis), mi.Float(0.01), mi.Float(rate))
+        Strand(f.density, f, arrays(np.tile([[0, 0, z]], (n, 1))), arrays(axis), mi.Float(0.01), mi.Float(rate))
         for f, z, rate in ((dense, 3.0, 1.0), (thin, 2.1, 0.5))
     ]
     far = mi.Float(np.full(n, 1e9))
@@ -202,7 +203,7 @@ def test_rays_from_afar(slab, distance):
     )
     np.testing.assert_allclose(np.array(depth), truth, atol=0.013)  # as above: voxels cut by the sphere
     samples = march.camera_samples(
-        [march.Strand(slab.density, slab, arrays(x), arrays(d), mi.Float(2 / 384))],
+        [Strand(slab.density, slab, arrays(x), arrays(d), mi.Float(2 / 384))],
         mi.Float(np.inf),
         mi.Float([0.3, 0.7]),
         mi.Float([0.5, 0.5]),
@@ -229,7 +230,7 @@ def test_a_sample_without_a_slot_is_dropped(slab, monkeypatch):
 
     def samples():
         o = np.tile([[0.0, 0.0, 3.0]], (2, 1))
-        strand = march.Strand(slab.density, slab, arrays(o), arrays(np.tile([[0.0, 0, -1]], (2, 1))), mi.Float(0.1))
+        strand = Strand(slab.density, slab, arrays(o), arrays(np.tile([[0.0, 0, -1]], (2, 1))), mi.Float(0.1))
         return march.camera_samples([strand], mi.Float(np.inf), mi.Float([0.3, 0.6]), mi.Float([0.5, 0.5]))
 
     whole = samples()

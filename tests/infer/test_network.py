@@ -13,6 +13,7 @@ from mi_ntf.core import field_file, reference
 from mi_ntf.core.architecture import MEAN_FLOOR, Architecture, Encoding, Header, Network
 from mi_ntf.core.depth_profile import LEVELS
 from mi_ntf.core.errors import MiNtfError
+from mi_ntf.infer import grid as grid_module
 from mi_ntf.infer.grid import CELLS, GridField
 from mi_ntf.infer.network import CLEAR_DEPTH, MIN_DENSITY, NetworkField
 
@@ -169,6 +170,23 @@ def test_voxels_hold_means_of_the_density_and_the_reflectance_at_their_centres(r
     ours, truth = grid.reflectance(p), network.reflectance(p)
     for a, b in zip([*ours[0], *ours[1], *ours[2:]], [*truth[0], *truth[1], *truth[2:]], strict=True):
         np.testing.assert_allclose(np.array(a), np.array(b), atol=2e-4)
+
+
+def test_fine_voxels_are_baked_near_matter_alone_and_hold_the_same(monkeypatch):
+    """Thin and small blobs, voxels finer than the survey: equal to the bit to a bake of all of them."""
+    network = NetworkField(*fields.blobs([(-0.2, 0.1, 0.0), (0.3, -0.2, 0.1)], [0.4, 0.06]), mi)
+    monkeypatch.setattr(grid_module, "SURVEY", 48)
+    evaluate, looked = grid_module._evaluate, []
+
+    def counted(function, count, index, n, dj):
+        looked.append((n, len(index)))
+        return evaluate(function, count, index, n, dj)
+
+    monkeypatch.setattr(grid_module, "_evaluate", counted)
+    some = GridField(network, 112, mi)
+    assert looked[0] == (48, 48**3) and looked[1][0] == 112 and looked[1][1] < 112**3 / 2
+    monkeypatch.setattr(grid_module, "SURVEY", 112)
+    assert (np.array(some._log_sigma.value()) == np.array(GridField(network, 112, mi)._log_sigma.value())).all()
 
 
 def test_grid_knows_where_density_is(rng):

@@ -8,6 +8,8 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="training needs PyTorch: pip install 'mi-ntf[train]'")
 
+import torch.nn.functional as F  # noqa: E402
+
 from mi_ntf.core import microfacet  # noqa: E402
 from mi_ntf.core import ops as numpy_ops  # noqa: E402
 from mi_ntf.core.architecture import Encoding, Network  # noqa: E402
@@ -15,7 +17,7 @@ from mi_ntf.train import evaluate, held_out, losses, networks, render  # noqa: E
 from mi_ntf.train.baked import Baked  # noqa: E402
 from mi_ntf.train.config import PRESETS  # noqa: E402
 from mi_ntf.train.marched import Marched, chords, uniform_directions  # noqa: E402
-from mi_ntf.train.occupancy import Occupancy  # noqa: E402
+from mi_ntf.train.occupancy import Occupancy, widest  # noqa: E402
 from mi_ntf.train.rays import Rays, sphere_span  # noqa: E402
 
 SIGMA = 3.0
@@ -78,6 +80,34 @@ def test_uniform_ball_has_the_closed_form():
         integral = np.sum(np.exp(-2 * SIGMA * (t - t0)) * SIGMA / t**2) * (2 * h[i] / 4000)
         expected = render.SURFACE * integral * ALBEDO / np.pi * LIGHT
         np.testing.assert_allclose(image.color[i], expected, rtol=0.02)
+
+
+def test_rays_end_where_they_are_spent():
+    """What is kept are the samples in front of the depth SPENT, of each ray its own, in the samples' order."""
+    counts, step = np.array([60, 0, 100, 1, 40]), 0.05
+    ray = torch.as_tensor(np.repeat(np.arange(5), counts))
+    t = torch.as_tensor(np.concatenate([np.arange(n) * step + 1 for n in counts])).float()
+    sigma = torch.tensor([2.0, 0.0, 0.3, 500.0, 30.0])
+
+    class Rows:
+        def density(self, x):
+            return sigma[x[:, 1].round().long()]
+
+    batch = rays(5)
+    o, d = torch.tensor([[0.0, k, 0.0] for k in range(5)]), torch.tensor([[1.0, 0.0, 0.0]] * 5)
+    batch = dataclasses.replace(batch, o=o, d=d)
+    order, places = render.unspent(Rows(), batch, (ray, t), step)
+    for k, n in enumerate(counts):
+        front = np.arange(n) * float(sigma[k]) * step
+        assert (order == k).sum() == (front < render.SPENT - 1e-4).sum(), k
+        np.testing.assert_allclose(places[order == k], 1 + step * np.arange(int((order == k).sum())), rtol=1e-6)
+    assert (order.diff() >= 0).all()
+
+
+@pytest.mark.parametrize("shape", [(5, 5, 5), (1, 1, 1)])
+def test_the_most_of_the_neighbours(shape):
+    grid = torch.rand(shape, generator=torch.Generator().manual_seed(0))
+    assert (widest(grid) == F.max_pool3d(grid[None, None], 3, 1, 1)[0, 0]).all()
 
 
 def test_an_opaque_plane_looks_like_its_surface():

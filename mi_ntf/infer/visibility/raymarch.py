@@ -4,7 +4,7 @@ import drjit as dr
 
 from ...core import spheres
 from .. import ops
-from ..march import clear_distance, safe_inverse
+from ..bundle import clear_distance, safe_inverse
 
 MAX_OPTICAL_DEPTH = 12.0
 """Light rays end here, and count as blocked: a lamp that shines through at τ = 6e-6 would light what is outside an
