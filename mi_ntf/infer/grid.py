@@ -79,12 +79,13 @@ def _highest_gloss(grid: GridField, dense: np.ndarray, n: int) -> float:
 
 def _log_density(field: NetworkField, n: int, dj: ModuleType) -> np.ndarray:
     """ln σ at the centres of n³ voxels (z, y, x); ``MEAN_FLOOR`` where a survey found less all around."""
-    index = np.arange(n**3)
     values = np.full(n**3, MEAN_FLOOR, np.float32)
     if n > SURVEY:
         near = _chebyshev_distance(_log_density(field, SURVEY, dj) > MEAN_FLOOR, 2) <= 1
         at = (2 * np.arange(n) + 1) * SURVEY // (2 * n)
-        index = np.flatnonzero(near[np.ix_(at, at, at)])
+        index = np.flatnonzero(near.take(at, 2).take(at, 1).take(at, 0))
+    else:
+        index = np.arange(n**3)
     values[index] = _evaluate(lambda p: [field.log_density(p)], 1, index, n, dj)[:, 0]
     return values.reshape(n, n, n)
 
