@@ -20,9 +20,9 @@ from rich.table import Table
 
 VARIANTS = {
     "neural_transmittance": {"visibility": "neural_transmittance"},
-    "map, field, 128²": {"visibility": "transmittance_map"},
+    "map, field, 128²": {"visibility": "transmittance_map", "map_resolution": 128},
     "map, field, 256²": {"visibility": "transmittance_map", "map_resolution": 256},
-    "map, network, 128²": {"visibility": "transmittance_map", "map_source": "network"},
+    "map, network, 128²": {"visibility": "transmittance_map", "map_source": "network", "map_resolution": 128},
     "map, network, 256²": {"visibility": "transmittance_map", "map_source": "network", "map_resolution": 256},
 }
 

@@ -35,7 +35,7 @@ def integrator_class() -> type:
                                     as an area; these need no map and are marched under ``transmittance_map``
                                     (default: 0)
         environment_lights  integer most directional lights that stand for an environment (default: 512)
-        map_resolution      integer texels per side of a light's transmittance map (default: 128)
+        map_resolution      integer texels per side of a light's transmittance map (default: 192)
         map_source          string  ``field``: marched once per texel; ``network``: one query per texel (default: field)
         map_components      integer logistics per texel of a marched map, 1 or 2: two err less on maps of 256² or more
                                     and on what is not opaque, and take four times the memory (default: 1)
@@ -81,7 +81,7 @@ def integrator_class() -> type:
             self.samples = read.whole("samples", 384, 8, 8192)
             self.light_samples = read.whole("light_samples", 0, 0, 65536)
             self.environment_lights = read.whole("environment_lights", 512, 1, 65536)
-            self.map_resolution = read.whole("map_resolution", 128, 4, 4096)
+            self.map_resolution = read.whole("map_resolution", 192, 4, 4096)
             self.map_components = read.whole("map_components", 1, 1, 2)
             self.map_memory = read.number("map_memory", 1024.0, 0.0, 2.0**24)
             self.map_file = read.text("map_file", "")

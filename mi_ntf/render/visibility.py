@@ -31,7 +31,7 @@ class Options:
     on disk (:mod:`mi_ntf.render.map_cache`)."""
 
     step: float
-    map_resolution: int = 128
+    map_resolution: int = 192
     map_source: str = "field"
     map_components: int = 1
     map_memory: float = 1024.0

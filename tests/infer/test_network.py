@@ -44,7 +44,7 @@ def case(request, rng):
     return shipped(request.param)
 
 
-def close(ours, truth, tolerance=3e-5):
+def assert_close(ours, truth, tolerance=3e-5):
     """Within `tolerance` of the output's range: float32 through two layers of sums of some dozen products, and exp. An
     output that is the same everywhere is rounded all the same."""
     truth = np.asarray(truth)
@@ -58,9 +58,9 @@ def test_density(case, rng):
     truth = reference.density(header.architecture, tensors, x.astype(np.float32).astype(np.float64))
     field = NetworkField(header, tensors, mi)
     # Trained layers amplify the rounding of texture coordinates (1e-7 · 128 texels · slopes of some ten) to 1e-3 of 18.
-    close(field.log_density(arrays(x)), np.log(truth), 1e-4)
+    assert_close(field.log_density(arrays(x)), np.log(truth), 1e-4)
     truth[truth <= MIN_DENSITY] = 0
-    close(field.density(arrays(x)), truth, 1e-4)
+    assert_close(field.density(arrays(x)), truth, 1e-4)
 
 
 def test_reflectance(case, rng):
@@ -70,7 +70,7 @@ def test_reflectance(case, rng):
     normal, albedo, roughness, specular = NetworkField(header, tensors, mi).reflectance(arrays(x))
     for i, value in enumerate([*normal, *albedo, roughness, specular]):
         # Normalisation divides by the raw normal's length, which can be small.
-        close(value, truth[:, i], 2e-4 if i < 3 else 3e-5)
+        assert_close(value, truth[:, i], 2e-4 if i < 3 else 3e-5)
 
 
 @pytest.mark.parametrize("name", ["statue", "globe", "knot"])
@@ -89,7 +89,7 @@ def test_torch_and_drjit_agree_on_the_shipped_fields(name, rng):
             theirs = networks.perceptron(twin.tensors, part, features).numpy()
         network = getattr(ours, f"_{part}")
         for i, value in enumerate(network.layers(network.encode(arrays(x)))):
-            close(value, theirs[:, i], 1e-5)
+            assert_close(value, theirs[:, i], 1e-5)
 
 
 def test_ray_mixture(case, rng):
@@ -108,8 +108,8 @@ def test_ray_mixture(case, rng):
     assert (np.array(ours_hit) == hit).all()
     for ours_k, truth_k in zip(ours, truth, strict=True):
         for value, expected in zip(ours_k[:2], truth_k[:2], strict=True):
-            close(np.log(value), np.log(expected), 1e-4)
-        close(ours_k[2], truth_k[2], 1e-4)
+            assert_close(np.log(value), np.log(expected), 1e-4)
+        assert_close(ours_k[2], truth_k[2], 1e-4)
 
 
 def test_visibility(rng):
@@ -118,7 +118,7 @@ def test_visibility(rng):
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     x, d = (v.astype(np.float32).astype(np.float64) for v in (x, d))
     truth = reference.visibility(header.architecture, tensors, x, d)
-    close(NetworkField(header, tensors, mi).visibility(arrays(x), arrays(d)), truth)
+    assert_close(NetworkField(header, tensors, mi).visibility(arrays(x), arrays(d)), truth)
     assert np.ptp(truth) > 0.1
     with pytest.raises(MiNtfError, match="no visibility network; train it with `mi-ntf train --visibility-mlp`"):
         NetworkField(*fields.uniform(5.0), mi).visibility(arrays(x), arrays(d))
@@ -142,7 +142,7 @@ def test_gradient_of_density_reaches_positions(rng):
             np.log(reference.density(header.architecture, tensors, x + e))
             - np.log(reference.density(header.architecture, tensors, x - e))
         ) / (2 * step)
-        close(dr.grad(p[axis]), difference, 1e-3)  # ReLU kinks inside ±1e-6 and float32 texel positions
+        assert_close(dr.grad(p[axis]), difference, 1e-3)  # ReLU kinks inside ±1e-6 and float32 texel positions
 
 
 def test_density_is_zero_outside_the_sphere():

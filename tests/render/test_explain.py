@@ -45,7 +45,7 @@ def test_auto_chooses_by_the_number_of_shading_points():
     assert few["visibility"] == "raymarch" and "shading points, maps pay from" in few["effects"]["visibility"]["why"]
     assert many["visibility"] == "transmittance_map" and many["effects"]["transmittance maps"]["on"]
     assert many["lights"]["count"] <= 512
-    assert many["memory_bytes"]["maps or volumes"] == 8 * 128**2 * many["lights"]["count"]
+    assert many["memory_bytes"]["maps or volumes"] == 8 * 192**2 * many["lights"]["count"]
     assert many["seconds"]["maps or volumes"] > 0
 
 
