@@ -82,6 +82,8 @@ class Train:
     """Do not compare pixels lit by the learned transmittance with the photographs."""
     no_bounces: bool = False
     """The photographs hold no light that the object throws on itself, as renderings with one bounce."""
+    no_fresnel: bool = False
+    """The photographed materials have no Fresnel effect: renderings of lobes of fixed weight."""
     visibility_mlp: bool = False
     """Also train NeRV's visibility network, of a point and a direction, on the same transmittance."""
     field: Path | None = None
@@ -99,7 +101,8 @@ class Train:
         report = train(self.dataset, self.output, preset=self.preset, minutes=self.minutes, steps=self.steps,
                        seed=self.seed, tensorboard=self.tensorboard, field=self.field, ntf=self.ntf,
                        augmentation=not self.no_augmentation, colour_loss=not self.no_colour_loss,
-                       visibility_mlp=self.visibility_mlp, bounces=not self.no_bounces)
+                       visibility_mlp=self.visibility_mlp, bounces=not self.no_bounces,
+                       fresnel=not self.no_fresnel)
         if report:  # under torchrun, only the first process has one
             _report(report, self.json, _print_training)
 

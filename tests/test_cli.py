@@ -50,15 +50,15 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list:
             (Path("data"), Path("f.safetensors")),
             {"preset": "fast", "minutes": 2.5, "steps": None, "seed": 0, "tensorboard": None, "field": None,
              "ntf": None, "augmentation": True, "colour_loss": True, "visibility_mlp": False,
-             "bounces": True},
+             "bounces": True, "fresnel": True},
         ),
         (
             "train data -o f --steps 9 --field g --ntf ray --no-augmentation --no-colour-loss --no-bounces "
-            "--visibility-mlp",
+            "--no-fresnel --visibility-mlp",
             (Path("data"), Path("f")),
             {"preset": "fast", "minutes": None, "steps": 9, "seed": 0, "tensorboard": None, "field": Path("g"),
              "ntf": "ray", "augmentation": False, "colour_loss": False, "visibility_mlp": True,
-             "bounces": False},
+             "bounces": False, "fresnel": False},
         ),
         ("swap s.xml f.safetensors -o out.xml", (Path("s.xml"), Path("f.safetensors"), Path("out.xml")), {}),
         ("compare a.exr b.exr", (Path("a.exr"), Path("b.exr")), {}),

@@ -18,6 +18,7 @@ from itertools import pairwise
 
 from .depth_profile import FEATURES
 from .errors import MiNtfError, shown
+from .fresnel import DIELECTRIC
 
 FORMAT = 2
 MAX_LOG_DENSITY = 6.5
@@ -73,6 +74,13 @@ class Architecture:
     reflectance: Network
     transmittance: Network
     visibility: Network | None = None
+    fresnel: bool = False
+    """The specular weight is the normal reflectance, and grows towards grazing angles (:mod:`mi_ntf.core.fresnel`)."""
+
+    @property
+    def least_specular(self) -> float:
+        """The lowest specular weight that the reflectance network can give."""
+        return DIELECTRIC if self.fresnel else 0.0
 
     def networks(self) -> dict[str, Network]:
         """Name → network of those that the field has."""
@@ -124,6 +132,7 @@ def header_from_json(data: object, source: str) -> Header:
         nets = {name: _network(_member(described, name, dict), name) for name in NAMES}
         if described.get("visibility") is not None:  # absent from files of earlier builds
             nets["visibility"] = _network(_member(described, "visibility", dict), "visibility")
+        fresnel = _member({"fresnel": False} | described, "fresnel", bool)  # likewise
         similarity = _member(data, "similarity", dict)
         center = _member(similarity, "center", list)
         if len(center) != 3:
@@ -131,7 +140,7 @@ def header_from_json(data: object, source: str) -> Header:
         x, y, z = (_number(c, "the similarity's center") for c in center)
         radius = _number(_member(similarity, "radius", object), "the similarity's radius", above=0)
         provenance = _member({"provenance": {}} | data, "provenance", dict)
-        return Header(Architecture(**nets), Similarity((x, y, z), radius), provenance)
+        return Header(Architecture(**nets, fresnel=fresnel), Similarity((x, y, z), radius), provenance)
     except ValueError as error:
         raise MiNtfError(f"{source}: the header's description is incomplete or wrong: {error}; "
                          "was it written by `mi-ntf train`?") from None
@@ -174,7 +183,7 @@ def _number(value: object, what: str, above: float = -math.inf) -> float:
     return float(value)
 
 
-_JSON = {dict: "an object", list: "a list", str: "text"}
+_JSON = {dict: "an object", list: "a list", str: "text", bool: "true or false"}
 
 
 FAST = Architecture(

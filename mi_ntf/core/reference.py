@@ -58,11 +58,13 @@ def density(arch: Architecture, tensors: dict, x: np.ndarray) -> np.ndarray:
 
 
 def reflectance(arch: Architecture, tensors: dict, x: np.ndarray) -> np.ndarray:
-    """(n, 8): unit normal, albedo in [0, 1], roughness in [MIN_ROUGHNESS, 1], specular weight in [0, 1]."""
+    """(n, 8): unit normal, albedo in [0, 1], roughness in [MIN_ROUGHNESS, 1], specular weight in
+    [``arch.least_specular``, 1]."""
     raw = perceptron(tensors, "reflectance", encode(arch.reflectance.encoding, tensors, "reflectance", x))
     normal = np.stack(ops.normalize(ops, tuple(raw[:, :3].T)), axis=1)
     rest = logistic.sigmoid(ops, raw[:, 3:])
-    rest[:, 3] = MIN_ROUGHNESS + (1 - MIN_ROUGHNESS) * rest[:, 3]
+    for column, least in ((3, MIN_ROUGHNESS), (4, arch.least_specular)):
+        rest[:, column] = least + (1 - least) * rest[:, column]
     return np.concatenate([normal, rest], axis=1)
 
 

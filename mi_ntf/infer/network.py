@@ -44,6 +44,7 @@ class NetworkField:
         baseline = arch.visibility
         self._visibility = None if baseline is None else _Network(baseline.encoding, "visibility", tensors, dj)
         self.has_visibility = baseline is not None
+        self._least_specular = arch.least_specular
         self.quick = arch.reflectance.encoding.kind == "planes"
         """Whether reflectance costs no more than some fetches."""
 
@@ -61,7 +62,8 @@ class NetworkField:
         raw = self._reflectance.layers(self._reflectance.encode(p))
         normal = normalize(ops, tuple(raw[:3]))
         r, g, b, rough, spec = (logistic.sigmoid(ops, v) for v in raw[3:])
-        return normal, (r, g, b), MIN_ROUGHNESS + (1 - MIN_ROUGHNESS) * rough, spec
+        least = self._least_specular
+        return normal, (r, g, b), MIN_ROUGHNESS + (1 - MIN_ROUGHNESS) * rough, least + (1 - least) * spec
 
     def visibility(self, p, d):
         """τ from `p` along the unit directions `d` towards the light, by the baseline's network: a query a point."""

@@ -9,14 +9,16 @@ import drjit as dr
 from ..core import microfacet
 from ..core.ops import cross, dot, normalize
 from . import ops
+from .shade import weights
 
 
 def evaluate(wi, wo, reflectance):
     """``(value, pdf)`` of light from `wi` scattered to `wo`: the phase function (3-tuple, 1/sr)
     and the density of :func:`sample`, both 0 for a viewer below the horizon."""
-    normal, albedo, roughness, specular, softness = reflectance
+    normal, albedo, roughness, _, softness, _ = reflectance
     diffuse, gloss = microfacet.scattering(ops, wi, wo, normal, roughness, softness)
-    value = tuple((1 - specular) * k * diffuse + specular * gloss for k in albedo)
+    of_diffuse, of_gloss = weights(wi, wo, reflectance)
+    value = tuple(of_diffuse * k * diffuse + of_gloss * gloss for k in albedo)
     half = normalize(ops, tuple(a + b for a, b in zip(wi, wo, strict=True)))
     cos_h = dr.maximum(dot(normal, half), 0)
     across = cross(normal, half)
@@ -32,7 +34,7 @@ def evaluate(wi, wo, reflectance):
 def sample(wo, reflectance, u1, u2):
     """A direction to the light. `u1`: scalar, `u2`: pair, uniform in [0, 1). Returns the unit 3-tuple `wi`; its density
     is :func:`evaluate`'s."""
-    normal, _, roughness, _, _ = reflectance
+    normal, roughness = reflectance.normal, reflectance.roughness
     share, above = _gloss_share(wo, reflectance)
     gloss = u1 < share
     uniform = (u1 - share) * (1 + 2 * above) > 1 - share
@@ -51,7 +53,7 @@ def sample(wo, reflectance, u1, u2):
 def _gloss_share(wo, reflectance):
     """Probability of the specular lobe, its share of the albedo within [0.1, 0.9] (0 seen from behind), and
     ⟨n,ω_o⟩⁺."""
-    normal, albedo, _, specular, _ = reflectance
+    normal, albedo, specular = reflectance.normal, reflectance.albedo, reflectance.specular
     above = dr.maximum(dot(normal, wo), 0)
     diffuse = (1 - specular) * (albedo[0] + albedo[1] + albedo[2]) / 3
     share = dr.clip(specular / dr.maximum(specular + diffuse, 1e-6), 0.1, 0.9)

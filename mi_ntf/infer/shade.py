@@ -1,8 +1,10 @@
 """Reflected light at shading points: points × lights in one kernel."""
 
+from typing import Any, NamedTuple
+
 import drjit as dr
 
-from ..core import microfacet
+from ..core import fresnel, microfacet
 from ..core.ops import dot
 from . import ops
 
@@ -82,20 +84,42 @@ def _lobes(wi, points, skin: bool, specular: bool):
     diffuse, gloss = (
         microfacet.scattering(ops, *direction, points.softness) if skin else microfacet.lobes(ops, *direction)
     )
-    return diffuse > 0, (1 - points.specular) * diffuse, points.specular * gloss
+    of_diffuse, of_gloss = weights(wi, points.wo, points.reflectance)
+    return diffuse > 0, of_diffuse * diffuse, of_gloss * gloss
+
+
+class Reflectance(NamedTuple):
+    """What field points reflect: ranges as in :mod:`mi_ntf.core.microfacet`, softness as in :mod:`mi_ntf.core.skin`.
+    `fresnel`: whether the specular weight is that at normal incidence alone."""
+
+    normal: tuple
+    albedo: tuple
+    roughness: Any
+    specular: Any
+    softness: Any
+    fresnel: bool = False
+
+    def diffuse_albedo(self) -> list:
+        """Albedos, linear RGB, of a diffuse surface that reflects as much of light from everywhere."""
+        rest = self.roughness, self.specular
+        if self.fresnel:
+            return [fresnel.diffuse_albedo(ops, k, *rest) for k in self.albedo]
+        return [microfacet.diffuse_albedo(k, *rest) for k in self.albedo]
+
+
+def weights(wi, wo, reflectance: Reflectance) -> tuple:
+    """What the diffuse and the specular lobe count, light from `wi` scattered to `wo`."""
+    if reflectance.fresnel:
+        return fresnel.weights(ops, wi, wo, reflectance.normal, reflectance.roughness, reflectance.specular)
+    return 1 - reflectance.specular, reflectance.specular
 
 
 class Points:
     """Shading points: position, direction to the viewer, reflectance. 3-tuples and scalars, all of one width."""
 
-    def __init__(self, x, wo, reflectance):
-        self.x, self.wo = x, wo
-        self.normal, self.albedo, self.roughness, self.specular, self.softness = reflectance
-
-    @property
-    def reflectance(self) -> tuple:
-        """``(normal, albedo, roughness, specular, softness)``."""
-        return self.normal, self.albedo, self.roughness, self.specular, self.softness
+    def __init__(self, x, wo, reflectance: Reflectance):
+        self.x, self.wo, self.reflectance = x, wo, reflectance
+        self.normal, self.albedo, self.roughness, self.specular, self.softness, _ = reflectance
 
     def evaluate(self) -> None:
         """Compute them now: what follows loops over lights."""

@@ -97,9 +97,8 @@ class Bounced:
         """Radiance that `points` of `part` send on of it."""
         index = next(i for i, m in enumerate(self._patches.media) if m is part.medium)
         light = self._irradiance[index](points.x, points.normal)
-        _, albedo, roughness, specular, _ = points.reflectance
-        return [microfacet.diffuse_albedo(k, roughness, specular) * e * microfacet.INV_PI
-                for k, e in zip(albedo, light, strict=True)]
+        albedo = points.reflectance.diffuse_albedo()
+        return [k * e * microfacet.INV_PI for k, e in zip(albedo, light, strict=True)]
 
 
 def _direct(composition, part, skin: "Skin") -> np.ndarray:
@@ -109,7 +108,7 @@ def _direct(composition, part, skin: "Skin") -> np.ndarray:
         return np.zeros((0, 3))
     one, zero = dr.ones(mi.Float, n), dr.zeros(mi.Float, n)
     x, normal = radiosity.above(skin.position, skin.normal), tuple(_vector(skin.normal))
-    white = shade.Points(tuple(_vector(x)), normal, (normal, (one, one, one), one, zero, zero))
+    white = shade.Points(tuple(_vector(x)), normal, shade.Reflectance(normal, (one, one, one), one, zero, zero))
     light = composition.reflect(part, white, dr.opaque(mi.UInt32, SEED), surface=True, draws=DRAWS)
     return _rows(light) * np.pi
 
@@ -135,10 +134,10 @@ class Skin:
         """Normals and diffuse albedos (n, 3) at field points."""
         if not len(x):
             return np.zeros((0, 3)), np.zeros((0, 3))
-        normal, albedo, roughness, specular, _ = self._reflectance(tuple(_vector(x)))
-        albedo = [microfacet.diffuse_albedo(k, roughness, specular) for k in albedo]
-        dr.eval(normal, albedo)
-        return _rows(normal), _rows(albedo)
+        found = self._reflectance(tuple(_vector(x)))
+        albedo = found.diffuse_albedo()
+        dr.eval(found.normal, albedo)
+        return _rows(found.normal), _rows(albedo)
 
 
 def _chords(medium, rng) -> tuple[np.ndarray, np.ndarray]:

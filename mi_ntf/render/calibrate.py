@@ -99,7 +99,7 @@ def _points(medium) -> shade.Points:
     lane = dr.arange(mi.UInt32, WIDTH) % dr.opaque(mi.UInt32, max(dr.width(found.t), 1))
     ray, t = dr.gather(mi.UInt32, found.ray, lane), dr.gather(mi.Float, found.t, lane)
     x, along = found.place(0, ray, t)
-    points = shade.Points(x, tuple(-c for c in along), (*grid.reflectance(x), medium.field.softness(x)))
+    points = shade.Points(x, tuple(-c for c in along), medium.reflectance(x))
     points.evaluate()
     return points
 

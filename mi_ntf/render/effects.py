@@ -30,6 +30,7 @@ class Effects:
     in_view     of each medium, whether the camera may see matter of it
     surfaces    there are shapes other than the media's bounds
     specular    a field has a specular lobe
+    fresnel     one whose weight grows towards grazing angles
     bounces     how light that scatters more than once is found, ``paths`` or ``radiosity``; "": it is not looked for
     gradients   a scene parameter is attached
     """
@@ -44,6 +45,7 @@ class Effects:
     in_view: tuple[bool, ...]
     surfaces: bool
     specular: bool
+    fresnel: bool
     bounces: str
     gradients: bool
 
@@ -150,6 +152,7 @@ def describe(scene, integrator, sensor, spp: int, media: list, light) -> Effects
     method, reason = _method(integrator, width * height * spp, exhaustive, media)
     if collocated:
         reason += "; not needed where the camera's own transmittance is the light's"
+    rims = [m.field.header.architecture.fresnel for m in media]
     return Effects(
         emitters=tuple(light.kinds),
         lit=lit,
@@ -160,7 +163,8 @@ def describe(scene, integrator, sensor, spp: int, media: list, light) -> Effects
         collocated=collocated,
         in_view=_in_view(sensor, media),
         surfaces=surfaces,
-        specular=any(m.field.grid.gloss > MIN_GLOSS for m in media),
+        specular=any(rims) or any(m.field.grid.gloss > MIN_GLOSS for m in media),
+        fresnel=any(rims),
         bounces=_bounces(integrator.bounces, media, method, surfaces, gradients) if lit and not 0 <= depth <= 2 else "",
         gradients=gradients,
     )

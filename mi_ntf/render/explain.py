@@ -118,6 +118,8 @@ def _effects(scene, found, integrator, count: int) -> dict:
         "shading": (found.lit, "the scene has lights" if found.lit else unlit),
         "specular lobe": (
             found.specular, "a field has one" if found.specular else "no field has one above the threshold"),
+        "Fresnel effect": (
+            found.fresnel, "a field was trained with it" if found.fresnel else "no field was trained with it"),
         "fields in view": (any(found.in_view), f"{sum(found.in_view)} of {len(found.in_view)}"),
         "ordinary surfaces": (
             found.surfaces, f"{others} shapes beside the fields' bounds" if others else "there are none"),

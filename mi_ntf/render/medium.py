@@ -7,18 +7,19 @@ import mitsuba as mi
 
 from ..core.architecture import MAX_LOG_DENSITY
 from ..core.errors import MiNtfError
+from ..infer.shade import Reflectance
 from . import field, properties
 from .frame import SCALES, Frame
 
 REPRESENTATIONS = ("grid", "network")
 
 
-def _reflectance(source, softness):
-    """``(normal, albedo, roughness, specular, softness)`` of field points, as a function. The phase function keeps it,
-    and must not keep the medium, which keeps the phase function: nothing would ever let go of the two."""
+def _reflectance(source, softness, fresnel: bool):
+    """The :class:`mi_ntf.infer.shade.Reflectance` of field points, as a function. The phase function keeps it, and must
+    not keep the medium, which keeps the phase function: nothing would ever let go of the two."""
 
     def reflectance(x):
-        return *source.reflectance(x), softness(x)
+        return Reflectance(*source.reflectance(x), softness(x), fresnel)
 
     return reflectance
 
@@ -66,7 +67,8 @@ def medium_class(phase_class: type) -> type:
             read.flag("sample_emitters", True)
             self.field = field.load(path, resolution)
             self.source = self.field.grid if self.representation == "grid" else self.field.network
-            self.reflectance = _reflectance(self.source, self.field.softness)
+            architecture = self.field.header.architecture
+            self.reflectance = _reflectance(self.source, self.field.softness, architecture.fresnel)
             self.frame = Frame(self.field.header.similarity, to_world, scale)
             self.path = path
             phase = phase_class(mi.Properties("nrf"))

@@ -8,12 +8,13 @@ the bounced light, and every round leaves that share of the rest.
 import numpy as np
 import torch
 
-from ..core import microfacet, radiosity
+from ..core import radiosity
 from .baked import fetch
 from .evaluate import CUT
 from .marched import Marched
 from .networks import Networks
 from .rays import Rays, sphere_span
+from .render import diffuse_albedo
 
 SEEN = 1 << 16
 """Camera rays that look for the skin; rays from what they find look into its folds."""
@@ -62,8 +63,7 @@ class Bounced:
         hits[ray] = table[radiosity.place(*there)]
         # All photographs at once, three columns each.
         views, count = len(self.place), len(x)
-        _, albedo, roughness, specular = networks.reflectance(_tensor(x))
-        albedo = microfacet.diffuse_albedo(albedo, roughness[:, None], specular[:, None]).numpy()
+        albedo = diffuse_albedo(networks.reflectance(_tensor(x)), networks.fresnel).numpy()
         direct = self._direct(marched, x, normal).transpose(1, 0, 2).reshape(count, -1)
         light = radiosity.solve(hits.reshape(count, -1), np.tile(albedo, (1, views)), direct, -1)
         light = np.pad(light, [(0, 1), (0, 0)]).reshape(count + 1, views, 3).transpose(1, 0, 2)

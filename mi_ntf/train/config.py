@@ -36,9 +36,12 @@ class TrainConfig:
     """Weight of an even density along surfaces."""
     sharp: float = 1e-3
     """Weight of thin skins: −ln σ where pictures see matter."""
-    gloss: float = 2e-3
-    """Weight of the specular share: a rough lobe can stand in for the diffuse one in flash photographs, and then sends
-    half as much again into all other directions."""
+    gloss: float = 5e-4
+    """Weight of the specular share, at the start: a rough lobe can stand in for the diffuse one in flash photographs,
+    and then sends half as much again into all other directions."""
+    lobes_from: float = 0.25
+    """Until here roughness and specular weight stay where they start: before normals have formed, highlights that are
+    where none are seen drive both to an end of their range, where sigmoids have no slope to come back by."""
     smooth: float = 1e-3
     """Weight of total variation of the planes."""
     ntf_from: float = 0.8
@@ -104,17 +107,18 @@ logistic from the ray's end points alone, of a size that CPUs can train."""
 
 
 def configured(preset: str, *, ntf: str | None = None, augmentation: bool = True, colour_loss: bool = True,
-               visibility_mlp: bool = False, bounces: bool = True) -> TrainConfig | HierarchicalConfig:
+               visibility_mlp: bool = False, bounces: bool = True,
+               fresnel: bool = True) -> TrainConfig | HierarchicalConfig:
     """The recipe `preset` with another transmittance network, without parts of its training, for photographs without
-    further `bounces`, or with the baseline's network (NeRV's, of a point and a direction) trained on the same
-    transmittance beside it."""
+    further `bounces` or of materials without a `fresnel` effect, or with the baseline's network (NeRV's, of a point and
+    a direction) trained on the same transmittance beside it."""
     if preset not in PRESETS:
         raise MiNtfError(f"preset '{preset}' is unknown; it is one of {', '.join(PRESETS)}")
     if ntf is not None and ntf not in NTF:
         raise MiNtfError(f"--ntf '{ntf}' is unknown; it is one of {', '.join(NTF)}")
     config = replace(PRESETS[preset], augmentation=augmentation, colour_loss=colour_loss)
     if isinstance(config, TrainConfig):
-        config = replace(config, bounces=bounces)
+        config = replace(config, bounces=bounces, architecture=replace(config.architecture, fresnel=fresnel))
     architecture = config.architecture
     if ntf is not None:
         architecture = replace(architecture, transmittance=NTF[ntf])
@@ -127,5 +131,5 @@ def transmittance_alone(config: TrainConfig | HierarchicalConfig, architecture: 
     """The recipe `config` for a finished field of `architecture`: the whole run trains transmittance networks."""
     if not isinstance(config, TrainConfig):
         raise MiNtfError("--field goes with the preset 'fast' alone: the paper's learns field and transmittance as one")
-    kept = {name: getattr(architecture, name) for name in ("density", "reflectance")}
+    kept = {name: getattr(architecture, name) for name in ("density", "reflectance", "fresnel")}
     return replace(config, architecture=replace(config.architecture, **kept), ntf_from=0.0, ntf_alone=0.0)

@@ -45,11 +45,12 @@ FAINT = -5.0
 """ln of the specular weight below which it is held: further down its sigmoid has no slope, and there is no way back."""
 
 
-def gloss(image: Image, count: int) -> torch.Tensor:
-    """The specular weight, the dearer the rougher: (1 + ROUGH α²) s per ray, α = roughness². What α = 1 adds under a
-    flash, a diffuse lobe of a quarter of its weight adds as well, and only that is right under other lights. Weights
-    that vanish cost as well: (FAINT − ln s)²/10."""
+def gloss(image: Image, least: float, count: int) -> torch.Tensor:
+    """The specular weight s above the `least` that it can be, the dearer the rougher: (1 + ROUGH α²) s per ray, α =
+    roughness². What α = 1 adds under a flash, a diffuse lobe of a quarter of its weight adds as well, and only that is
+    right under other lights. Weights that vanish cost as well: (FAINT − ln s)²/10."""
     roughness, specular = image.gloss
+    specular = (specular - least) / (1 - least)
     lost = torch.relu(FAINT - specular.clamp(min=1e-30).log()).square()
     return (image.weight.detach() * (specular * (1 + ROUGH * roughness**4) + 0.1 * lost)).sum() / count
 

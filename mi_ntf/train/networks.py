@@ -29,6 +29,11 @@ class Networks:
     architecture: Architecture
     tensors: dict[str, torch.Tensor]
 
+    @property
+    def fresnel(self) -> bool:
+        """Whether the specular weight is the normal reflectance (:mod:`mi_ntf.core.fresnel`)."""
+        return self.architecture.fresnel
+
     def log_density(self, x: torch.Tensor) -> torch.Tensor:
         """ln σ (n,) of the points `x` (n, 3), before it is clipped to the format's range."""
         features = encode(self.architecture.density.encoding, self.tensors, "density", x)
@@ -44,7 +49,9 @@ class Networks:
         raw = perceptron(self.tensors, "reflectance", features)
         rest = torch.sigmoid(raw[:, 3:])
         roughness = MIN_ROUGHNESS + (1 - MIN_ROUGHNESS) * rest[:, 3]
-        return F.normalize(raw[:, :3], dim=1, eps=1e-10), rest[:, :3], roughness, rest[:, 4]
+        least = self.architecture.least_specular
+        specular = least + (1 - least) * rest[:, 4]
+        return F.normalize(raw[:, :3], dim=1, eps=1e-10), rest[:, :3], roughness, specular
 
     def ray_mixture(self, o: torch.Tensor, d: torch.Tensor, profile: torch.Tensor):
         """``(hit (n,), mixture (n, K, 3))`` of rays through `o` along unit directions `d` towards the light.

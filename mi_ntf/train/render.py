@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import torch
 
-from ..core import microfacet
+from ..core import fresnel, microfacet
 from . import ops
 from .networks import Networks, density_from_log
 from .rays import Rays
@@ -92,26 +92,30 @@ def scatter_sum(value: torch.Tensor, ray: torch.Tensor, count: int) -> torch.Ten
     return value.new_zeros(count, *value.shape[1:]).index_add(0, ray, value)
 
 
-def shade(reflectance: tuple, d: torch.Tensor, t: torch.Tensor, light: torch.Tensor) -> torch.Tensor:
-    """What points of this `reflectance` scatter back along −d per unit of light weight v: radiance (n, 3)."""
+def shade(reflectance: tuple, d: torch.Tensor, t: torch.Tensor, light: torch.Tensor, rim: bool) -> torch.Tensor:
+    """What points of this `reflectance` scatter back along −d per unit of light weight v: radiance (n, 3). `rim`:
+    whether the field has a Fresnel term."""
     normal, albedo, roughness, specular = reflectance
     cos = -(normal * d).sum(1)
     diffuse, glossy = microfacet.lobes_collocated(ops, cos, roughness)
-    lobe = (1 - specular)[:, None] * albedo * diffuse[:, None] + (specular * glossy)[:, None]
+    of_diffuse = fresnel.weights_collocated(ops, cos, roughness, specular)[0] if rim else 1 - specular
+    lobe = (of_diffuse * diffuse)[:, None] * albedo + (specular * glossy)[:, None]
     return SURFACE * lobe * light / (t * t)[:, None]
 
 
-def send_on(reflectance: tuple, irradiance: torch.Tensor) -> torch.Tensor:
-    """Radiance (n, 3) that points of this `reflectance` make of `irradiance` (n, 3), as diffuse surfaces."""
+def diffuse_albedo(reflectance: tuple, rim: bool) -> torch.Tensor:
+    """Albedo (n, 3) of diffuse surfaces that reflect as much of light from everywhere. `rim`: as for :func:`shade`."""
     _, albedo, roughness, specular = reflectance
-    return microfacet.diffuse_albedo(albedo, roughness[:, None], specular[:, None]) * irradiance * microfacet.INV_PI
+    rest = roughness[:, None], specular[:, None]
+    return fresnel.diffuse_albedo(ops, albedo, *rest) if rim else microfacet.diffuse_albedo(albedo, *rest)
 
 
 def render(networks: Networks, rays: Rays, samples, step: float | torch.Tensor, bounced=None,
-           generator: torch.Generator | None = None) -> Image:
+           generator: torch.Generator | None = None, lobes: bool = True) -> Image:
     """Colour and alpha of `rays` from packed ``(ray, t)`` samples in cells of `step`, one length or each its own.
 
     `bounced` (:class:`mi_ntf.train.bounced.Bounced`, drawn from by `generator`): further bounces of the flashes' light.
+    `lobes`: whether roughness and specular weight have derivatives.
     """
     ray, t = samples
     x = torch.addcmul(rays.o[ray], rays.d[ray], t[:, None])
@@ -121,10 +125,13 @@ def render(networks: Networks, rays: Rays, samples, step: float | torch.Tensor, 
     near = (w.detach() > MIN_WEIGHT).nonzero()[:, 0]
     ray, t, x = ray[near], t[near], x[near]
     reflectance = networks.reflectance(x)
-    radiance = shade(reflectance, rays.d[ray], t, rays.light[ray])
+    if not lobes:
+        reflectance = *reflectance[:2], *(v.detach() for v in reflectance[2:])
+    radiance = shade(reflectance, rays.d[ray], t, rays.light[ray], networks.fresnel)
     color, indirect = scatter_sum(v[near, None] * radiance, ray, len(rays)), 0.0
     if bounced is not None and bounced.known:
-        sent = send_on(reflectance, bounced(rays.view[ray], x, reflectance[0], generator))
+        irradiance = bounced(rays.view[ray], x, reflectance[0], generator)
+        sent = diffuse_albedo(reflectance, networks.fresnel) * irradiance * microfacet.INV_PI
         indirect = scatter_sum(w[near, None] * sent, ray, len(rays))
         color = color + indirect
     return Image(color, alpha, x, ray, near, w[near], reflectance[0], reflectance[2:], radiance, raw, indirect)

@@ -126,10 +126,15 @@ class Stepper(Descent):
         self.trained[1] += len(samples[0])
         return batch, samples
 
+    def fading(self) -> float:
+        """1 at the start, ``config.lr_end`` when the field is finished: of learning rates, and of the cost of lobes. It
+        says what is glossy at all; how much so, photographs alone should say."""
+        return self.config.lr_end ** (self.progress() / self.config.ntf_alone)
+
     def field_loss(self, batch: rays.Rays, samples):
         """``(terms, image)``: name → weighted term of the photographs; see :mod:`mi_ntf.train.losses`."""
         c, g = self.config, self.generator
-        image = render.render(self.nets, batch, samples, c.step, self.bounced, g)
+        image = render.render(self.nets, batch, samples, c.step, self.bounced, g, self.progress() >= c.lobes_from)
         terms = {"colour": losses.color(image.color, batch.target[:, :3], self.exposure),
                  "alpha": c.alpha * (image.alpha - batch.target[:, 3]).square().mean()}
         toward, away = losses.normals(image, batch.d, self.baked)
@@ -138,7 +143,7 @@ class Stepper(Descent):
         terms["even"] = c.even * losses.evenness(self.nets, image, 2048, g)
         matter = image.raw[image.index].clamp(max=MAX_LOG_DENSITY)
         terms["sharp"] = -c.sharp * self.opaque * (image.weight.detach() * matter).sum() / len(batch)
-        terms["gloss"] = c.gloss * losses.gloss(image, len(batch))
+        terms["gloss"] = c.gloss * self.fading() * losses.gloss(image, c.architecture.least_specular, len(batch))
         x = self.occupancy.must_be_empty(1536, g)
         if len(x):
             terms["empty"] = c.empty * losses.emptiness(self.nets, x)
@@ -178,7 +183,7 @@ class Stepper(Descent):
             self.terms, image = self.field_loss(batch, samples)
             # Of all terms these two are positive and of a known size.
             self.watch.check("field", float((self.terms["colour"] + self.terms["alpha"]).detach()), self.step)
-            rate = c.lr_end ** (done / c.ntf_alone) * min(1.0, (self.step + 1) / 50)
+            rate = self.fading() * min(1.0, (self.step + 1) / 50)
             value += self._descend("field", total(self.terms), rate)
         if done >= c.ntf_from:
             terms = self.ntf_loss(image, batch)

@@ -74,8 +74,8 @@ def test_describe_counts_parameters(saved):
     json.dumps(info)
 
 
-def test_fields_with_a_visibility_network_and_old_ones_without(tmp_path):
-    both = dataclasses.replace(SMALL, visibility=Network(Encoding("frequency", octaves=1), (3,)))
+def test_fields_with_a_visibility_network_and_fresnel_effect_and_old_ones_without(tmp_path):
+    both = dataclasses.replace(SMALL, visibility=Network(Encoding("frequency", octaves=1), (3,)), fresnel=True)
     assert set(both.skeleton()) - set(SMALL.skeleton()) == {
         f"visibility.layers.{i}.{part}" for i in (0, 1) for part in ("weight", "bias")}
     assert both.skeleton()["visibility.layers.0.weight"] == (3, 18)  # 6 + 1 octave · (sin, cos) · 6
@@ -84,7 +84,7 @@ def test_fields_with_a_visibility_network_and_old_ones_without(tmp_path):
     header, found = field_file.load(tmp_path / "f")
     assert header.architecture == both and set(found) == set(tensors)
     old = Header(SMALL).to_json()
-    del old["architecture"]["visibility"]
+    del old["architecture"]["visibility"], old["architecture"]["fresnel"]
     assert header_from_json(json.loads(json.dumps(old)), "old").architecture == SMALL
 
 
@@ -184,6 +184,7 @@ def test_foreign_and_absent_files(tmp_path):
     (lambda d: d.update(format=1), "field format 1, this build reads 2; train or export the field anew"),
     (lambda d: d.pop("architecture"), "incomplete .*architecture"),
     (lambda d: d["architecture"].pop("transmittance"), "incomplete .*transmittance"),
+    (lambda d: d["architecture"].update(fresnel=1), "fresnel is 1, expected true or false"),
     (lambda d: d["architecture"]["density"]["encoding"].update(kind="hash"),
      "'hash' of density, expected one of planes, frequency"),
     (lambda d: d["architecture"]["transmittance"]["encoding"].update(kind="planes"),

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from helpers.frameworks import BACKENDS, oracle
 
-from mi_ntf.core import logistic, microfacet, ops, spheres
+from mi_ntf.core import fresnel, logistic, microfacet, ops, spheres
 
 COUNT = 4000
 STEP = 1e-6
@@ -101,6 +101,13 @@ FORMULAS = [
             (_direction, _direction, _direction, _uniform(0.15, 1)), 2e-5, 2e-4),
     Formula("lobes, collocated", lambda o, c, r: microfacet.lobes_collocated(o, c, r),
             (_uniform(-1, 0.999), _uniform(0.15, 1)), 2e-5, 2e-4),
+    # ⟨ω_o,h⟩ is a root, of slope 1/(2 cos), at 1e-12 under it: 2e-4 of directions are within 1e-3 of opposite.
+    Formula("fresnel", lambda o, *c: fresnel.weights(o, c[:3], c[3:6], c[6:9], c[9], c[10]),
+            (_direction, _direction, _direction, _uniform(0.15, 1), _uniform(0.02, 0.98)), 3e-6, 1e-4),
+    Formula("fresnel, collocated", lambda o, *c: fresnel.weights_collocated(o, *c),
+            (_uniform(-1, 0.999), _uniform(0.15, 1), _uniform(0.02, 0.98)), 3e-6, 1e-5),
+    Formula("diffuse_albedo, fresnel", lambda o, *c: [fresnel.diffuse_albedo(o, *c)],
+            (_uniform(0, 1), _uniform(0.15, 1), _uniform(0.02, 0.98)), 5e-7, 5e-6),
     Formula("diffuse_albedo", lambda o, *c: [microfacet.diffuse_albedo(*c)],
             (_uniform(0, 1), _uniform(0.15, 1), _uniform(0, 1)), 5e-7, 5e-7),
     Formula("normalize", lambda o, *c: ops.normalize(o, c), (_point,), 5e-7, 1e-5, 1.0),

@@ -178,7 +178,7 @@ def _points(seed: int, medium, n: int = 2048) -> shade.Points:
     """Shading points anywhere in the sphere, seen from anywhere."""
     rng = np.random.default_rng([seed, 3])
     x = arrays(rf.unit(rng, n) * rng.uniform(0, 1, (n, 1)) ** (1 / 3))
-    return shade.Points(x, arrays(rf.unit(rng, n)), (*medium.source.reflectance(x), 0.1 * x[0] ** 2))
+    return shade.Points(x, arrays(rf.unit(rng, n)), shade.Reflectance(*medium.source.reflectance(x), 0.1 * x[0] ** 2))
 
 
 def _reflect(points, table, method) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Fields with known values, written by hand into the networks: no training, exact up to bilinear interpolation."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -40,12 +40,13 @@ def _logit(p):
 
 def blobs(
     centers, radii, *, log_density=5.0, edge=8.0, albedo=(0.6, 0.5, 0.4), roughness=0.5, specular=0.2, similarity=None,
-    components=2, visibility=False
+    components=2, visibility=False, fresnel=False
 ) -> tuple[Header, dict]:
     """Opaque balls: ln σ rises from −12 to `log_density` over about radius/`edge`.. around each radius. Normals point
     away from the origin. At most 8 balls; a ball is the level set of a Gaussian, which the three planes' product holds
-    exactly. `visibility`: with the baseline's network, too, whose τ is anything between 0 and 1 and smooth."""
-    arch = architecture(components, visibility)
+    exactly. `visibility`: with the baseline's network, too, whose τ is anything between 0 and 1 and smooth. `fresnel`:
+    `specular` is the normal reflectance."""
+    arch = replace(architecture(components, visibility), fresnel=fresnel)
     t = {k: np.zeros(s) for k, s in arch.skeleton().items()}
     u, v = _axes()
     for i, (c, r) in enumerate(zip(centers, radii, strict=True)):
@@ -64,7 +65,8 @@ def blobs(
         t["density.layers.0.weight"][8 + i] = t["density.layers.0.weight"][i]
         t["density.layers.0.bias"][8 + i] = t["density.layers.0.bias"][i] - span
         t["density.layers.1.weight"][0, 8 + i] = -1
-    _outward_reflectance(t, albedo, roughness, specular)
+    least = arch.least_specular
+    _outward_reflectance(t, albedo, roughness, (specular - least) / (1 - least))
     for name, scale in (("transmittance", 0.5), ("visibility", 0.3)):
         rng = np.random.default_rng(0)
         for k in t:

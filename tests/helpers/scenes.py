@@ -17,6 +17,7 @@ SIMILARITY = Similarity((0.4, -0.2, 0.3), 1.5)
 
 def write_blobs(folder: Path, **options) -> Path:
     """The asymmetric object as a field file."""
+    folder.mkdir(exist_ok=True)
     path = folder / "blobs.safetensors"
     header, tensors = fields.blobs(CENTERS, RADII, similarity=SIMILARITY, **options)
     field_file.save(path, header, tensors, np.float32)

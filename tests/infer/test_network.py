@@ -24,7 +24,7 @@ def random_field(rng, encoding=None):
     encoding = encoding or Encoding("planes", (16, 32), 4)
     rays = Encoding("frequency", octaves=3)
     arch = Architecture(*(Network(encoding, (16, 24)) for _ in range(2)), Network(rays, (16, 24), components=2),
-                        Network(rays, (24, 16)))
+                        Network(rays, (24, 16)), fresnel=True)
     return Header(arch), {k: rng.normal(size=s) * 0.4 for k, s in arch.skeleton().items()}
 
 

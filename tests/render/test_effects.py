@@ -7,7 +7,7 @@ import pytest
 from helpers import fields, scenes
 from helpers.scenes import nrf
 
-from mi_ntf.core import field_file, microfacet
+from mi_ntf.core import field_file, fresnel, microfacet
 from mi_ntf.infer import march, shade
 from mi_ntf.infer.visibility import raymarch
 from mi_ntf.render import composition, effects, visibility, walk
@@ -99,6 +99,21 @@ def test_diffuse_field_has_no_specular_lobe(tmp_path, monkeypatch):
     without = scenes.render(scene)
     np.testing.assert_allclose(without, with_lobe, rtol=0.01, atol=2e-3)
     assert operations(scene) < count
+
+
+def test_fresnel_effect_is_that_of_fields_trained_with_it(tmp_path, monkeypatch):
+    """However rough; other fields never ask for it."""
+    paths = (scenes.write_blobs(tmp_path / str(rim), log_density=3.0, specular=0.041 if rim else 1e-3, roughness=0.99,
+                                fresnel=rim) for rim in (False, True))
+    faint, scene = (scenes.scene(p, nrf(), {"light": scenes.light("point")}, size=24, spp=16) for p in paths)
+    assert not described(faint).specular and not described(faint).fresnel
+    assert described(scene).specular and described(scene).fresnel
+    with monkeypatch.context() as before:
+        forbid(before, fresnel, "weights")
+        scenes.render(faint)
+        with pytest.raises(Exception, match="weights was called") as caught:
+            scene.integrator().render(scene)
+        assert "weights was called" in str(caught.value)
 
 
 def test_gloss_is_the_highest_lobe_in_matter(tmp_path):

@@ -84,7 +84,7 @@ def points(n: int, copies: int, rng) -> shade.Points:
     roughness, specular = rng.uniform(0.3, 0.9, n), rng.uniform(0, 0.4, n)
     albedo = rng.uniform(0.2, 0.8, (3, n))
     x, wo, normal, albedo = (tuple(tile(c) for c in v) for v in (x, wo, normal, albedo))
-    return shade.Points(x, wo, (normal, albedo, tile(roughness), tile(specular), tile(0 * specular)))
+    return shade.Points(x, wo, shade.Reflectance(normal, albedo, tile(roughness), tile(specular), tile(0 * specular)))
 
 
 def drawn(emitters: list, at, count: int) -> emitter_samples.EmitterSamples:

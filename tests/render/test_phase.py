@@ -10,15 +10,15 @@ import pytest
 from helpers import scenes
 
 import mi_ntf.render
-from mi_ntf.core import microfacet, ops
+from mi_ntf.core import fresnel, microfacet, ops
 from mi_ntf.render import field
 
 
-@pytest.fixture(params=[(0.3, 0.4), (0.8, 0.1)], ids=["glossy", "rough"])
+@pytest.fixture(params=[(0.3, 0.4, False), (0.8, 0.1, False), (0.4, 0.06, True)], ids=["glossy", "rough", "fresnel"])
 def medium(request, variant, tmp_path):
     mi_ntf.render.register()
-    roughness, specular = request.param
-    path = scenes.write_blobs(tmp_path, roughness=roughness, specular=specular, albedo=(0.7, 0.5, 0.3))
+    roughness, specular, rim = request.param
+    path = scenes.write_blobs(tmp_path, roughness=roughness, specular=specular, albedo=(0.7, 0.5, 0.3), fresnel=rim)
     scene = scenes.scene(path, {"type": "nrf"}, {"light": scenes.light("directional")})
     (shape,) = scene.shapes()
     return shape.interior_medium()
@@ -77,11 +77,12 @@ def test_value_is_the_formula_and_weight_is_value_over_density(medium, rng):
     roughness, specular = (float(v[0]) for v in medium.source.reflectance(tuple(mi.Float(c) for c in NORMAL_POINT))[2:])
     softness = float(medium.field.softness(tuple(mi.Float(c) for c in NORMAL_POINT))[0])
     d = np.array(wo, np.float64)
-    diffuse, gloss = microfacet.scattering(
-        ops, tuple(d), tuple(np.full(count, c) for c in viewer), (0.0, 0.0, 1.0), roughness, softness
-    )
+    directions = tuple(d), tuple(np.full(count, c) for c in viewer), (0.0, 0.0, 1.0), roughness
+    diffuse, gloss = microfacet.scattering(ops, *directions, softness)
+    rim = medium.field.header.architecture.fresnel
+    weights = fresnel.weights(ops, *directions, specular) if rim else (1 - specular, specular)
     for channel, albedo in enumerate((0.7, 0.5, 0.3)):
-        truth = (1 - specular) * albedo * diffuse + specular * gloss
+        truth = weights[0] * albedo * diffuse + weights[1] * gloss
         # Baked normals are off by 1e-3 between voxels.
         np.testing.assert_allclose(np.array(value)[channel], truth, rtol=0.03, atol=2e-3)
 

@@ -10,7 +10,7 @@ torch = pytest.importorskip("torch", reason="training needs PyTorch: pip install
 
 import torch.nn.functional as F  # noqa: E402
 
-from mi_ntf.core import microfacet  # noqa: E402
+from mi_ntf.core import fresnel, microfacet  # noqa: E402
 from mi_ntf.core import ops as numpy_ops  # noqa: E402
 from mi_ntf.core.architecture import Encoding, Network  # noqa: E402
 from mi_ntf.train import evaluate, held_out, losses, networks, render  # noqa: E402
@@ -37,6 +37,8 @@ def rays(n=4):
 
 class Slab:
     """Uniform density, Lambert reflectance, normals towards the camera."""
+
+    fresnel = False
 
     def log_density(self, x):
         return torch.full((len(x),), float(np.log(SIGMA)))
@@ -237,13 +239,18 @@ def test_psnr_of_a_known_error():
     assert evaluate.psnr(a, b, 2)["srgb"] == pytest.approx(24.10, abs=0.01)
 
 
-def test_surface_factor_is_the_phase_function_seen_from_the_light():
-    """SURFACE · lobes_collocated is what the renderers' phase function gives for ω_i = ω_o."""
-    cos, roughness = np.linspace(0.05, 1, 20), np.linspace(0.2, 1, 20)
-    w = (np.sqrt(1 - cos**2), 0 * cos, cos)
-    expected = microfacet.scattering(numpy_ops, w, w, (0 * cos, 0 * cos, 1 + 0 * cos), roughness)
-    actual = microfacet.lobes_collocated(numpy_ops, cos, roughness)
-    np.testing.assert_allclose(render.SURFACE * np.array(actual), expected, rtol=1e-12)  # float64 rounding
+@pytest.mark.parametrize("rim", [False, True])
+def test_training_shades_by_the_phase_function_seen_from_the_light(rim):
+    """What photographs are compared with is what the renderers' phase function gives for ω_i = ω_o."""
+    cos, roughness, specular = np.linspace(0.05, 1, 20), np.linspace(0.2, 1, 20), np.linspace(0, 0.9, 20)
+    w, n = (np.sqrt(1 - cos**2), 0 * cos, cos), (0 * cos, 0 * cos, 1 + 0 * cos)
+    diffuse, gloss = microfacet.scattering(numpy_ops, w, w, n, roughness)
+    weights = fresnel.weights(numpy_ops, w, w, n, roughness, specular) if rim else (1 - specular, specular)
+    rows = [torch.as_tensor(np.stack(v, 1)) for v in (n, [0.6 + 0 * cos] * 3, w)]
+    reflectance = *rows[:2], *map(torch.as_tensor, (roughness, specular))
+    actual = render.shade(reflectance, -rows[2], torch.full((20,), 2.0), torch.full((20, 3), 4.0), rim)
+    expected = weights[0] * 0.6 * diffuse + weights[1] * gloss
+    np.testing.assert_allclose(actual[:, 1], expected, rtol=1e-9)  # float64 rounding of sines
 
 
 def test_held_out_score_of_a_network_that_knows_no_shadow():
@@ -275,4 +282,4 @@ def test_rough_lobes_cost_more():
                          weight=torch.tensor([0.5, 0.25, 0.25]),
                          normal=None, gloss=gloss, radiance=None, raw=None, bounced=0.0)
     wanted = 0.5 * 0.2 * 31 + 0.25 * 0.4 * (1 + 30 / 16) + 0.25 * (math.exp(-7) * 31 + 0.4)
-    assert float(losses.gloss(image, 4)) == pytest.approx(wanted / 4)
+    assert float(losses.gloss(image, 0.0, 4)) == pytest.approx(wanted / 4)
