@@ -212,6 +212,24 @@ def test_transmittance_loss_leaves_the_field_alone(kind):
             assert value.grad is None, name
 
 
+@pytest.mark.parametrize("rim", [False, True])
+def test_lobes_wait_for_normals(rim):
+    """Held, roughness and specular weight (rows 6 and 7) have no derivatives; the rest of the reflectance has its own,
+    and the picture is the same."""
+    arch = dataclasses.replace(PRESETS["fast"].architecture, fresnel=rim)
+    samples = torch.arange(4).repeat_interleave(5), torch.linspace(2.8, 3.2, 5).repeat(4)
+    grads, pictures = [], []
+    for lobes in (True, False):
+        nets = networks.initial(arch, 1.0, torch.Generator().manual_seed(0))
+        nets.tensors["reflectance.layers.1.bias"].data[:3] = -rays().d[0]  # seen from the front
+        image = render.render(nets, rays(), samples, 0.1, lobes=lobes)
+        image.color.square().sum().backward()
+        grads.append(nets.tensors["reflectance.layers.1.weight"].grad.abs().sum(1))
+        pictures.append(image.color.detach())
+    assert (grads[0] > 0).all() and (grads[1][:6] > 0).all() and (grads[1][6:] == 0).all()
+    assert torch.equal(*pictures)
+
+
 def test_evenness_sees_slopes_along_the_surface_alone():
     """ln σ = 8z does not change along surfaces of normal −z; for normals x it differs by 16·offset·cos, ⟨cos²⟩ = ½."""
     class Ramp:
