@@ -36,8 +36,8 @@ class TrainConfig:
     """Weight of an even density along surfaces."""
     sharp: float = 1e-3
     """Weight of thin skins: −ln σ where pictures see matter."""
-    gloss: float = 5e-4
-    """Weight of the specular share, at the start: a rough lobe can stand in for the diffuse one in flash photographs,
+    gloss: float = 2e-3
+    """Weight of the specular share: a rough lobe can stand in for the diffuse one in flash photographs,
     and then sends half as much again into all other directions."""
     lobes_from: float = 0.25
     """Until here roughness and specular weight stay where they start: before normals have formed, highlights that are

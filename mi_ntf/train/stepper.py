@@ -127,8 +127,8 @@ class Stepper(Descent):
         return batch, samples
 
     def fading(self) -> float:
-        """1 at the start, ``config.lr_end`` when the field is finished: of learning rates, and of the cost of lobes. It
-        says what is glossy at all; how much so, photographs alone should say."""
+        """1 at the start, ``config.lr_end`` when the field is finished: of learning rates, and of the cost of sharp
+        lobes. It says what is glossy at all; how much so, photographs alone should say."""
         return self.config.lr_end ** (self.progress() / self.config.ntf_alone)
 
     def field_loss(self, batch: rays.Rays, samples):
@@ -143,7 +143,7 @@ class Stepper(Descent):
         terms["even"] = c.even * losses.evenness(self.nets, image, 2048, g)
         matter = image.raw[image.index].clamp(max=MAX_LOG_DENSITY)
         terms["sharp"] = -c.sharp * self.opaque * (image.weight.detach() * matter).sum() / len(batch)
-        terms["gloss"] = c.gloss * self.fading() * losses.gloss(image, c.architecture.least_specular, len(batch))
+        terms["gloss"] = c.gloss * losses.gloss(image, c.architecture.least_specular, self.fading(), len(batch))
         x = self.occupancy.must_be_empty(1536, g)
         if len(x):
             terms["empty"] = c.empty * losses.emptiness(self.nets, x)
