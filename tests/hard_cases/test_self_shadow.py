@@ -87,7 +87,7 @@ LEARNED = {
     ("knot", "neural_transmittance"): 0.0098,
     ("knot", "visibility_mlp"): 0.0445,
 }
-"""On learned fields what is measured is stated: these are 1.5 times it. Maps of 128² texels blur what is finer."""
+"""On learned fields what is measured is stated: these are 1.5 times it. Maps of 192² texels blur what is finer."""
 
 
 @cache

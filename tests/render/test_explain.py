@@ -61,16 +61,16 @@ def test_auto_follows_the_measured_machine():
 def test_maps_of_mixtures_take_four_times_the_memory(tmp_path):
     scene = with_integrator(tmp_path, '<string name="map_source" value="network"/>')
     report = explain(scene, {"visibility": "transmittance_map"})
-    assert report["memory_bytes"]["maps or volumes"] == 4 * 8 * 128**2
+    assert report["memory_bytes"]["maps or volumes"] == 4 * 8 * 192**2
 
 
 def test_memory_of_maps_is_bounded(tmp_path):
-    """512 lights of 128 KiB each in runs of 4 MiB."""
+    """512 lights of 288 KiB each, 14 of which fit into 4 MiB."""
     scene = with_integrator(tmp_path, '<float name="map_memory" value="4"/>')
     light = f'<include filename="{SCENE.parent}/light_point.xml"/>'
     scene.write_text(scene.read_text().replace(light, '<emitter type="constant"/>'))
     report = explain(scene, {"visibility": "transmittance_map"})
-    assert report["lights"]["count"] == 512 and report["memory_bytes"]["maps or volumes"] == 4 << 20
+    assert report["lights"]["count"] == 512 and report["memory_bytes"]["maps or volumes"] == 14 * 8 * 192**2
 
 
 def test_environments_state_their_error(tmp_path, capsys):
