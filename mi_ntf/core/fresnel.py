@@ -23,9 +23,11 @@ DIELECTRIC = 0.04
 """Normal reflectance of a dielectric of index 1.5; of most, 0.02 to 0.05."""
 
 
-def weights(ops, wi, wo, n, roughness, specular):
+def weights(ops, wi, wo, n, roughness, specular, rim: bool):
     """What the lobes of :mod:`mi_ntf.core.microfacet` count, ``(diffuse, specular)``: ρ = diffuse weight · k · diffuse
-    lobe + specular weight · specular lobe. Directions as there."""
+    lobe + specular weight · specular lobe. Directions as there. `rim`: whether there is a Fresnel term."""
+    if not rim:
+        return 1 - specular, specular
     # ⟨ω_o,h⟩² = (1 + ⟨ω_i,ω_o⟩)/2; of opposite directions rounding makes less than 0.
     cos_h = ops.sqrt(ops.maximum(0.5 + 0.5 * dot(wi, wo), 1e-12))
     away = ops.maximum(1 - cos_h, 0.0)
@@ -36,17 +38,22 @@ def weights(ops, wi, wo, n, roughness, specular):
     return (1 - specular) * left, specular + (1 - specular) * square * square * away
 
 
-def weights_collocated(ops, cos, roughness, specular):
+def weights_collocated(ops, cos, roughness, specular, rim: bool):
     """:func:`weights` for light and viewer in one direction at cosine `cos` to the normal."""
+    if not rim:
+        return 1 - specular, specular
     grazing, mean = _rim(ops, roughness)
     once = 1 - grazing(ops.maximum(cos, 0.0))
     return (1 - specular) * once * once / (1 - mean), specular
 
 
-def diffuse_albedo(ops, albedo, roughness, specular):
-    """As :func:`mi_ntf.core.microfacet.diffuse_albedo`, with the rim's light."""
+def diffuse_albedo(ops, albedo, roughness, specular, rim: bool):
+    """As :func:`mi_ntf.core.microfacet.diffuse_albedo`, with the rim's light where there is a `rim`."""
+    fixed = without_rim(albedo, roughness, specular)
+    if not rim:
+        return fixed
     _, mean = _rim(ops, roughness)
-    return without_rim(albedo, roughness, specular) + (1 - specular) * mean * (1 - albedo)
+    return fixed + (1 - specular) * mean * (1 - albedo)
 
 
 def _rim(ops, roughness):

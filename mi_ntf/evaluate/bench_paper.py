@@ -136,8 +136,8 @@ def camera_cost(sensor, medium, paper: PaperField, sizes: Sizes):
     def view():
         found = march.camera_samples([strand], far, middle, middle)
         x, along = found.place(0, found.ray, found.t)
-        found = shade.Reflectance(*paper.reflectance(x), medium.field.softness(x))
-        p = shade.Points(x, tuple(-c for c in along), found)
+        matter = shade.Reflectance(*paper.reflectance(x), medium.field.softness(x))
+        p = shade.Points(x, tuple(-c for c in along), matter)
         last[:] = [p]
         return [*p.x, *p.wo, *p.normal, *p.albedo, p.roughness, p.specular]
 

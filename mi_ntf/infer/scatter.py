@@ -6,18 +6,17 @@ diffuse lobe of a flat skin, ∝ ⟨n,ω_i⟩ + c, exactly, and the GGX half vec
 
 import drjit as dr
 
-from ..core import microfacet
+from ..core import fresnel, microfacet
 from ..core.ops import cross, dot, normalize
 from . import ops
-from .shade import weights
 
 
 def evaluate(wi, wo, reflectance):
     """``(value, pdf)`` of light from `wi` scattered to `wo`: the phase function (3-tuple, 1/sr)
     and the density of :func:`sample`, both 0 for a viewer below the horizon."""
-    normal, albedo, roughness, _, softness, _ = reflectance
+    normal, albedo, roughness, specular, softness, rim = reflectance
     diffuse, gloss = microfacet.scattering(ops, wi, wo, normal, roughness, softness)
-    of_diffuse, of_gloss = weights(wi, wo, reflectance)
+    of_diffuse, of_gloss = fresnel.weights(ops, wi, wo, normal, roughness, specular, rim)
     value = tuple(of_diffuse * k * diffuse + of_gloss * gloss for k in albedo)
     half = normalize(ops, tuple(a + b for a, b in zip(wi, wo, strict=True)))
     cos_h = dr.maximum(dot(normal, half), 0)

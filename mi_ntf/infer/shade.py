@@ -84,7 +84,7 @@ def _lobes(wi, points, skin: bool, specular: bool):
     diffuse, gloss = (
         microfacet.scattering(ops, *direction, points.softness) if skin else microfacet.lobes(ops, *direction)
     )
-    of_diffuse, of_gloss = weights(wi, points.wo, points.reflectance)
+    of_diffuse, of_gloss = fresnel.weights(ops, *direction, points.specular, points.reflectance.fresnel)
     return diffuse > 0, of_diffuse * diffuse, of_gloss * gloss
 
 
@@ -101,17 +101,7 @@ class Reflectance(NamedTuple):
 
     def diffuse_albedo(self) -> list:
         """Albedos, linear RGB, of a diffuse surface that reflects as much of light from everywhere."""
-        rest = self.roughness, self.specular
-        if self.fresnel:
-            return [fresnel.diffuse_albedo(ops, k, *rest) for k in self.albedo]
-        return [microfacet.diffuse_albedo(k, *rest) for k in self.albedo]
-
-
-def weights(wi, wo, reflectance: Reflectance) -> tuple:
-    """What the diffuse and the specular lobe count, light from `wi` scattered to `wo`."""
-    if reflectance.fresnel:
-        return fresnel.weights(ops, wi, wo, reflectance.normal, reflectance.roughness, reflectance.specular)
-    return 1 - reflectance.specular, reflectance.specular
+        return [fresnel.diffuse_albedo(ops, k, self.roughness, self.specular, self.fresnel) for k in self.albedo]
 
 
 class Points:

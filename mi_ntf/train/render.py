@@ -98,16 +98,15 @@ def shade(reflectance: tuple, d: torch.Tensor, t: torch.Tensor, light: torch.Ten
     normal, albedo, roughness, specular = reflectance
     cos = -(normal * d).sum(1)
     diffuse, glossy = microfacet.lobes_collocated(ops, cos, roughness)
-    of_diffuse = fresnel.weights_collocated(ops, cos, roughness, specular)[0] if rim else 1 - specular
-    lobe = (of_diffuse * diffuse)[:, None] * albedo + (specular * glossy)[:, None]
+    of_diffuse, of_gloss = fresnel.weights_collocated(ops, cos, roughness, specular, rim)
+    lobe = (of_diffuse * diffuse)[:, None] * albedo + (of_gloss * glossy)[:, None]
     return SURFACE * lobe * light / (t * t)[:, None]
 
 
 def diffuse_albedo(reflectance: tuple, rim: bool) -> torch.Tensor:
     """Albedo (n, 3) of diffuse surfaces that reflect as much of light from everywhere. `rim`: as for :func:`shade`."""
     _, albedo, roughness, specular = reflectance
-    rest = roughness[:, None], specular[:, None]
-    return fresnel.diffuse_albedo(ops, albedo, *rest) if rim else microfacet.diffuse_albedo(albedo, *rest)
+    return fresnel.diffuse_albedo(ops, albedo, roughness[:, None], specular[:, None], rim)
 
 
 def render(networks: Networks, rays: Rays, samples, step: float | torch.Tensor, bounced=None,

@@ -164,7 +164,7 @@ class _Loop(Descent):
         color, _, normal = evaluate.render_all(self.nets, part, self.occupied(), self.config.step, generator,
                                                self.bounced)
         exact = evaluate.psnr(color, part.target[:, :3], count)["srgb"]
-        entry = {"step": self.step, "psnr": round(exact, 2)}
+        entry = {"step": self.step, "psnr": round(exact, 4)}
         self.history.append(entry)
         pictures = (x[:shape[0] * shape[1], :3].view(*shape, 3) for x in (part.target, color, normal))
         self.log.validated(entry, *pictures)

@@ -25,7 +25,7 @@ above = st.builds(_direction, st.floats(0.02, 1), st.floats(0, 6.3))
 def _rho(wi, wo, k, s, roughness):
     """ρ ⟨n,ω_i⟩."""
     diffuse, gloss = microfacet.lobes(ops, wi, wo, N, roughness)
-    of_diffuse, of_gloss = fresnel.weights(ops, wi, wo, N, roughness, s)
+    of_diffuse, of_gloss = fresnel.weights(ops, wi, wo, N, roughness, s, True)
     return of_diffuse * k * diffuse + of_gloss * gloss
 
 
@@ -66,7 +66,7 @@ def test_a_white_surface_never_sends_out_more_than_comes_in(roughness, s):
     wi = _direction(cos_i[:, None], phi[None, :])
     for cos in (0.1, 0.2, 0.4, 0.7, 1.0):
         wo = _direction(cos, 0.0)
-        of_diffuse, _ = fresnel.weights(ops, wi, wo, N, roughness, s)
+        of_diffuse, _ = fresnel.weights(ops, wi, wo, N, roughness, s, True)
         diffuse = np.pi * np.einsum("i,j,ij->", w / 2, w, of_diffuse * wi[2]) / np.pi
         whole, rim = _reflected(cos, roughness)
         assert diffuse + s * whole + (1 - s) * rim <= 1.012
@@ -81,8 +81,8 @@ def test_reciprocity(wi, wo, k, s, roughness):
 @given(above, st.floats(0, 1), st.floats(0.15, 1))
 def test_light_at_the_camera(w, s, roughness):
     """Photographs see the normal reflectance."""
-    general = fresnel.weights(ops, w, w, N, roughness, s)
-    assert fresnel.weights_collocated(ops, w[2], roughness, s) == pytest.approx(general, rel=1e-9, abs=1e-12)
+    general = fresnel.weights(ops, w, w, N, roughness, s, True)
+    assert fresnel.weights_collocated(ops, w[2], roughness, s, True) == pytest.approx(general, rel=1e-9, abs=1e-12)
     assert general[1] == pytest.approx(s, abs=1e-12)
 
 
@@ -95,7 +95,7 @@ def test_diffuse_albedo_reflects_as_much_of_light_from_everywhere(roughness, k, 
     _, mean = fresnel._rim(ops, roughness)
     expected = (1 - s) * (1 - mean) * k + s * gloss + (1 - s) * rim
     # 0.008 s: the fit of the specular lobe's loss; 0.01: that of the rim's mean.
-    assert fresnel.diffuse_albedo(ops, k, roughness, s) == pytest.approx(expected, abs=0.008 * s + 0.01)
+    assert fresnel.diffuse_albedo(ops, k, roughness, s, True) == pytest.approx(expected, abs=0.008 * s + 0.01)
 
 
 def test_schlick_is_close_to_a_dielectric():
@@ -107,4 +107,4 @@ def test_schlick_is_close_to_a_dielectric():
         inside = np.sqrt(1 - (1 - cos_h**2) / 1.5**2)
         s = ((cos_h - 1.5 * inside) / (cos_h + 1.5 * inside)) ** 2
         p = ((1.5 * cos_h - inside) / (1.5 * cos_h + inside)) ** 2
-        assert fresnel.weights(ops, wi, wo, N, 0.3, fresnel.DIELECTRIC)[1] == pytest.approx((s + p) / 2, abs=0.04)
+        assert fresnel.weights(ops, wi, wo, N, 0.3, fresnel.DIELECTRIC, True)[1] == pytest.approx((s + p) / 2, abs=0.04)

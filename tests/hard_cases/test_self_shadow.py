@@ -75,19 +75,20 @@ def test_skin_by_angle(kind, cosine, method, check):
 
 LEARNED = {
     ("statue", "raymarch"): BOUND,
-    ("statue", "transmittance_map"): 0.021,
-    ("statue", "transmittance_map, 2 logistics"): 0.0155,
-    ("statue", "transmittance_map, network"): 0.022,
-    ("statue", "neural_transmittance"): 0.0102,
+    ("statue", "transmittance_map"): 0.018,
+    ("statue", "transmittance_map, 2 logistics"): 0.0101,
+    ("statue", "transmittance_map, network"): 0.0165,
+    ("statue", "neural_transmittance"): 0.008,
     ("statue", "visibility_mlp"): 0.0435,
     ("knot", "raymarch"): BOUND,
-    ("knot", "transmittance_map"): 0.0285,
-    ("knot", "transmittance_map, 2 logistics"): 0.0092,
-    ("knot", "transmittance_map, network"): 0.0134,
-    ("knot", "neural_transmittance"): 0.0098,
+    ("knot", "transmittance_map"): 0.0165,
+    ("knot", "transmittance_map, 2 logistics"): 0.0084,
+    ("knot", "transmittance_map, network"): 0.0125,
+    ("knot", "neural_transmittance"): 0.0077,
     ("knot", "visibility_mlp"): 0.0445,
 }
-"""On learned fields what is measured is stated: these are 1.5 times it. Maps of 192² texels blur what is finer."""
+"""On learned fields what is measured is stated: these are at most 1.5 times it; `visibility_mlp` is right in the mean
+by chance alone, and keeps the bounds that it had. Maps of 192² texels blur what is finer."""
 
 
 @cache

@@ -80,7 +80,7 @@ def test_value_is_the_formula_and_weight_is_value_over_density(medium, rng):
     directions = tuple(d), tuple(np.full(count, c) for c in viewer), (0.0, 0.0, 1.0), roughness
     diffuse, gloss = microfacet.scattering(ops, *directions, softness)
     rim = medium.field.header.architecture.fresnel
-    weights = fresnel.weights(ops, *directions, specular) if rim else (1 - specular, specular)
+    weights = fresnel.weights(ops, *directions, specular, True) if rim else (1 - specular, specular)
     for channel, albedo in enumerate((0.7, 0.5, 0.3)):
         truth = weights[0] * albedo * diffuse + weights[1] * gloss
         # Baked normals are off by 1e-3 between voxels.

@@ -263,7 +263,7 @@ def test_training_shades_by_the_phase_function_seen_from_the_light(rim):
     cos, roughness, specular = np.linspace(0.05, 1, 20), np.linspace(0.2, 1, 20), np.linspace(0, 0.9, 20)
     w, n = (np.sqrt(1 - cos**2), 0 * cos, cos), (0 * cos, 0 * cos, 1 + 0 * cos)
     diffuse, gloss = microfacet.scattering(numpy_ops, w, w, n, roughness)
-    weights = fresnel.weights(numpy_ops, w, w, n, roughness, specular) if rim else (1 - specular, specular)
+    weights = fresnel.weights(numpy_ops, w, w, n, roughness, specular, True) if rim else (1 - specular, specular)
     rows = [torch.as_tensor(np.stack(v, 1)) for v in (n, [0.6 + 0 * cos] * 3, w)]
     reflectance = *rows[:2], *map(torch.as_tensor, (roughness, specular))
     actual = render.shade(reflectance, -rows[2], torch.full((20,), 2.0), torch.full((20, 3), 4.0), rim)
