@@ -6,6 +6,8 @@ on one lattice per ray, so that skipping changes no value.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import reduce
+from typing import Any, NamedTuple
 
 import drjit as dr
 
@@ -35,6 +37,12 @@ def clear_distance(grid, p, inverse_d):
         exits.append((face - c) * inv)
     exit_ = dr.minimum(dr.minimum(exits[0], exits[1]), exits[2])
     return dr.select(n > 0, dr.maximum(exit_, 0), 0)
+
+
+def density_where(active, density, p):
+    """The density at `p` where `active`, 0 elsewhere. Of rays that march side by side often none is in matter: they are
+    spared the fetches."""
+    return dr.if_stmt((*p,), active, lambda *p: density(p), lambda *p: type(p[0])(0), label="density")
 
 
 def safe_inverse(d):
@@ -120,8 +128,17 @@ class Bundle:
         """The cell at `t`, cut off where the ray begins and ends (a surface may be there)."""
         begin = dr.maximum(t, 0)
         part = (dr.minimum(t + step, self.end) - begin) * (1 / PARTS)
-        skips, sigmas = zip(*(self.at(begin + (k + 0.5) * part, active) for k in range(PARTS)), strict=True)
-        return Cell(begin, part, sigmas, skips[0])
+        skip = reduce(dr.minimum, self.clear(begin + 0.5 * part)[0])
+        count = len(self.strands)
+
+        def look(begin, part):
+            return tuple(sigma for k in range(PARTS) for sigma in self.densities(begin + (k + 0.5) * part))
+
+        def nothing(begin, part):
+            return tuple(type(begin)(0) for _ in range(PARTS * count))
+
+        sigmas = dr.if_stmt((begin, part), active & (skip <= (PARTS - 1) * part), look, nothing, label="cell")
+        return Cell(begin, part, tuple(sigmas[k : k + count] for k in range(0, PARTS * count, count)), skip)
 
     def point(self, i: int, t):
         """The point at `t` in the coordinates of field `i`."""
@@ -129,9 +146,9 @@ class Bundle:
         along = t if s.rate is None else t * s.rate
         return tuple(a + along * b for a, b in zip(s.o, s.d, strict=True))
 
-    def at(self, t, active):
-        """``(skip, sigmas)``: how far the ray is clear of all matter from `t` on, 0 in an occupied cell; each field's
-        density there, per unit of t."""
+    def clear(self, t):
+        """``(skips, places)`` of each field: how far the ray is clear of its matter from `t` on, 0 in an occupied cell;
+        the point at `t` in its coordinates."""
         skips, places = [], []
         for i, (s, inverse, (begin, end)) in enumerate(zip(self.strands, self.inverse, self.intervals, strict=True)):
             p = self.point(i, t)
@@ -141,14 +158,14 @@ class Bundle:
                 skip = dr.select(inside, skip / s.rate, dr.select(t < begin, dr.minimum(begin - t, ahead), ahead))
             skips.append(skip)
             places.append(p)
-        sigmas = [
-            dr.select(active & (skip <= 0), s.density(p), 0) * (1 if s.rate is None else s.rate)
-            for s, skip, p in zip(self.strands, skips, places, strict=True)
+        return skips, places
+
+    def densities(self, t) -> list:
+        """The density of each field at `t`, per unit of t."""
+        return [
+            dr.select(skip <= 0, s.density(p), 0) * (1 if s.rate is None else s.rate)
+            for s, skip, p in zip(self.strands, *self.clear(t), strict=True)
         ]
-        skip = skips[0]
-        for other in skips[1:]:
-            skip = dr.minimum(skip, other)
-        return skip, sigmas
 
     def counts(self, shares, step):
         """Whether a sample of these weights is worth shading: that of some field, in its own unit."""
@@ -158,8 +175,7 @@ class Bundle:
         return hit
 
 
-@dataclass(frozen=True)
-class Cell:
+class Cell(NamedTuple):
     """A piece of a ray in PARTS parts, each of constant densities.
 
     begin, part  where it begins; the length of a part
@@ -167,10 +183,10 @@ class Cell:
     skip         how far the ray is clear of all matter from the middle of the first part on
     """
 
-    begin: object
-    part: object
+    begin: Any
+    part: Any
     sigmas: tuple
-    skip: object
+    skip: Any
 
     @property
     def totals(self) -> list:

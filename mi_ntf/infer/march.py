@@ -1,10 +1,11 @@
 """Marches through the fields along camera rays: the points that they shade, and free flight."""
 
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import drjit as dr
 
-from .bundle import PARTS, Bundle, onward
+from .bundle import PARTS, Bundle, Cell, onward
 
 MIN_TRANSMITTANCE = 1e-3
 """Camera rays end here; what lies behind could add 0.1 %."""
@@ -84,36 +85,52 @@ def camera_samples(strands, maxt, offset, depth, shade=True, view=False) -> Samp
 
     Samples that weigh at most MIN_WEIGHT_RATE times their cell's length in every field are left out.
     """
-    # First walk: count. Second: write. Costs little beside shading and needs no guess of the capacity.
+    # First walk: count. Second: write. Needs no guess of the capacity.
     bundle = Bundle(strands, maxt, offset)
     floats, uint = type(bundle.base), dr.uint32_array_t(type(bundle.base))
     rays = dr.arange(uint, dr.width(bundle.base))
 
-    def tally(hit, sample, state):
-        return (state[0] + dr.select(hit, uint(1), 0),)
+    def tally(hit, here, state):
+        count, t, transmittance = state
+        first = hit & (count == 0)
+        return (count + dr.select(hit, uint(1), 0), dr.select(first, here.t, t),
+                dr.select(first, here.transmittance, transmittance))  # fmt: skip
 
-    transmittance, (count,) = _walk(bundle, offset, depth, tally, (dr.zeros(uint, dr.width(rays)),))
+    begin = (dr.zeros(uint, dr.width(rays)), floats(bundle.begin), dr.ones(floats, dr.width(rays)))
+    transmittance, (count, *first) = _walk(bundle, tally, begin)
     total, start = 0, dr.zeros(uint, dr.width(rays))
     if shade:
         start = dr.prefix_sum(count)
         total = int(dr.sum(count)[0])
     out = dr.zeros(uint, total), *(dr.zeros(floats, total) for _ in range(1 + len(strands) + view))
     if total:
-        end = start + count
-
-        def write(hit, sample, state):
-            slot, *targets = state
-            # The two walks are two kernels, which a compiler may round differently: a sample that only this one finds
-            # has no slot.
-            hit = hit & (slot < end)
-            for target, value in zip(targets, (rays, *sample[: len(targets) - 1]), strict=True):
-                dr.scatter(target, value, slot, hit)
-            return slot + dr.select(hit, uint(1), 0), *targets
-
-        _, (_, *out) = _walk(bundle, offset, depth, write, (uint(start), *out))
+        out = _write(bundle, depth, (rays, start, start + count), (*first, count > 0), out)
         dr.eval(out, transmittance, start, count)
     weights = tuple(out[2 : 2 + len(strands)])
     return Samples(bundle, out[0], out[1], weights, out[-1] if view else None, transmittance, start, count)
+
+
+def _write(bundle, depth, rays, begin, out):
+    """The second walk, from where `begin` says that a ray's samples begin: fills `out`, the samples' rays, places and
+    weights and maybe view, one entry a slot. `rays`: each one's index, its first slot, and the one after its last."""
+    ray, first, end = rays
+
+    def put(slot, ray, depth, here, *out):
+        for target, value in zip(out, (ray, *here.sample(depth)), strict=False):  # the view only where wanted
+            dr.scatter(target, value, slot)
+        return slot + 1, *out
+
+    def skip(slot, ray, depth, here, *out):
+        return slot, *out
+
+    def write(hit, here, state):
+        slot, *out = state
+        # The two walks are two kernels, which a compiler may round differently: a sample that only this one finds has
+        # no slot.
+        return dr.if_stmt((slot, ray, depth, here, *out), hit & (slot < end), put, skip, label="write")
+
+    _, (_, *out) = _walk(bundle, write, (type(first)(first), *out), begin, lambda state: state[0] < end)
+    return out
 
 
 def camera_light(strands, maxt, offset, depth, reflect):
@@ -124,25 +141,44 @@ def camera_light(strands, maxt, offset, depth, reflect):
     """
     bundle = Bundle(strands, maxt, offset)
 
-    def shade(t, shares, view, *light):
+    def shade(depth, here, *light):
+        t, *shares, view = here.sample(depth)
         for i, share in enumerate(shares):
             light = [c + share * v for c, v in zip(light, reflect(i, bundle.point(i, t), view), strict=True)]
         return tuple(light)
 
-    def add(hit, sample, state):
-        t, *shares, view = sample
+    def add(hit, here, state):
         # Few cells hold samples that count: the branch skips what the others would cost.
-        return dr.if_stmt((t, shares, view, *state), hit, shade, lambda t, shares, view, *light: light, label="shade")
+        return dr.if_stmt((depth, here, *state), hit, shade, lambda depth, here, *light: light, label="shade")
 
     zero = dr.zeros(type(bundle.base), dr.width(bundle.base))
-    transmittance, light = _walk(bundle, offset, depth, add, (zero, type(zero)(zero), type(zero)(zero)))
+    transmittance, light = _walk(bundle, add, (zero, type(zero)(zero), type(zero)(zero)))
     return light, transmittance
 
 
-def _walk(bundle, offset, depth, emit, state):
-    """One walk along the camera rays of `bundle`; ``emit(hit, sample, state)`` gives the next state and is called for
-    each cell, `hit` where it holds a sample that counts: t, the weight in each field, and the view's transmittance.
-    Returns ``(transmittance, state)``."""
+class _Here(NamedTuple):
+    """A cell on a walk: its lattice's `t`, the view's `transmittance` to it, the share `alpha` of it that the cell
+    takes, its weights (`shares`), one a field."""
+
+    t: Any
+    transmittance: Any
+    alpha: Any
+    shares: tuple
+    cell: Cell
+
+    def sample(self, depth) -> tuple:
+        """``(t, *shares, view)`` of the sample at the quantile `depth` of what the cell takes."""
+        lost = depth * self.alpha
+        return self.cell.place(-dr.log(1 - lost)), *self.shares, self.transmittance * (1 - lost)
+
+
+def _walk(bundle, emit, state, start=None, wanted=None):
+    """One walk along the camera rays of `bundle`; ``emit(hit, here, state)`` gives the next state and is called for
+    each cell, a :class:`_Here`, `hit` where it holds a sample that counts. Returns ``(transmittance, state)``.
+
+    start   ``(t, transmittance, active)`` to walk on from; None: the rays' beginnings
+    wanted  callable: the state → whether to walk on; None: as long as there is light
+    """
     floats = type(bundle.base)
 
     def body(t, transmittance, state, active):
@@ -150,17 +186,16 @@ def _walk(bundle, offset, depth, emit, state):
         cell = bundle.cell(t, step, active)
         alpha = 1 - dr.exp(-cell.depth)
         w = transmittance * alpha
-        lost = depth * alpha
         shares = (w,) if bundle.single else tuple(transmittance * share for share in cell.shares())
-        sample = cell.place(-dr.log(1 - lost)), *shares, transmittance * (1 - lost)
-        state = emit(active & bundle.counts(shares, step), sample, state)
+        state = emit(active & bundle.counts(shares, step), _Here(t, transmittance, alpha, shares, cell), state)
         transmittance = dr.select(active, transmittance - w, transmittance)
         t = t + onward(cell.skip, step, PARTS)
         active = active & (t < bundle.end) & (transmittance > MIN_TRANSMITTANCE)
-        return t, transmittance, state, active
+        return t, transmittance, state, active & wanted(state) if wanted else active
 
+    start = start or (floats(bundle.begin), dr.ones(floats, dr.width(bundle.base)), bundle.active)
     _, transmittance, state, _ = dr.while_loop(
-        state=(floats(bundle.begin), dr.ones(floats, dr.width(bundle.base)), state, bundle.active),
+        state=(*start[:2], state, start[2]),
         cond=lambda t, transmittance, state, active: active,
         body=body,
         label="camera march",

@@ -38,22 +38,29 @@ class DepthProfile:
         floats = type(o[0])
         step = self.step
 
-        def body(s, depth, before, places, last, active):
-            p = tuple(mi + (h - s - 0.5 * step) * di for mi, di in zip(m, d, strict=True))
-            skip = clear_distance(self.grid, p, inverse)
-            empty = skip > 0
-            sigma = dr.select(active & ~empty, self.density(p), 0)
+        def cross(s, depth, before, last, p, *places):
+            sigma = self.density(p)
             after = depth + sigma * step
             rate = dr.rcp(dr.maximum(sigma * step, 1e-6))
-            shares = [(q - depth) * rate for q in levels]  # of the step, for constant σ
             bend = dr.clip(0.5 * (sigma - before) * step * rate, -1, 1)
+            shares = [(q - depth) * rate for q in levels]  # of the step, for constant σ
             places = tuple(
                 dr.select((g > 0) & (g <= 1), s + step * (g + bend * g * (1 - g)), c)
                 for c, g in zip(places, shares, strict=True)
             )
-            last = dr.select(sigma > 0, s + step, last)
+            return after, sigma, dr.select(sigma > 0, s + step, last), *places
+
+        def pass_by(s, depth, before, last, p, *places):
+            return depth, type(before)(0), last, *places
+
+        def body(s, depth, before, places, last, active):
+            p = tuple(mi + (h - s - 0.5 * step) * di for mi, di in zip(m, d, strict=True))
+            skip = clear_distance(self.grid, p, inverse)
+            depth, before, last, *places = dr.if_stmt(
+                (s, depth, before, last, p, *places), active & (skip <= 0), cross, pass_by, label="cross"
+            )
             s = s + onward(skip, step)
-            return s, after, sigma, places, last, active & (s < 2 * h) & (after < levels[-1])
+            return s, depth, before, tuple(places), last, active & (s < 2 * h) & (depth < levels[-1])
 
         zero = dr.zeros(floats, dr.width(h))
         start = zero if begin is None else dr.maximum(h - begin, 0)

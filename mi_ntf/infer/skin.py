@@ -7,7 +7,7 @@ import numpy as np
 
 from ..core import skin
 from . import ops
-from .bundle import clear_distance, onward, safe_inverse
+from .bundle import clear_distance, density_where, onward, safe_inverse
 from .grid import REFLECTANCE_RESOLUTION
 
 
@@ -77,7 +77,7 @@ def _depth(grid, x, d, most):
     def body(t, depth, active):
         p = tuple(a + (t + 0.5 * step) * b for a, b in zip(x, d, strict=True))
         skip = clear_distance(grid, p, inverse)
-        depth = depth + dr.select(active & (skip <= 0), grid.density(p) * step, 0)
+        depth = depth + density_where(active & (skip <= 0), grid.density, p) * step
         t = t + onward(skip, step)
         return t, depth, active & (t < length) & (depth < most)
 

@@ -220,12 +220,12 @@ def test_a_sample_without_a_slot_is_dropped(slab, monkeypatch):
     go to the next ray's slot."""
     walk, walks = march._walk, []
 
-    def forgetful(bundle, offset, depth, emit, state):
+    def forgetful(bundle, emit, state, *more):
         walks.append(emit)
-        transmittance, state = walk(bundle, offset, depth, emit, state)
+        transmittance, state = walk(bundle, emit, state, *more)
         if len(walks) == 1:  # counted one too few for the first ray
             count = np.array(state[0])
-            state = (mi.UInt32(count - (np.arange(len(count)) == 0)),)
+            state = (mi.UInt32(count - (np.arange(len(count)) == 0)), *state[1:])
         return transmittance, state
 
     def samples():

@@ -4,7 +4,7 @@ import drjit as dr
 
 from ...core import spheres
 from .. import ops
-from ..bundle import clear_distance, safe_inverse
+from ..bundle import clear_distance, density_where, safe_inverse
 
 MAX_OPTICAL_DEPTH = 12.0
 """Light rays end here, and count as blocked: a lamp that shines through at τ = 6e-6 would light what is outside an
@@ -62,8 +62,7 @@ def optical_depth(density, grid, x, d, length, steps, active):
         q = tuple(mi + at * di for mi, di in zip(m, along, strict=True))
         if attached:
             q = tuple(dr.replace_grad(a, xi + (at - here) * di) for a, xi, di in zip(q, x, d, strict=True))
-        sigma = density(q)
-        depth = depth + dr.select(active & ~empty, sigma * step, 0)
+        depth = depth + density_where(active & ~empty, density, q) * step
         t = t + dr.select(empty, skip + 1e-4, step)
         return t, depth, active & (t < end - 1e-5) & (depth < MAX_OPTICAL_DEPTH)
 
