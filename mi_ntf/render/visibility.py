@@ -73,11 +73,16 @@ def size_per_light(method: str, medium, table, options: Options) -> int:
 def _numbers(method: str, medium, table, options: Options) -> int:
     """float32 numbers that a light's ray takes."""
     if method == "transmittance_volume":
-        return math.ceil(2 / options.step)
+        return _depths(options)
     if options.map_source == "field":
         return transmittance_map.channels(options.map_components)
     components = medium.field.network.components
     return transmittance_map.channels(components, components > 1 or _inside(table))
+
+
+def _depths(options: Options) -> int:
+    """Entries of a ray of a transmittance volume."""
+    return math.ceil(transmittance_volume.ENTRIES * 2 / options.step)
 
 
 def _inside(table) -> bool:
@@ -100,7 +105,7 @@ def build(method: str, medium, table, options: Options):
     if method == "visibility_mlp":
         return visibility_mlp.VisibilityMLP(field.network)
     if method == "transmittance_volume":
-        depths = math.ceil(2 / options.step)
+        depths = _depths(options)
         return transmittance_volume.TransmittanceVolume(
             table, options.map_resolution, depths, field.grid.hull, source.density, mi
         )

@@ -33,10 +33,7 @@ class TrainConfig:
     empty: float = 0.05
     """Weight of σ → 0 outside the visual hull, where no photograph's ray is sampled."""
     even: float = 5e-3
-    """Weight of an even density along surfaces …"""
-    even_over: float = 0.02
-    """… over a quarter of this length up to all of it, 1.3 pixels: what is wider, photographs should say. (Over five
-    pixels of 512² photographs it filled the folds of `statue` and cost a dB in its test views.)"""
+    """Weight of an even density along surfaces."""
     sharp: float = 1e-3
     """Weight of thin skins: −ln σ where pictures see matter."""
     gloss: float = 2e-3
@@ -63,11 +60,9 @@ class TrainConfig:
     def sharpened(self, pixel: float) -> "TrainConfig":
         """The recipe for photographs whose pixels are `pixel` wide at the object, in field units. Its own lengths are
         for 1/64, 128 pixels across the unit sphere; they shrink by the root of the pixels, and by a third at most: a
-        grid's upkeep costs the cube. Evenness follows the pixels, down to a quarter."""
-        smaller = min(max(64 * pixel, 0.25), 1.0)
-        finer = min(1 / math.sqrt(smaller), 1.5)
-        return replace(self, step=self.step / finer, cells=round(self.cells * finer), bake=round(self.bake * finer),
-                       even_over=self.even_over * smaller)
+        grid's upkeep costs the cube."""
+        finer = min(max(math.sqrt(1 / (64 * pixel)), 1.0), 1.5)
+        return replace(self, step=self.step / finer, cells=round(self.cells * finer), bake=round(self.bake * finer))
 
 
 @dataclass(frozen=True)

@@ -140,7 +140,7 @@ class Stepper(Descent):
         toward, away = losses.normals(image, batch.d, self.baked)
         terms["normal"], terms["facing"] = c.normal * toward, c.facing * away
         terms["bounds"] = c.empty * torch.relu(image.raw - MAX_LOG_DENSITY).mean()
-        terms["even"] = c.even * losses.evenness(self.nets, image, 2048, c.even_over, g)
+        terms["even"] = c.even * losses.evenness(self.nets, image, 2048, g)
         matter = image.raw[image.index].clamp(max=MAX_LOG_DENSITY)
         terms["sharp"] = -c.sharp * self.opaque * (image.weight.detach() * matter).sum() / len(batch)
         terms["gloss"] = c.gloss * losses.gloss(image, c.architecture.least_specular, self.fading(), len(batch))

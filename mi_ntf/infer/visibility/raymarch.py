@@ -32,7 +32,7 @@ def default_steps(step: float, gradients: bool = False) -> tuple[float, float, f
     `gradients`: for derivatives, which see the slopes of a skin: 28 % off with steps of 1/64, 2 % with 1/512.
     """
     longest = 1 / 512 if gradients else max(step, min(3 * step, 1 / 64))
-    return 0.3 * step, longest, min(0.2, 38.4 * step)
+    return 0.25 * step, longest, min(0.2, 38.4 * step)
 
 
 def optical_depth(density, grid, x, d, length, steps, active):

@@ -13,6 +13,10 @@ from ..lights import LightTable
 from .light_rays import LightRays
 
 
+ENTRIES = 1.5
+"""Entries of a ray for each cell of the camera's march: τ is linear between them, and skins are as thin."""
+
+
 class TransmittanceVolume:
     """Tables of all lights of a table, `resolution`² rays of `depths` entries each.
 
