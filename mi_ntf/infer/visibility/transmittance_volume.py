@@ -12,7 +12,6 @@ from .. import ops
 from ..lights import LightTable
 from .light_rays import LightRays
 
-
 ENTRIES = 1.5
 """Entries of a ray for each cell of the camera's march: τ is linear between them, and skins are as thin."""
 
