@@ -97,12 +97,12 @@ def _coefficients(log_sigma: np.ndarray, dj: ModuleType) -> np.ndarray:
     n, values = log_sigma.shape[0], dj.Float(np.maximum(log_sigma, MEAN_FLOOR).ravel())
     here = dr.arange(dj.UInt32, n**3)
     for stride in (1, n, n * n):
+        dr.eval(values)  # their neighbours are fetched
         place, step = here // stride % n, dr.opaque(dj.UInt32, stride)
         sides = (dr.gather(dj.Float, values, dr.select(place == end, here, beside))
                  for end, beside in ((0, here - step), (n - 1, here + step)))
         values = (14 * values - sum(sides)) / 12
-        dr.eval(values)
-    return np.minimum(values.numpy(), log_sigma.max()).reshape(log_sigma.shape)
+    return dr.minimum(values, dr.opaque(dj.Float, float(log_sigma.max()))).numpy().reshape(log_sigma.shape)
 
 
 def _flat(reflectance) -> list:

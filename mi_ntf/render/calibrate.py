@@ -21,7 +21,7 @@ MAP = 128
 FEW = 4
 MANY = 256
 """Lights of the lookups: their maps fit no cache, and neither do a scene's."""
-VOLUME = 64
+VOLUME = 52
 """Rays along a volume's side: fewer, since each has an entry for each sample."""
 
 

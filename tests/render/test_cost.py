@@ -34,8 +34,8 @@ def test_break_even_by_hand():
 
 
 def test_steps_of_a_light_march():
-    """Steps of a quarter of 1/192, growing by a fifth of the distance, at last 1/64 long: counted for 384 samples."""
-    assert cost.light_steps(384) == 78
+    """Steps of a quarter of 1/192, growing by a fifth of the distance, at last 1/80 long: counted for 384 samples."""
+    assert cost.light_steps(384) == 93
     assert cost.light_steps(96) < cost.light_steps(384) < cost.light_steps(1536)
 
 
