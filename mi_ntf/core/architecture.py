@@ -24,9 +24,9 @@ FORMAT = 2
 MAX_LOG_DENSITY = 6.5
 """ln σ is clipped from above: σ ≤ 665 per unit-sphere radius, a skin of 0.0015 radii."""
 MIN_LOG_DENSITY = -12.0
-MEAN_FLOOR = -6.0
-"""Where ln σ is averaged over space, lower values count as this: they are empty all the same, and must not thin out a
-skin beside them."""
+LOG_FLOOR = -6.0
+"""Where ln σ is interpolated in space, lower values count as this: they are empty all the same, and must not thin out
+a skin beside them."""
 MAX_OCTAVES = 24
 """sin(2^k π x) of higher k is noise in single precision."""
 NAMES = ("density", "reflectance", "transmittance")

@@ -5,7 +5,7 @@ from types import ModuleType
 import drjit as dr
 import numpy as np
 
-from ..core.architecture import MEAN_FLOOR
+from ..core.architecture import LOG_FLOOR
 from ..core.ops import normalize
 from . import ops
 from .network import MIN_DENSITY, NetworkField, cut_density
@@ -79,10 +79,10 @@ def _highest_gloss(grid: GridField, dense: np.ndarray, n: int) -> float:
 
 
 def _log_density(field: NetworkField, n: int, dj: ModuleType) -> np.ndarray:
-    """ln σ at the centres of n³ voxels (z, y, x); ``MEAN_FLOOR`` where a survey found less all around."""
-    values = np.full(n**3, MEAN_FLOOR, np.float32)
+    """ln σ at the centres of n³ voxels (z, y, x); ``LOG_FLOOR`` where a survey found less all around."""
+    values = np.full(n**3, LOG_FLOOR, np.float32)
     if n > SURVEY:
-        near = _chebyshev_distance(_log_density(field, SURVEY, dj) > MEAN_FLOOR, 2) <= 1
+        near = _chebyshev_distance(_log_density(field, SURVEY, dj) > LOG_FLOOR, 2) <= 1
         at = (2 * np.arange(n) + 1) * SURVEY // (2 * n)
         index = np.flatnonzero(near.take(at, 2).take(at, 1).take(at, 0))
     else:
@@ -94,7 +94,7 @@ def _log_density(field: NetworkField, n: int, dj: ModuleType) -> np.ndarray:
 def _coefficients(log_sigma: np.ndarray, dj: ModuleType) -> np.ndarray:
     """Values between which trilinear interpolation is right on average, f − f″/12 along each axis of (z, y, x) (Condat
     and Möller 2011, quasi-interpolation); none above the highest."""
-    n, values = log_sigma.shape[0], dj.Float(np.maximum(log_sigma, MEAN_FLOOR).ravel())
+    n, values = log_sigma.shape[0], dj.Float(np.maximum(log_sigma, LOG_FLOOR).ravel())
     here = dr.arange(dj.UInt32, n**3)
     for stride in (1, n, n * n):
         dr.eval(values)  # their neighbours are fetched

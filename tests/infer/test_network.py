@@ -10,7 +10,7 @@ from helpers import fields
 from helpers.jit import arrays
 
 from mi_ntf.core import field_file, reference
-from mi_ntf.core.architecture import MEAN_FLOOR, Architecture, Encoding, Header, Network
+from mi_ntf.core.architecture import LOG_FLOOR, Architecture, Encoding, Header, Network
 from mi_ntf.core.depth_profile import LEVELS
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.infer import grid as grid_module
@@ -161,7 +161,7 @@ def test_voxels_hold_the_density_that_interpolates_it_and_the_reflectance_at_the
     for offset in np.ndindex(3, 3, 3):
         weight = np.prod([(-1, 14, -1)[k] / 12 for k in offset])
         raw = np.array(network.log_density(arrays((i + np.array(offset) - 0.5) / 32 - 1)))
-        value += weight * np.maximum(raw, MEAN_FLOOR)
+        value += weight * np.maximum(raw, LOG_FLOOR)
     centres = (np.argwhere(np.ones((64, 64, 64))) + 0.5) / 32 - 1
     value = np.minimum(value, np.array(network.log_density(arrays(centres))).max())
     p = arrays((i + 0.5) / 32 - 1)

@@ -33,6 +33,12 @@ def test_break_even_by_hand():
     assert cost.break_even(replace(WORK, lights=1), KNOT) == cost.break_even(WORK, KNOT)
 
 
+def test_volumes_hold_one_and_a_half_entries_a_sample():
+    volume = replace(WORK, method="transmittance_volume")
+    entries = 0.785398 * 128**2 * 1.5 * 384
+    assert cost.seconds(volume, KNOT)["maps or volumes"] == pytest.approx(1e-9 * 50 * entries * KNOT.cell, rel=1e-5)
+
+
 def test_steps_of_a_light_march():
     """Steps of a quarter of 1/192, growing by a fifth of the distance, at last 1/80 long: counted for 384 samples."""
     assert cost.light_steps(384) == 93
