@@ -33,8 +33,8 @@ def render_all(networks: Networks, rays: Rays, occupancy: Occupancy, step: float
         part = kept[slice(first, first + chunk)]
         where = index[first:first + chunk]
         for _ in range(passes):
-            samples = unspent(networks, part, occupancy.samples(part, step, generator), step)
-            image = render(networks, part, samples, step, bounced, generator)
+            cells = occupancy.visible(part, step, generator)
+            image = render(networks, part, unspent(networks, part, cells, step, generator), bounced, generator)
             color[where] += image.color / passes
             alpha[where] += image.alpha / passes
             normal[where] += scatter_sum(image.weight[:, None] * image.normal, image.shaded, len(part)) / passes

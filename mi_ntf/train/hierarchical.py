@@ -49,7 +49,7 @@ def edges(t: torch.Tensor, rays: Rays) -> torch.Tensor:
 def composite(nets: Networks, rays: Rays, t: torch.Tensor, width: torch.Tensor) -> Image:
     """The rays' image from samples `t` (n, k) in cells of `width` (n, k)."""
     index = torch.arange(len(rays)).repeat_interleave(t.shape[1])
-    return render(nets, rays, (index, t.reshape(-1)), width.reshape(-1))
+    return render(nets, rays, (index, t.reshape(-1), width.reshape(-1)))
 
 
 @dataclass(frozen=True)

@@ -39,29 +39,29 @@ def normals(image: Image, d: torch.Tensor, baked: Baked):
     return toward, (w * away**2).sum() / count
 
 
-ROUGH = 60.0
+ROUGH = 120.0
 """How much dearer the roughest lobe is than a sharp one."""
 FAINT = -5.0
 """ln of the specular weight below which it is held: further down its sigmoid has no slope, and there is no way back."""
 
 
 def gloss(image: Image, least: float, fading: float, count: int) -> torch.Tensor:
-    """The specular weight s above the `least` that it can be, the dearer the rougher: (`fading` + ROUGH α⁴) s per ray,
+    """The specular weight s above the `least` that it can be, the dearer the rougher: (`fading` + ROUGH α⁶) s per ray,
     α = roughness². What α = 1 adds under a flash, a diffuse lobe of a quarter of its weight adds as well, and only that
     is right under other lights. What sharp lobes add nothing else can, so their cost may fade in the course of the
     training. Weights that vanish cost as well: (FAINT − ln s)²/10."""
     roughness, specular = image.gloss
     specular = (specular - least) / (1 - least)
     lost = torch.relu(FAINT - specular.clamp(min=1e-30).log()).square()
-    return (image.weight.detach() * (specular * (fading + ROUGH * roughness**8) + 0.1 * lost)).sum() / count
+    return (image.weight.detach() * (specular * (fading + ROUGH * roughness**12) + 0.1 * lost)).sum() / count
 
 
-def evenness(networks: Networks, image: Image, count: int, generator: torch.Generator) -> torch.Tensor:
+def evenness(networks: Networks, image: Image, over: float, count: int, generator: torch.Generator) -> torch.Tensor:
     """Squared change of ln σ along the surface, in random directions perpendicular to the (detached) predicted normals.
 
     Photographs with the light at the camera hardly see small bumps of the density, since nothing is in shadow there;
-    lit from elsewhere the bumps shade each other and show as blotches. Differences over 0.005 to 0.02 at `count`
-    samples.
+    lit from elsewhere the bumps shade each other and show as blotches. Differences over a quarter of `over` to all of
+    it, at `count` samples.
     """
     seen = (image.weight.detach() > 0.02).nonzero()[:, 0]
     if not len(seen):
@@ -69,7 +69,7 @@ def evenness(networks: Networks, image: Image, count: int, generator: torch.Gene
     pick = seen[torch.randint(len(seen), (count,), generator=generator)]
     normal = image.normal[pick].detach()
     along = F.normalize(torch.linalg.cross(normal, uniform_directions(count, generator)), dim=1)
-    offset = along * (0.005 + 0.015 * torch.rand(count, 1, generator=generator))
+    offset = along * over * (0.25 + 0.75 * torch.rand(count, 1, generator=generator))
     x = image.x[pick]
     raw = networks.log_density(torch.cat([x + offset, x - offset])).clamp(LOG_EMPTY, MAX_LOG_DENSITY)
     return (raw[:count] - raw[count:]).square().mean()

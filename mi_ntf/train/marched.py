@@ -12,7 +12,8 @@ from .networks import Networks
 from .occupancy import Occupancy
 
 SCALE = 2
-"""Voxels per cell of the occupancy grid, along an edge: 192³ in all, as fine as the renderer bakes."""
+"""Voxels per cell of the occupancy grid, along an edge: 192³ in all, 288³ for photographs of 512². The renderer has
+384³."""
 
 
 class Marched:
@@ -33,11 +34,12 @@ class Marched:
         grid = torch.full((k**3,), LOG_FLOOR)
         grid[index] = value.clamp(LOG_FLOOR, MAX_LOG_DENSITY)
         grid = grid.view(1, 1, k, k, k)
-        for axis in range(2, 5):  # the renderer's voxels hold means under their trilinear kernel
+        highest = grid.max()
+        for axis in range(2, 5):  # as the renderer's voxels: right on average where they are interpolated
             ends = grid.narrow(axis, 0, 1), grid.narrow(axis, k - 1, 1)
             wide = torch.cat([ends[0], grid, ends[1]], axis)
-            grid = (wide.narrow(axis, 0, k) + 10 * grid + wide.narrow(axis, 2, k)) / 12
-        self.log_sigma = grid
+            grid = (14 * grid - wide.narrow(axis, 0, k) - wide.narrow(axis, 2, k)) / 12
+        self.log_sigma = grid.clamp(max=highest)
         dense = x[value.exp() > CUT]
         self.reach = min(1.0, float(dense.norm(dim=1).max()) + 2 / k) if len(dense) else 1.0
 

@@ -87,18 +87,18 @@ class Occupancy:
         return index[fine], rays
 
     @torch.no_grad()
-    def samples(self, rays: Rays, step: float, generator: torch.Generator):
-        """Stratified samples in occupied, visible cells of `step`: packed ``(ray, t)``, ordered along each ray."""
+    def visible(self, rays: Rays, step: float, generator: torch.Generator):
+        """Occupied, visible cells of `step` along the rays: packed ``(ray, near)``, ordered along each ray, with the
+        distance of their near ends. One random shift a ray: the cells' bounds vary."""
         count = max(1, int(((rays.t1 - rays.t0).max() / step).ceil()))
-        # One random shift a ray and one a sample: cell bounds and places within the cells both vary.
-        t = torch.arange(count) + torch.rand(len(rays), 1, generator=generator) - 0.5
-        t = rays.t0[:, None] + (t + torch.rand(len(rays), count, generator=generator)) * step
+        near = torch.arange(count) + torch.rand(len(rays), 1, generator=generator) - 0.5
+        t = rays.t0[:, None] + (near + torch.rand(len(rays), count, generator=generator)) * step
         o, d = rays.o, rays.d
         sigma = self.lookup(*torch.addcmul(o.T[:, :, None], t[None], d.T[:, :, None]))
         depth = (sigma.clamp(min=0) * step).cumsum(1)
         ahead = depth - sigma.clamp(min=0) * step < OPAQUE_DEPTH
         ray, k = torch.nonzero((sigma >= 0) & ahead & (t < rays.t1[:, None]) & (t > rays.t0[:, None]), as_tuple=True)
-        return ray, t[ray, k]
+        return ray, (rays.t0[:, None] + near * step)[ray, k]
 
 
 def widest(grid: torch.Tensor) -> torch.Tensor:

@@ -13,6 +13,7 @@ scattering point. :data:`SURFACE` makes up for it.
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 
 from ..core import fresnel, microfacet
 from . import ops
@@ -27,6 +28,10 @@ MIN_WEIGHT = 1e-4
 """Samples with a smaller alpha weight are not shaded."""
 SPENT = 7.0
 """Optical depth behind which samples are left out: a thousandth of the pixel's alpha, a millionth of its light."""
+STEEP = 0.3
+"""Optical depth of a cell from which on it, and its neighbours, are split …"""
+PARTS = 4
+"""… into so many."""
 ROUND = 12
 """Samples of a ray that are looked at before it is asked whether it is spent."""
 
@@ -49,12 +54,12 @@ class Image:
     bounced: torch.Tensor | float
 
 
-def weights(sigma: torch.Tensor, ray: torch.Tensor, step: float | torch.Tensor):
-    """``(w, v)``, alpha and light weights of packed samples: `ray` (s,) ascending, `sigma` (s,), `step` one or (s,).
+def weights(sigma: torch.Tensor, ray: torch.Tensor, width: float | torch.Tensor):
+    """``(w, v)``, alpha and light weights of packed samples: `ray` (s,) ascending, `sigma` (s,), `width` one or (s,).
 
     Sums run over all rays at once, in float64: at the last ray the sum is 10⁵, of which float32 keeps two decimals.
     """
-    depth = sigma * step
+    depth = sigma * width
     total = depth.double().cumsum(0)
     first = torch.searchsorted(ray, ray)
     before = total - depth
@@ -64,27 +69,39 @@ def weights(sigma: torch.Tensor, ray: torch.Tensor, step: float | torch.Tensor):
 
 
 @torch.no_grad()
-def unspent(networks: Networks, rays: Rays, samples, step: float):
-    """Of packed ``(ray, t)`` samples those in front of the optical depth SPENT. Two of three lie deeper in the matter
-    that the occupancy grid knows; finding out costs one look at the density of the others, without gradient."""
-    ray, t = samples
+def unspent(networks: Networks, rays: Rays, cells, step: float, generator: torch.Generator):
+    """Of packed cells ``(ray, near)`` of length `step` those in front of the optical depth SPENT, as samples
+    ``(ray, t, width)``, a random place in each.
+
+    Two of three lie deeper in the matter that the occupancy grid knows; finding out costs one look at the density of
+    the others, without gradient. Where it is high, and in the cells before and behind, skins are thinner than the
+    cells, which are split: their noise would be learned as soft outlines.
+    """
+    ray, near = cells
     place = torch.arange(len(ray)) - torch.searchsorted(ray, ray)
-    depth, kept, first = torch.zeros(len(rays)), [], 0
+    depth, thick, kept, first = torch.zeros(len(rays)), torch.zeros(len(ray)), [], 0
     rest = torch.arange(len(ray))
     while len(rest):
         now = rest[place[rest] < first + ROUND]
-        x = torch.addcmul(rays.o[ray[now]], rays.d[ray[now]], t[now, None])
+        t = near[now] + step * torch.rand(len(now), generator=generator)
+        x = torch.addcmul(rays.o[ray[now]], rays.d[ray[now]], t[:, None])
         here = networks.density(x) * step
         # Float64: the sum runs over all rays.
         total = here.double().cumsum(0)
         before = total - here
         front = depth[ray[now]] + (before - before[torch.searchsorted(ray[now], ray[now])]).float()
         kept.append(now[front < SPENT])
+        thick[now] = here
         depth.index_add_(0, ray[now], here)
         rest = rest[(place[rest] >= first + ROUND) & (depth[ray[rest]] < SPENT)]
         first += ROUND
     index = torch.cat(kept).sort().values if kept else rest
-    return ray[index], t[index]
+    sharp = F.max_pool1d(F.pad(thick, (1, 1))[None], 3, 1)[0, index] > STEEP
+    parts = torch.where(sharp, PARTS, 1)
+    part = torch.arange(int(parts.sum())) - (parts.cumsum(0) - parts).repeat_interleave(parts)
+    width = (step / parts).repeat_interleave(parts)
+    index = index.repeat_interleave(parts)
+    return ray[index], near[index] + width * (part + torch.rand(len(index), generator=generator)), width
 
 
 def scatter_sum(value: torch.Tensor, ray: torch.Tensor, count: int) -> torch.Tensor:
@@ -109,17 +126,17 @@ def diffuse_albedo(reflectance: tuple, rim: bool) -> torch.Tensor:
     return fresnel.diffuse_albedo(ops, albedo, roughness[:, None], specular[:, None], rim)
 
 
-def render(networks: Networks, rays: Rays, samples, step: float | torch.Tensor, bounced=None,
+def render(networks: Networks, rays: Rays, samples, bounced=None,
            generator: torch.Generator | None = None, lobes: bool = True) -> Image:
-    """Colour and alpha of `rays` from packed ``(ray, t)`` samples in cells of `step`, one length or each its own.
+    """Colour and alpha of `rays` from packed samples ``(ray, t, width)``, each in a cell of its width.
 
     `bounced` (:class:`mi_ntf.train.bounced.Bounced`, drawn from by `generator`): further bounces of the flashes' light.
     `lobes`: whether roughness and specular weight have derivatives.
     """
-    ray, t = samples
+    ray, t, width = samples
     x = torch.addcmul(rays.o[ray], rays.d[ray], t[:, None])
     raw = networks.log_density(x)
-    w, v = weights(density_from_log(raw), ray, step)
+    w, v = weights(density_from_log(raw), ray, width)
     alpha = scatter_sum(w, ray, len(rays))
     near = (w.detach() > MIN_WEIGHT).nonzero()[:, 0]
     ray, t, x = ray[near], t[near], x[near]

@@ -116,11 +116,11 @@ class Stepper(Descent):
         self.last_bake = self.step
 
     def batch(self):
-        """Random camera rays and their samples, about ``config.samples`` of them: ``(rays, (ray, t))``."""
+        """Random camera rays and their samples, about ``config.samples`` of them: ``(rays, (ray, t, width))``."""
         count = min(8192, max(256, int(self.config.samples / self.samples_per_ray)))
         batch = self.seen[torch.randint(len(self.seen), (count,), generator=self.generator)]
-        samples = self.occupancy.samples(batch, self.config.step, self.generator)
-        samples = render.unspent(self.nets, batch, samples, self.config.step)
+        cells = self.occupancy.visible(batch, self.config.step, self.generator)
+        samples = render.unspent(self.nets, batch, cells, self.config.step, self.generator)
         self.samples_per_ray = 0.9 * self.samples_per_ray + 0.1 * max(1.0, len(samples[0]) / count)
         self.trained[0] += count
         self.trained[1] += len(samples[0])
@@ -134,13 +134,13 @@ class Stepper(Descent):
     def field_loss(self, batch: rays.Rays, samples):
         """``(terms, image)``: name → weighted term of the photographs; see :mod:`mi_ntf.train.losses`."""
         c, g = self.config, self.generator
-        image = render.render(self.nets, batch, samples, c.step, self.bounced, g, self.progress() >= c.lobes_from)
+        image = render.render(self.nets, batch, samples, self.bounced, g, self.progress() >= c.lobes_from)
         terms = {"colour": losses.color(image.color, batch.target[:, :3], self.exposure),
                  "alpha": c.alpha * (image.alpha - batch.target[:, 3]).square().mean()}
         toward, away = losses.normals(image, batch.d, self.baked)
         terms["normal"], terms["facing"] = c.normal * toward, c.facing * away
         terms["bounds"] = c.empty * torch.relu(image.raw - MAX_LOG_DENSITY).mean()
-        terms["even"] = c.even * losses.evenness(self.nets, image, 2048, g)
+        terms["even"] = c.even * losses.evenness(self.nets, image, c.even_over, 2048, g)
         matter = image.raw[image.index].clamp(max=MAX_LOG_DENSITY)
         terms["sharp"] = -c.sharp * self.opaque * (image.weight.detach() * matter).sum() / len(batch)
         terms["gloss"] = c.gloss * losses.gloss(image, c.architecture.least_specular, self.fading(), len(batch))
@@ -173,11 +173,10 @@ class Stepper(Descent):
         value = 0.0
         batch, samples = self.batch()
         if alone:
-            ray, t = samples
-            few = ray < NEAR
+            few = samples[0] < NEAR
             with torch.no_grad():
-                image = render.render(self.nets, batch[slice(NEAR)], (ray[few], t[few]), c.step,
-                                      self.bounced, self.generator)
+                image = render.render(self.nets, batch[slice(NEAR)], tuple(part[few] for part in samples), self.bounced,
+                                      self.generator)
             self.terms = {}
         else:
             self.terms, image = self.field_loss(batch, samples)

@@ -120,10 +120,11 @@ def test_albedo_learns_of_the_bounced_light(spheres, light):
     """Colour holds it, on top of the flash's own light, and its derivative by the albedo is its own share."""
     nets = Outward(spheres[0])
     some = camera_rays(200)
-    samples = torch.arange(200).repeat_interleave(64), torch.linspace(2, 4, 64).repeat(200)
+    samples = (torch.arange(200).repeat_interleave(64), torch.linspace(2, 4, 64).repeat(200),
+               torch.full((12800,), 2 / 64))
     generator = torch.Generator().manual_seed(0)
-    without = render.render(nets, some, samples, 2 / 64)
-    whole = render.render(nets, some, samples, 2 / 64, light, generator)
+    without = render.render(nets, some, samples)
+    whole = render.render(nets, some, samples, light, generator)
     torch.testing.assert_close(whole.color, without.color + whole.bounced)
     assert float(whole.bounced.max()) > 0.01 and without.bounced == 0.0
     albedo = torch.tensor([[0.5, 0.5, 0.5]], requires_grad=True)

@@ -73,7 +73,9 @@ def test_uniform_ball_has_the_closed_form():
     grid = Occupancy(torch.ones((16,) * 3, dtype=torch.bool))
     grid.sigma[:] = 0.0  # occupied everywhere, nothing hidden
     step = 1 / 400
-    image = render.render(Slab(), batch, grid.samples(batch, step, torch.Generator().manual_seed(0)), step)
+    generator = torch.Generator().manual_seed(0)
+    cells = grid.visible(batch, step, generator)
+    image = render.render(Slab(), batch, render.unspent(Slab(), batch, cells, step, generator))
     h = ((batch.t1 - batch.t0) / 2).numpy().astype(float)
     # A jittered first and last cell each miss or add up to one cell: 2σ·step = 1.5 % of the depth at that end.
     np.testing.assert_allclose(image.alpha, 1 - np.exp(-2 * SIGMA * h), rtol=0.004)
@@ -84,25 +86,31 @@ def test_uniform_ball_has_the_closed_form():
         np.testing.assert_allclose(image.color[i], expected, rtol=0.02)
 
 
-def test_rays_end_where_they_are_spent():
-    """What is kept are the samples in front of the depth SPENT, of each ray its own, in the samples' order."""
+def test_rays_end_where_they_are_spent_and_steep_cells_are_split():
+    """What is kept are the cells in front of the depth SPENT, of each ray its own, in their order, those of optical
+    depth STEEP and their neighbours in PARTS, with a sample in each part."""
     counts, step = np.array([60, 0, 100, 1, 40]), 0.05
     ray = torch.as_tensor(np.repeat(np.arange(5), counts))
-    t = torch.as_tensor(np.concatenate([np.arange(n) * step + 1 for n in counts])).float()
+    near = torch.as_tensor(np.concatenate([np.arange(n) * step + 1 for n in counts])).float()
     sigma = torch.tensor([2.0, 0.0, 0.3, 500.0, 30.0])
 
     class Rows:
         def density(self, x):
-            return sigma[x[:, 1].round().long()]
+            row = x[:, 1].round().long()
+            return sigma[row] * ((row != 4) | (x[:, 0] > 1.5))  # row 4 is empty up to its tenth cell
 
     batch = rays(5)
     o, d = torch.tensor([[0.0, k, 0.0] for k in range(5)]), torch.tensor([[1.0, 0.0, 0.0]] * 5)
     batch = dataclasses.replace(batch, o=o, d=d)
-    order, places = render.unspent(Rows(), batch, (ray, t), step)
-    for k, n in enumerate(counts):
-        front = np.arange(n) * float(sigma[k]) * step
-        assert (order == k).sum() == (front < render.SPENT - 1e-4).sum(), k
-        np.testing.assert_allclose(places[order == k], 1 + step * np.arange(int((order == k).sum())), rtol=1e-6)
+    order, places, widths = render.unspent(Rows(), batch, (ray, near), step, torch.Generator().manual_seed(0))
+    # Row 3's one cell has neighbours in the rows beside it.
+    expected = [1] * 60, [], [1] * 99 + [4], [4], [4] + [1] * 8 + [4] * 6
+    for k, parts in enumerate(expected):
+        width = np.repeat(step / np.array(parts), parts)
+        start = 1 + np.cumsum(width) - width
+        np.testing.assert_allclose(widths[order == k], width, rtol=1e-6)
+        inside = (places[order == k].numpy() - start) / width
+        assert ((inside > -1e-4) & (inside < 1 + 1e-4)).all(), k
     assert (order.diff() >= 0).all()
 
 
@@ -202,8 +210,8 @@ def test_transmittance_loss_leaves_the_field_alone(kind):
     targets = losses.targets(marched, torch.rand(64, 3) - 0.5, uniform_directions(64, generator), generator)
     loss = losses.transmittance(nets, targets) + losses.visibility(nets, targets)
     batch = rays()
-    samples = torch.arange(4).repeat_interleave(5), torch.linspace(2.8, 3.2, 5).repeat(4)
-    image = render.render(nets, batch, samples, 0.1)
+    samples = torch.arange(4).repeat_interleave(5), torch.linspace(2.8, 3.2, 5).repeat(4), torch.full((20,), 0.1)
+    image = render.render(nets, batch, samples)
     (loss + losses.transmittance_color(nets, marched, image, batch, 1.0, 4)).backward()
     for name, value in nets.tensors.items():
         if name.startswith(("transmittance", "visibility")):
@@ -217,12 +225,12 @@ def test_lobes_wait_for_normals(rim):
     """Held, roughness and specular weight (rows 6 and 7) have no derivatives; the rest of the reflectance has its own,
     and the picture is the same."""
     arch = dataclasses.replace(PRESETS["fast"].architecture, fresnel=rim)
-    samples = torch.arange(4).repeat_interleave(5), torch.linspace(2.8, 3.2, 5).repeat(4)
+    samples = torch.arange(4).repeat_interleave(5), torch.linspace(2.8, 3.2, 5).repeat(4), torch.full((20,), 0.1)
     grads, pictures = [], []
     for lobes in (True, False):
         nets = networks.initial(arch, 1.0, torch.Generator().manual_seed(0))
         nets.tensors["reflectance.layers.1.bias"].data[:3] = -rays().d[0]  # seen from the front
-        image = render.render(nets, rays(), samples, 0.1, lobes=lobes)
+        image = render.render(nets, rays(), samples, lobes=lobes)
         image.color.square().sum().backward()
         grads.append(nets.tensors["reflectance.layers.1.weight"].grad.abs().sum(1))
         pictures.append(image.color.detach())
@@ -243,10 +251,10 @@ def test_evenness_sees_slopes_along_the_surface_alone():
 
     generator = torch.Generator().manual_seed(0)
     # float32 rounding of offsets of 0.02
-    assert float(losses.evenness(Ramp(), image([0.0, 0.0, -1.0]), 4000, generator)) < 1e-10
+    assert float(losses.evenness(Ramp(), image([0.0, 0.0, -1.0]), 0.02, 4000, generator)) < 1e-10
     offset = np.mean(np.linspace(0.005, 0.02, 1000) ** 2)
     # 4000 random directions and lengths: 2 % standard error
-    value = float(losses.evenness(Ramp(), image([1.0, 0.0, 0.0]), 4000, generator))
+    value = float(losses.evenness(Ramp(), image([1.0, 0.0, 0.0]), 0.02, 4000, generator))
     assert value == pytest.approx(128 * offset, rel=0.1)
 
 
@@ -294,12 +302,12 @@ def test_held_out_score_of_a_network_that_knows_no_shadow():
 
 
 def test_rough_lobes_cost_more():
-    """Σ w ((fading + 60 α⁴) s + (−5 − ln s)²/10) per ray, the square where s lies below e^−5; s above the least."""
+    """Σ w ((fading + 120 α⁶) s + (−5 − ln s)²/10) per ray, the square where s lies below e^−5; s above the least."""
     gloss = torch.tensor([1.0, 0.5, 1.0]), torch.tensor([0.2, 0.4, math.exp(-7)])
     image = render.Image(color=None, alpha=None, x=None, shaded=None, index=None,
                          weight=torch.tensor([0.5, 0.25, 0.25]),
                          normal=None, gloss=gloss, radiance=None, raw=None, bounced=0.0)
-    wanted = 0.5 * 0.2 * 60.5 + 0.25 * 0.4 * (0.5 + 60 / 256) + 0.25 * (math.exp(-7) * 60.5 + 0.4)
+    wanted = 0.5 * 0.2 * 120.5 + 0.25 * 0.4 * (0.5 + 120 / 4096) + 0.25 * (math.exp(-7) * 120.5 + 0.4)
     assert float(losses.gloss(image, 0.0, 0.5, 4)) == pytest.approx(wanted / 4)
     above = dataclasses.replace(image, gloss=(gloss[0], 0.04 + 0.96 * gloss[1]))
     assert float(losses.gloss(above, 0.04, 0.5, 4)) == pytest.approx(wanted / 4, rel=1e-5)
