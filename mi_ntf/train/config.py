@@ -16,7 +16,7 @@ class TrainConfig:
     samples: int = 30000
     """Field samples a step; the number of camera rays follows from how many samples a ray takes."""
     step: float = 1 / 100
-    """Length of the cells of the quadrature: 200 across the unit sphere."""
+    """Length of the cells of the quadrature, 200 across the unit sphere; steep ones are split."""
     cells: int = 96
     """Occupancy grid, cells along an edge."""
     bake: int = 128

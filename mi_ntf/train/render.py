@@ -96,12 +96,17 @@ def unspent(networks: Networks, rays: Rays, cells, step: float, generator: torch
         rest = rest[(place[rest] >= first + ROUND) & (depth[ray[rest]] < SPENT)]
         first += ROUND
     index = torch.cat(kept).sort().values if kept else rest
+    # The first and last cells of a ray have neighbours of other rays, and may be split without need.
     sharp = F.max_pool1d(F.pad(thick, (1, 1))[None], 3, 1)[0, index] > STEEP
-    parts = torch.where(sharp, PARTS, 1)
-    part = torch.arange(int(parts.sum())) - (parts.cumsum(0) - parts).repeat_interleave(parts)
-    width = (step / parts).repeat_interleave(parts)
-    index = index.repeat_interleave(parts)
-    return ray[index], near[index] + width * (part + torch.rand(len(index), generator=generator)), width
+    return _split(ray[index], near[index], step, torch.where(sharp, PARTS, 1), generator)
+
+
+def _split(ray: torch.Tensor, near: torch.Tensor, step: float, parts: torch.Tensor, generator: torch.Generator):
+    """Samples ``(ray, t, width)`` at random places of cells of length `step`, one in each of their `parts` (s,)."""
+    first = (parts.cumsum(0) - parts).repeat_interleave(parts)
+    ray, near, width = (v.repeat_interleave(parts) for v in (ray, near, step / parts))
+    place = torch.arange(len(ray)) - first + torch.rand(len(ray), generator=generator)
+    return ray, near + width * place, width
 
 
 def scatter_sum(value: torch.Tensor, ray: torch.Tensor, count: int) -> torch.Tensor:

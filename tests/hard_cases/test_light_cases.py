@@ -157,7 +157,7 @@ def block_error(a: np.ndarray, b: np.ndarray) -> float:
 def test_area_light_around_the_object_is_an_even_sky(blobs):
     lit = picture(blobs, "raymarch", {"ball_of_light": lamp_around(0.7)}, spp=256)
     sky = picture(blobs, "raymarch", {"type": "constant", "radiance": 0.7}, spp=256, environment_lights=64)
-    assert block_error(lit, sky) < 0.04  # noise of two drawn lights a point, in blocks of 4²
+    assert block_error(lit, sky) < 0.04  # noise of two drawn lights a point: 0.017 to 0.033 with six seeds
 
 
 def test_small_area_light_within_the_object_is_a_point(blobs):
@@ -186,7 +186,7 @@ def test_negative_light_subtracts(blobs, light_samples):
     two = {"a": point(CENTER + 2 * RADIUS * TOWARDS, 9.0), "b": point(CENTER + 2 * RADIUS * TOWARDS, -4.0)}
     found = picture(blobs, "raymarch", two, spp=256, light_samples=light_samples)
     wanted = picture(blobs, "raymarch", {"a": point(CENTER + 2 * RADIUS * TOWARDS, 5.0)}, spp=256)
-    # Of two lights in one place, drawn with even chances: noise in blocks of 4².
+    # Of two lights in one place, drawn with even chances: noise of 0.028 to 0.063 with six seeds.
     assert block_error(found, wanted) < (0.08 if light_samples else 1e-4)
 
 
