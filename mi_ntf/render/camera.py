@@ -7,6 +7,9 @@ import mitsuba as mi
 
 from ..core.errors import MiNtfError
 
+LATTICE = 3242174889, 2447445414
+"""2³² over ρ and ρ², ρ³ = ρ + 1: steps of a sequence that fills a square evenly however many of its points are taken
+(Roberts 2018, the R₂ sequence)."""
 CHANNELS = 8
 """Channels that one kernel sums: each is a register of its loop."""
 
@@ -51,6 +54,17 @@ class Camera:
         if dr.width(ray) < n:  # a sensor whose rays are all the same
             ray = dr.gather(mi.Ray3f, ray, dr.zeros(mi.UInt32, n))
         return ray, weight, inside + mi.Vector2f(self.film.crop_offset())
+
+    def quadrature(self, count: int, stream):
+        """Two numbers in [0, 1) for each ray of `count` source pixels: uniform ones, and evenly spread over the samples
+        of a pixel, whatever the sampler. Where in its skin a ray's samples lie decides half of their light."""
+        index = dr.arange(mi.UInt32, count * self.spp)
+        pixel = index // dr.opaque(mi.UInt32, self.spp)
+        sample = index - pixel * dr.opaque(mi.UInt32, self.spp)
+        starts = mi.sample_tea_32(stream, pixel)
+        # Integers wrap around; the upper 24 bits are a float's.
+        return tuple(mi.Float((start + sample * step) >> 8) * 2**-24
+                     for start, step in zip(starts, LATTICE, strict=True))  # fmt: skip
 
 
 class Reconstruction:

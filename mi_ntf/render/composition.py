@@ -165,8 +165,9 @@ class Composition:
         others = [(p.frame, getattr(p, kind)) for p in self.parts if p is not part]
         return Shadow(part.frame, own, others, self.surfaces) if own and (others or self.surfaces) else own
 
-    def trace(self, ray, sampler, stream, sums=None):
-        """``(radiance, opacity)`` of camera rays. `sums`: where other outputs are gathered
+    def trace(self, ray, quadrature, stream, sums=None):
+        """``(radiance, opacity)`` of camera rays. `quadrature`: where their cells begin and samples lie in them
+        (:meth:`mi_ntf.render.camera.Camera.quadrature`). `sums`: where other outputs are gathered
         (:class:`mi_ntf.render.aovs.Sums`), None where nobody asks."""
         n, found = dr.width(ray.o), self.effects
         total = [dr.zeros(mi.Float, n) for _ in range(3)]
@@ -175,7 +176,7 @@ class Composition:
             hit = self.surfaces.first(ray)
             dr.eval(hit)
         transmittance = dr.ones(mi.Float, n)
-        offset, depth = sampler.next_1d(), sampler.next_1d()
+        offset, depth = quadrature
         if self.in_view:
             transmittance = self._fields(ray, hit, offset, depth, total, stream, sums)
         if (self.surfaces or found.bounces == "paths") and not self.run:

@@ -20,6 +20,8 @@ SPACED = 20.0
 """Seconds of a run for each of these rounds, which take some each: the shortest runs do without."""
 SOLID = 0.5
 """Share of the object's pixels that nothing may shine through, or it is smoke, whose bounces are others."""
+SURFACE_LEVEL = 3.0
+"""ln σ where skins meet the surfaces that photographs show: of fields of meshes, within a thousandth of the radius."""
 REFRESH = 32
 """Steps between two updates of the occupancy grid; the baked density is renewed at every fourth of them."""
 
@@ -30,7 +32,7 @@ NEAR = 96
 class Stepper(Descent):
     """The recipe of the project's own: planes, an occupancy grid in the visual hull, transmittance after the field."""
 
-    HELD = (*Descent.HELD, "samples_per_ray", "last_bake", "rounds")
+    HELD = (*Descent.HELD, "samples_per_ray", "last_bake", "rounds", "steep")
     GRIDS = (("occupancy", ("sigma", "level", "stray")), ("baked", ("slope",)), ("marched", ("log_sigma", "reach")),
              ("bounced", ("table", "light")))
     config: TrainConfig
@@ -46,6 +48,8 @@ class Stepper(Descent):
         self.samples_per_ray, self.last_bake = 30.0, 0
         self.rounds = 0
         """How often the bounced light was found."""
+        self.steep = self.opaque <= SOLID
+        """Whether skins were made steeper, or there are none."""
         if config.bounces and self.opaque > SOLID:
             flashes = [rays.flashes(split) for split in self.splits.values()]
             self.bounced = Bounced(*(torch.cat(parts) for parts in zip(*flashes, strict=True)))
@@ -94,6 +98,8 @@ class Stepper(Descent):
         done = self.progress() >= self.config.ntf_alone
         if self.step % REFRESH == 0 and not done:
             self.occupancy.update(self.nets, self.generator)
+        if not self.steep and not done and self.progress() >= self.config.steepen_at:
+            self.make_steep()
         due = self.step % (4 * REFRESH) == 0 and not (done and self.step > self.last_bake + 8 * REFRESH)
         if due or (self.progress() >= self.config.ntf_from and not hasattr(self.marched, "log_sigma")):
             self.bake()
@@ -101,6 +107,16 @@ class Stepper(Descent):
             # Runs given in steps are the same whatever the clock says.
             if self.minutes == math.inf or self.spent >= SPACED * (self.rounds + 1):
                 self.find_bounced()
+
+    @torch.no_grad()
+    def make_steep(self) -> None:
+        """Multiply the slopes of ln σ, around SURFACE_LEVEL, which stays where it is."""
+        layer = f"density.layers.{len(self.config.architecture.density.hidden)}"
+        self.nets.tensors[f"{layer}.weight"] *= self.config.steepen
+        bias = self.nets.tensors[f"{layer}.bias"]
+        bias += (self.config.steepen - 1) * (bias - SURFACE_LEVEL)
+        self.optimizers["field"] = self._optimizer(*FIELD)  # the old one's steps are of other slopes
+        self.steep = True
 
     def find_bounced(self) -> None:
         """Bring the light that bounced up to date."""

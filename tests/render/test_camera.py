@@ -7,6 +7,8 @@ import pytest
 from helpers import scenes, ztest
 from helpers.scenes import nrf
 
+from mi_ntf.render.camera import Camera
+
 LIGHT = {"light": scenes.light("point")}
 SPECTRUM_TO_LUMINANCE = np.array([0.212671, 0.715160, 0.072169])
 RGB_TO_XYZ = np.array([[0.412453, 0.357580, 0.180423], [0.212671, 0.715160, 0.072169], [0.019334, 0.119193, 0.950227]])
@@ -130,3 +132,30 @@ def test_frozen_functions_are_refused(blobs):
         error = error.__cause__
     assert "dr.freeze cannot record a render" in " ".join(texts)
     np.testing.assert_array_equal(scenes.render(loaded), before)
+
+
+def test_samples_of_a_pixel_spread_evenly(blobs):
+    """Of 16 points, and of 4096, every stretch of a few sixteenths (4096ths) of [0, 1) holds one; over the pixels each
+    is uniform."""
+    loaded = scenes.scene(blobs, nrf(), LIGHT, size=8, spp=16)
+    for spp, count in (16, 900), (4096, 4):
+        camera = Camera(loaded.sensors()[0], spp)
+        for u in camera.quadrature(count, mi.UInt32(5)):
+            values = np.sort(u.numpy().reshape(count, spp))
+            assert values.min() >= 0 and values.max() < 1
+            gaps = np.diff(np.concatenate([values, values[:, :1] + 1], 1))
+            assert gaps.max() < 3.5 / spp  # points at random leave ln(16) or ln(4096), 2.8 or 8.3
+    first = np.array([u.numpy()[::16] for u in Camera(loaded.sensors()[0], 16).quadrature(900, mi.UInt32(6))])
+    assert np.abs(first.mean(1) - 0.5).max() < 4 / np.sqrt(12 * 900)
+    assert abs(np.corrcoef(first)[0, 1]) < 4 / np.sqrt(900)
+
+
+def test_samples_of_a_pixel_know_of_each_other(blobs):
+    """Along one ray, whose places in its pixel are none, the variance of 16 samples is not half of a sixteenth."""
+    view = sensors(1)["radiancemeter"]
+    loaded = mi.load_dict({"type": "scene", "integrator": nrf(), **view, **LIGHT, "ball": scenes.ball(blobs)})
+
+    def variance(spp):
+        return np.array([scenes.render(loaded, seed, spp)[..., :3] for seed in range(60)]).var(0).mean()
+
+    assert variance(16) < 0.5 / 16 * variance(1)

@@ -11,7 +11,7 @@ from train import two_spheres  # noqa: E402
 
 from mi_ntf.core import field_file  # noqa: E402
 from mi_ntf.core.errors import MiNtfError  # noqa: E402
-from mi_ntf.train import config, evaluate, monitor, train, trainer  # noqa: E402
+from mi_ntf.train import config, evaluate, monitor, stepper, train, trainer  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -160,3 +160,21 @@ def test_no_tensorboard_is_a_clear_error(photographs, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
     with pytest.raises(MiNtfError, match=r"--tensorboard .*tb needs the package .*pip install 'mi-ntf\[train\]'"):
         train(photographs, tmp_path / "f", steps=1, tensorboard=tmp_path / "tb")
+
+
+def test_skins_get_steeper_once_around_the_surface(photographs, tmp_path):
+    """ln σ → SURFACE_LEVEL + steepen (ln σ − SURFACE_LEVEL) everywhere, at its share of the run and never again; smoke
+    has no skin."""
+    run = trainer._Run(photographs, tmp_path / "f", config.PRESETS["fast"], "fast", minutes=None, steps=8, seed=3)
+    x = torch.rand(100, 3) - 0.5
+    while run.step < 4:
+        run.advance()
+        run.step += 1
+    assert not run.steep
+    before = run.nets.log_density(x).detach()
+    run.refresh()
+    assert run.steep
+    expected = stepper.SURFACE_LEVEL + run.config.steepen * (before - stepper.SURFACE_LEVEL)
+    torch.testing.assert_close(run.nets.log_density(x).detach(), expected, rtol=1e-4, atol=1e-4)
+    run.refresh()
+    torch.testing.assert_close(run.nets.log_density(x).detach(), expected, rtol=1e-4, atol=1e-4)
