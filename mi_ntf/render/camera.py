@@ -55,16 +55,19 @@ class Camera:
             ray = dr.gather(mi.Ray3f, ray, dr.zeros(mi.UInt32, n))
         return ray, weight, inside + mi.Vector2f(self.film.crop_offset())
 
-    def quadrature(self, count: int, stream):
-        """Two numbers in [0, 1) for each ray of `count` source pixels: uniform ones, and evenly spread over the samples
-        of a pixel, whatever the sampler. Where in its skin a ray's samples lie decides half of their light."""
+    def quadrature(self, count: int):
+        """Two numbers in [0, 1) for each ray of the last :meth:`rays`, those of `count` source pixels: uniform ones,
+        and evenly spread over the samples of a pixel, whatever the sampler, which gives the first sample's. Where in
+        its skin a ray's samples lie decides half of their light."""
+        spp = dr.opaque(mi.UInt32, self.spp)
         index = dr.arange(mi.UInt32, count * self.spp)
-        pixel = index // dr.opaque(mi.UInt32, self.spp)
-        sample = index - pixel * dr.opaque(mi.UInt32, self.spp)
-        starts = mi.sample_tea_32(stream, pixel)
-        # Integers wrap around; the upper 24 bits are a float's.
-        return tuple(mi.Float((start + sample * step) >> 8) * 2**-24
-                     for start, step in zip(starts, LATTICE, strict=True))  # fmt: skip
+        first = index // spp * spp
+        numbers = []
+        for step in LATTICE:
+            start = mi.UInt32(dr.gather(mi.Float, self.sampler.next_1d(), first) * 2**24) << 8
+            # Integers wrap around; the upper 24 bits are a float's.
+            numbers.append(mi.Float((start + (index - first) * step) >> 8) * 2**-24)
+        return tuple(numbers)
 
 
 class Reconstruction:

@@ -152,7 +152,7 @@ def _render(self, scene, sensor, seed: int, spp: int, develop: bool):
         ray, weight, position = camera.rays(first, count, stream)
         sums = picture and picture.sums(dr.width(ray), run, composition.runs[run])
         with composition.lights.bare():
-            radiance, opacity = composition.trace(ray, camera.quadrature(count, stream), stream, sums)
+            radiance, opacity = composition.trace(ray, camera.quadrature(count), stream, sums)
         alpha = [opacity] if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else []
         once = [*alpha, dr.ones(mi.Float, dr.width(ray))]
         pixels.add(first, position, [*(radiance * weight), *([None] * len(once) if run else once)])

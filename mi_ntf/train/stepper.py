@@ -19,9 +19,10 @@ ROUNDS = (0.3, 0.45, 0.6, 0.75)
 SPACED = 20.0
 """Seconds of a run for each of these rounds, which take some each: the shortest runs do without."""
 SOLID = 0.5
-"""Share of the object's pixels that nothing may shine through, or it is smoke, whose bounces are others."""
+"""Share of the object's pixels that nothing may shine through, or it is smoke, which has no skin, and whose
+bounces are others."""
 SURFACE_LEVEL = 3.0
-"""ln σ where skins meet the surfaces that photographs show: of fields of meshes, within a thousandth of the radius."""
+"""ln σ where skins meet the surfaces that photographs show: of `statue`, within 0.001 radii of the mesh (median)."""
 REFRESH = 32
 """Steps between two updates of the occupancy grid; the baked density is renewed at every fourth of them."""
 
@@ -48,9 +49,10 @@ class Stepper(Descent):
         self.samples_per_ray, self.last_bake = 30.0, 0
         self.rounds = 0
         """How often the bounced light was found."""
-        self.steep = self.opaque <= SOLID
+        solid = self.opaque > SOLID
+        self.steep = not solid
         """Whether skins were made steeper, or there are none."""
-        if config.bounces and self.opaque > SOLID:
+        if config.bounces and solid:
             flashes = [rays.flashes(split) for split in self.splits.values()]
             self.bounced = Bounced(*(torch.cat(parts) for parts in zip(*flashes, strict=True)))
 

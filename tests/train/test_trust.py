@@ -165,10 +165,13 @@ def test_no_tensorboard_is_a_clear_error(photographs, tmp_path, monkeypatch):
         train(photographs, tmp_path / "f", steps=1, tensorboard=tmp_path / "tb")
 
 
-def test_skins_get_steeper_once_around_the_surface(photographs, tmp_path):
+def test_skins_get_steeper_once_around_the_surface(photographs, tmp_path, monkeypatch):
     """ln σ → SURFACE_LEVEL + steepen (ln σ − SURFACE_LEVEL) everywhere, at its share of the run and never again; smoke
     has no skin."""
-    run = trainer._Run(photographs, tmp_path / "f", config.PRESETS["fast"], "fast", minutes=None, steps=8, seed=3)
+    def start():
+        return trainer._Run(photographs, tmp_path / "f", config.PRESETS["fast"], "fast", minutes=None, steps=8, seed=3)
+
+    run = start()
     x = torch.rand(100, 3) - 0.5
     while run.step < 4:
         run.advance()
@@ -181,3 +184,5 @@ def test_skins_get_steeper_once_around_the_surface(photographs, tmp_path):
     torch.testing.assert_close(run.nets.log_density(x).detach(), expected, rtol=1e-4, atol=1e-4)
     run.refresh()
     torch.testing.assert_close(run.nets.log_density(x).detach(), expected, rtol=1e-4, atol=1e-4)
+    monkeypatch.setattr(stepper, "SOLID", 1.0)
+    assert start().steep
