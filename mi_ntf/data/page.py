@@ -1,0 +1,167 @@
+"""One short HTML page that holds all it shows: no network, no scripts. For reports to look at.
+
+    page = Page("skull")
+    page.section("Photographs")
+    page.text("66 photographs."), page.warning("1 % is saturated.")
+    page.table(["what", "value"], [["gain", 0.34]])
+    page.pictures([("photograph 1", array)], width=240)
+    page.curves("Loss", {"colour": (xs, ys)}, xlabel="step", ylabel="loss", log=True)
+    page.write(Path("report.html"))
+
+Every text is escaped. Arrays are (H, W, 3) RGB, linear light as floats or sRGB levels as uint8. Pillow and matplotlib
+(extra `train`) are imported where they are needed.
+"""
+
+import base64
+import io
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from pathlib import Path
+
+import numpy as np
+
+from mi_ntf.core import files
+from mi_ntf.data.images import levels
+
+GREY = "#7d7d7d"
+"""Of a figure's text and lines: it can be read on a light page and on a dark one."""
+COLOURS = {"red": "#e0433a", "green": "#2f9e44", "blue": "#3b82e0"}
+"""Of curves that are called so; others take matplotlib's in turn."""
+SMALL = 128 * 128
+"""Pictures of so many pixels are PNG, exact to the level; larger ones JPEG."""
+
+_STYLE = """
+:root { color-scheme: light dark; --page: #fff; --ink: #1c1c1c; --warn: #fff1d6; }
+@media (prefers-color-scheme: dark) { :root { --page: #17181a; --ink: #dedede; --warn: #45330f; } }
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em;
+       background: var(--page); color: var(--ink); }
+h1 { font-size: 1.6em; } h2 { font-size: 1.2em; margin-top: 2em; border-bottom: 1px solid #8886; }
+p.warning { background: var(--warn); border-left: 4px solid #e39b1a; padding: .4em .8em; }
+table { border-collapse: collapse; margin: 1em 0; }
+td, th { padding: .15em .8em .15em 0; text-align: left; border-bottom: 1px solid #8883; vertical-align: top;
+         font-variant-numeric: tabular-nums; }
+.row { display: flex; flex-wrap: wrap; gap: 10px; }
+figure { margin: 0 0 .5em; } figcaption { font-size: .85em; opacity: .8; overflow-wrap: anywhere; }
+img { display: block; max-width: 100%; height: auto; } img.small { image-rendering: pixelated; }
+summary { cursor: pointer; }
+"""
+
+
+class Page:
+    """A page under way; nothing is on the disk before :meth:`write`."""
+
+    def __init__(self, title: str):
+        self._parts = [f"<h1>{escape(title)}</h1>"]
+        self._title = title
+
+    def section(self, title: str) -> None:
+        """A heading."""
+        self._parts.append(f"<h2>{escape(title)}</h2>")
+
+    def text(self, text: str) -> None:
+        """A paragraph."""
+        self._parts.append(f"<p>{escape(text)}</p>")
+
+    def warning(self, text: str) -> None:
+        """A paragraph that stands out."""
+        self._parts.append(f'<p class="warning">⚠ {escape(text)}</p>')
+
+    def table(self, header: Sequence[object], rows: Iterable[Sequence[object]], folded: str = "") -> None:
+        """A table, one text or number a cell. `folded`: what is shown in its place until it is clicked on."""
+        lines = ["".join(f"<th>{escape(str(cell))}</th>" for cell in header)]
+        lines += ["".join(f"<td>{escape(str(cell))}</td>" for cell in row) for row in rows]
+        table = "<table>" + "".join(f"<tr>{line}</tr>\n" for line in lines) + "</table>"
+        self._parts.append(f"<details><summary>{escape(folded)}</summary>{table}</details>" if folded else table)
+
+    def pictures(self, pictures: Iterable[tuple[str, np.ndarray]], width: int = 240) -> None:
+        """A row of pictures (caption, (H, W, 3)), each shown `width` CSS pixels wide."""
+        self._parts.append('<div class="row">')
+        for caption, array in pictures:
+            small = ' class="small"' if array.shape[1] < width else ""
+            self._image(_encode(array), caption, f'{small} width="{width}"')
+        self._parts.append("</div>")
+
+    def figure(self, figure, caption: str = "") -> None:
+        """A `matplotlib.figure.Figure`; its background is the page's, its text and axes should be ``GREY``."""
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="png", dpi=150, transparent=True)
+        self._image(_uri("png", buffer.getvalue()), caption, f' width="{int(96 * figure.get_figwidth())}"')
+
+    def curves(self, title: str, curves: Mapping[str, tuple[Sequence[float], Sequence[float]]], xlabel: str = "",
+               ylabel: str = "", log: bool = False) -> None:
+        """Curves (xs, ys) by name in one diagram; `log`: of the y axis. NaN leaves a gap."""
+        figure = new_figure(7.5, 3.0)
+        axes = figure.add_subplot()
+        plain(axes)
+        for name, (xs, ys) in curves.items():
+            axes.plot(xs, ys, label=_literal(name), color=COLOURS.get(name), linewidth=1.4,
+                      marker="." if len(xs) <= 100 else None)
+        axes.set(xlabel=xlabel, ylabel=ylabel)
+        if log:
+            from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+
+            axes.set_yscale("log")
+            axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axes.yaxis.set_minor_locator(NullLocator())
+            axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.set_title(_literal(title), color=GREY, fontsize=11)
+        if len(curves) > 1:
+            axes.legend(frameon=False, labelcolor=GREY)
+        self.figure(figure)
+
+    def html(self) -> str:
+        """The page so far."""
+        return ('<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">\n'
+                f'<meta name="viewport" content="width=device-width">\n<title>{escape(self._title)}</title>\n'
+                f"<style>{_STYLE}</style></head>\n<body>\n" + "\n".join(self._parts) + "\n</body></html>\n")
+
+    def write(self, path: Path) -> None:
+        """Write the page to `path`, whole or not at all. Raises MiNtfError."""
+        files.write(path, self.html())
+
+    def _image(self, uri: str, caption: str, attributes: str) -> None:
+        caption = escape(caption)
+        self._parts.append(f'<figure><img src="{uri}" alt="{caption}"{attributes}>'
+                           f"<figcaption>{caption}</figcaption></figure>")
+
+
+def new_figure(width: float, height: float):
+    """An empty `matplotlib.figure.Figure` of `width` x `height` inches (96 CSS pixels each), on no screen."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def plain(axes) -> None:
+    """Make the lines and texts of matplotlib `axes` ``GREY``."""
+    axes.set_facecolor("none")
+    axes.tick_params(colors=GREY, which="both", labelsize=8)
+    for spine in axes.spines.values():
+        spine.set_color(GREY)
+    for label in (axes.xaxis.label, axes.yaxis.label, axes.title):
+        label.set_color(GREY)
+        label.set_fontsize(9)
+    axes.grid(True, color=GREY, alpha=0.2)
+
+
+def _encode(array: np.ndarray) -> str:
+    """Data URI of a picture (H, W, 3): linear light as floats, or sRGB levels."""
+    from PIL import Image
+
+    if array.ndim != 3 or array.shape[2] != 3:
+        raise ValueError(f"a picture has shape (H, W, 3), found {array.shape}")
+    if array.dtype != np.uint8:
+        array = levels(np.nan_to_num(array, nan=0.0, posinf=1.0))
+    kind, options = ("png", {}) if array.shape[0] * array.shape[1] <= SMALL else ("jpeg", {"quality": 90})
+    buffer = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(array)).save(buffer, kind, **options)
+    return _uri(kind, buffer.getvalue())
+
+
+def _literal(text: str) -> str:
+    """`text` for matplotlib, which takes what stands between two dollars for a formula."""
+    return text.replace("$", r"\$")
+
+
+def _uri(kind: str, content: bytes) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"

@@ -1,0 +1,237 @@
+"""`mi-ntf inspect`: its numbers on a set where they are known, its warnings, and the page of every form."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from data import forms
+from data.test_page import pictures
+from PIL import Image
+
+from mi_ntf.core.errors import MiNtfError
+from mi_ntf.data import inspect_figures, measures, silhouettes
+from mi_ntf.data.capture import camera_to_world
+from mi_ntf.data.images import LINEAR
+from mi_ntf.data.inspect import inspect, print_table
+from mi_ntf.data.schema import Camera, Split, View
+
+AXES = np.concatenate([np.eye(3), -np.eye(3)])
+DISTANCE, FOCAL, SIDE, LEVEL, INTENSITY = 5.0, 50.0, 40, 100, 30.0
+SEEN = LINEAR[LEVEL]
+
+
+def six(**changes) -> dict[str, Split]:
+    """A grey square of 20 x 20 of 40 x 40 pixels seen from the six ends of the axes, the first three for training twice
+    as often; the sphere has radius 2."""
+    images = np.zeros((6, SIDE, SIDE, 4), np.uint8)
+    images[:, 10:30, 10:30] = (LEVEL, LEVEL, LEVEL, 255)
+    c2w = np.stack([camera_to_world(DISTANCE * axis, np.zeros(3)) for axis in AXES])
+    train = Split(images, c2w, np.full((6, 2), FOCAL), np.full((6, 2), SIDE / 2), c2w[:, :3, 3].astype(np.float32),
+                  np.full((6, 3), INTENSITY, np.float32), np.zeros(3), 2.0, tuple(f"{i}.png" for i in range(6)),
+                  calibrated=False)
+    train = dataclasses.replace(train, **changes)
+    return {"train": train, "test": dataclasses.replace(
+        train, images=train.images[:1], c2w=train.c2w[:1], focal=train.focal[:1], principal=train.principal[:1],
+        light_pos=train.light_pos[:1], light_intensity=train.light_intensity[:1], names=("test.png",))}
+
+
+def of(splits: dict[str, Split]) -> tuple[dict, list[measures.Photograph], str]:
+    rows = measures.measure(splits)
+    found = measures.numbers(splits, rows)
+    return found, rows, "\n".join(measures.warnings(found, rows))
+
+
+def changed(**changes) -> tuple[dict, list[measures.Photograph], str]:
+    return of(six(**changes))
+
+
+def test_numbers_of_an_even_set():
+    found, rows, warned = changed()
+    assert [row.name for row in rows] == [*(f"{i}.png" for i in range(6)), "test.png"]
+    assert found["photographs"] == {"train": 6, "test": 1} and (found["width"], found["height"]) == (SIDE, SIDE)
+    assert found["coverage"] == {"least": 0.25, "median": 0.25, "most": 0.25} and found["unknown"] == 0
+    assert found["brightness"]["mean"] == pytest.approx(3 * [np.pi * SEEN * DISTANCE**2 / INTENSITY], rel=1e-6)
+    assert found["brightness"]["ratio"] == pytest.approx([1, 1, 1])
+    assert found["saturated"] == found["black"] == 0
+    assert found["distance"]["median"] == pytest.approx(DISTANCE / 2)
+    assert found["pixel"]["median"] == pytest.approx(DISTANCE / FOCAL / 2)
+    assert found["flash_degrees"]["most"] == pytest.approx(0, abs=1e-3)
+    assert found["gap"]["degrees"] == pytest.approx(np.degrees(np.arccos(1 / np.sqrt(3))), abs=0.05)  # a cube's corner
+    assert found["uncovered"]["most"] == 0
+    assert warned.splitlines() == [
+        "6 photographs for training are few: 60 or more from all sides make a field without holes.",
+        "The object's sphere is 40 pixels wide, which shows little detail; use larger photographs."]
+    json.dumps(found)
+
+
+def test_one_photograph_brighter_and_bluer():
+    images = six()["train"].images.copy()
+    images[2, 10:30, 10:30, :3] = (150, 150, 200)
+    found, _, warned = changed(images=images)
+    assert found["brightness"]["ratio"] == pytest.approx(
+        [LINEAR[150] / SEEN, LINEAR[150] / SEEN, LINEAR[200] / SEEN], rel=1e-5)
+    assert found["white_balance"]["red_over_green"] == pytest.approx(1)
+    assert found["white_balance"]["blue_over_green"] == pytest.approx(LINEAR[200] / LINEAR[150], rel=1e-5)
+    assert "brightness in blue differs 4.53-fold between 0.png and 2.png" in warned
+    assert "red or blue over green, differs 1.89-fold" in warned
+    assert "differs" not in changed(images=images, calibrated=True)[2]  # the set says how bright each flash was
+
+
+def test_brightness_allows_for_distance_and_intensity():
+    """Twice as far is a quarter as bright, and no fault."""
+    train = six()["train"]
+    images, c2w, intensity = train.images.copy(), train.c2w.copy(), train.light_intensity.copy()
+    images = np.where(np.arange(4) < 3, LINEAR[images], images / 255).astype(np.float32)
+    c2w[1, :3, 3] *= 2
+    images[1, ..., :3] /= 4
+    intensity[2] *= 3
+    images[2, ..., :3] *= 3
+    found, rows, _ = changed(images=images, c2w=c2w, light_pos=c2w[:, :3, 3], light_intensity=intensity)
+    assert found["brightness"]["ratio"] == pytest.approx([1, 1, 1], rel=1e-6)
+    assert rows[1].mean == pytest.approx(rows[0].mean / 4)
+    assert found["distance"] == pytest.approx({"least": 2.5, "median": 2.5, "most": 5})
+    assert found["saturated"] is None  # a linear file's white is not known
+
+
+def test_saturated_and_black_pixels():
+    images = six()["train"].images.copy()
+    images[3, 10:15, 10:30, 1] = 250  # a quarter of one of seven
+    images[4, 10:30, 10:20, :3] = 4
+    images[:, 0, 0, :3] = 255  # outside of the mask
+    found, rows, warned = changed(images=images)
+    assert rows[3].saturated == 0.25 and found["saturated"] == pytest.approx(0.25 / 7)
+    assert rows[4].black == 0.5 and found["black"] == pytest.approx(0.5 / 7)
+    assert "3.57 % of the object's pixels are saturated" in warned and "nearly black" not in warned
+    images[:, 10:30, 10:20, :3] = 4
+    assert "50 % of the object's pixels are nearly black" in changed(images=images)[2]
+    linear = np.where(np.arange(4) < 3, LINEAR[images], images / 255).astype(np.float16)
+    linear[3, 10, 29, 0] = 1  # clipped at 1, as a linear TIFF
+    assert changed(images=linear)[1][3].saturated == pytest.approx(0.125)  # of levels 250 those that are not black
+
+
+def test_the_direction_nobody_photographed():
+    train = six()["train"]
+    kept = slice(0, 5)
+    few = dataclasses.replace(train, images=train.images[kept], c2w=train.c2w[kept], focal=train.focal[kept],
+                              principal=train.principal[kept], light_pos=train.light_pos[kept],
+                              light_intensity=train.light_intensity[kept], names=train.names[kept])
+    found, _, warned = of({"train": few, "test": six()["test"]})
+    assert found["gap"]["degrees"] == pytest.approx(90, abs=0.1)
+    np.testing.assert_allclose(found["gap"]["direction"], [0, 0, -1], atol=0.002)
+    assert "No camera for training is within 90° of the direction" in warned
+
+
+def test_flash_beside_the_lens():
+    train = six()["train"]
+    angle = np.radians(18)
+    beside = train.light_pos * np.cos(angle) + DISTANCE * np.sin(angle) * np.roll(AXES, 1, axis=1)
+    found, _, _ = changed(light_pos=beside.astype(np.float32))
+    assert found["flash_degrees"]["least"] == pytest.approx(18, abs=1e-3)
+    assert found["flash_degrees"]["most"] == pytest.approx(18, abs=1e-3)
+
+
+def test_small_objects_and_inverted_masks():
+    images = six()["train"].images.copy()
+    images[:, :, :18, 3] = 0
+    images[:, :, 22:, 3] = 0
+    assert "covers 5 % of a photograph" in changed(images=images)[2]
+    images[..., 3] = 255
+    assert "masks cover 100 % of a photograph" in changed(images=images)[2]
+
+
+def test_a_black_background_knows_less():
+    images = six()["train"].images.copy()
+    images[:, 5:35, 5:35, 3] = 128
+    images[:, 10:30, 10:30, 3] = 255
+    found, _, _ = changed(images=images, masked=False)
+    assert found["coverage"]["most"] == 0.25 and found["unknown"] == pytest.approx((900 - 400) / 1600)
+    assert found["brightness"]["mean"] == pytest.approx(3 * [np.pi * SEEN * DISTANCE**2 / INTENSITY], rel=1e-6)
+
+
+def test_masks_that_disagree():
+    """One mask of twice the others' width: the hull of the others is 1 to 1.2 half a side wide, at depths of 4 to 6."""
+    images = six()["train"].images.copy()
+    images[4, :, :, 3] = 255
+    _, rows, warned = changed(images=images)
+    assert 1 - (32 / 40) ** 2 < rows[4].uncovered < 1 - (20 / 40) ** 2
+    assert max(row.uncovered for i, row in enumerate(rows) if i != 4) == 0
+    assert "% of the silhouette in 4.png lies outside of what the other photographs leave" in warned
+
+
+def test_poses_that_disagree():
+    c2w = six()["train"].c2w.copy()
+    c2w[:, :3, 3] += np.roll(AXES, 1, axis=1)  # each half a square aside
+    found, _, warned = changed(c2w=c2w)
+    assert found["uncovered"]["median"] > 0.1 and "the poses are inexact, or the masks unlike" in warned
+
+
+def test_photographs_to_compare_are_evenly_chosen():
+    assert silhouettes.chosen(3).tolist() == [0, 1, 2]
+    many = silhouettes.chosen(500)
+    assert len(many) == silhouettes.VIEWS and many[0] == 0 and many[-1] == 499 and np.ptp(np.diff(many)) <= 1
+
+
+def test_a_thumbnail_shows_mask_and_background(tmp_path):
+    split, path = six()["train"], tmp_path / "whole.png"
+    whole = np.full((SIDE, SIDE, 3), 200, np.uint8)
+    whole[10:30, 10:30] = LEVEL
+    Image.fromarray(whole).save(path)
+    view = View("", path, "whole.png", [], split.c2w[0], Camera(FOCAL, FOCAL, SIDE / 2, SIDE / 2))
+    shown = inspect_figures.thumbnail(split, 0, view, 1.0)
+    assert shown.shape == (240, 240, 3)  # each pixel six times
+    np.testing.assert_array_equal(shown[60, 60:180], np.broadcast_to(inspect_figures.OUTLINE, (120, 3)))
+    np.testing.assert_array_equal(shown[61, 61], 3 * [LEVEL])
+    assert (shown[30, 30] > 90).all() and (shown[30, 30] < 140).all()  # 0.3 of it in linear light
+    linear = dataclasses.replace(view, image=tmp_path / "whole.exr")  # not 8-bit: what is stored, black without
+    shown = inspect_figures.thumbnail(split, 0, linear, 1.0)
+    assert (shown[30, 30] < 60).all() and (shown[90, 90] == LEVEL).all()
+
+
+def test_a_thumbnail_of_a_bent_lens(tmp_path):
+    """The pinhole's pixel at x shows what the lens put at 8.5 (1 + k r²), r = 8.5 / 50, from the middle."""
+    split, path = six()["train"], tmp_path / "bent.png"
+    Image.fromarray(np.broadcast_to(5 * np.arange(SIDE)[:, None], (SIDE, SIDE, 3)).astype(np.uint8)).save(path)
+    bent = Camera(FOCAL, FOCAL, SIDE / 2, SIDE / 2, (4.0, 0.0, 0.0, 0.0))
+    shown = inspect_figures.thumbnail(split, 0, View("", path, "bent.png", [], split.c2w[0], bent), 1.0)
+    there = SIDE / 2 + 8.5 * (1 + 4 * (8.5 / FOCAL) ** 2)
+    assert shown[120, 168] == pytest.approx(5 * (there - 0.5), abs=2)  # 8-bit, resampled: a level or two
+
+
+def test_a_thumbnail_before_a_black_background():
+    images = six()["train"].images.copy()
+    images[..., :3] = 40
+    images[:, 5:35, 5:35, 3], images[:, 10:30, 10:30, 3] = 128, 255
+    shown = inspect_figures.thumbnail(six(images=images, masked=False)["train"], 0, None, 1.0)[::6, ::6].astype(int)
+    assert shown[20, 20].tolist() == [40, 40, 40] and shown[10, 15].tolist() == list(inspect_figures.OUTLINE)
+    assert shown[7, 20][0] > shown[7, 20][2] + 30  # not known: orange
+    assert shown[2, 20][2] > shown[2, 20][0] + 10  # empty: bluish
+
+
+FORMS = (forms.capture, forms.blender, forms.nrhints, forms.colmap, forms.nerfstudio, forms.llff)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_every_form(tmp_path, monkeypatch, form, capsys):
+    monkeypatch.chdir(tmp_path)
+    found = inspect(form(tmp_path / "set"))
+    page = (tmp_path / "set-inspect.html").read_text(encoding="utf-8")
+    assert found["page"] == "set-inspect.html" and capsys.readouterr().out == ""  # --json prints JSON alone
+    assert sum(found["photographs"].values()) == forms.VIEWS == len(found["views"])
+    assert found["distance"]["median"] == pytest.approx(3.2 / found["sphere"]["radius"], rel=0.1)
+    assert found["uncovered"]["most"] < 0.02
+    assert len(pictures(page)) == 2 + 12 + 1
+    for text in [*found["said"], *found["warnings"]]:
+        assert text.split("'")[0][:40] in page
+    print_table(json.loads(json.dumps(found)))
+    printed = capsys.readouterr().out
+    assert "warning: 13 photographs" in printed or "warning: 14 photographs" in printed
+    assert printed.endswith("set-inspect.html\n")
+
+
+def test_a_page_that_cannot_be_written_is_told_before_the_work(tmp_path):
+    with pytest.raises(MiNtfError, match=r"cannot write .*page.html: folder .* does not exist"):
+        inspect(tmp_path / "no set", tmp_path / "nowhere" / "page.html")
+    with pytest.raises(MiNtfError, match=r"no set does not exist"):
+        inspect(tmp_path / "no set", tmp_path / "page.html")
+    assert list(tmp_path.iterdir()) == []
