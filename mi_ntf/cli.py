@@ -43,6 +43,8 @@ class Capture:
     """Samples per pixel."""
     seed: int = 0
     """Seed of view directions and samples."""
+    flash_offset: Annotated[str | None, arg(metavar="R,U,F")] = None
+    """Flash beside the lens: right,up,forward of it in scene lengths."""
 
     def run(self) -> None:
         from mi_ntf.data.capture import capture
@@ -55,6 +57,7 @@ class Capture:
             test_views=self.test_views,
             spp=self.spp,
             seed=self.seed,
+            flash_offset=_offset(self.flash_offset) or (0.0, 0.0, 0.0),
         )
 
 
@@ -63,7 +66,7 @@ class Train:
     """Train a field and its transmittance network on a data set."""
 
     dataset: Positional[Path]
-    """Folder with transforms_train.json."""
+    """Photographs: a capture, NeRF-synthetic, NRHints, nerfstudio (transforms.json), LLFF or COLMAP."""
     output: Output
     """Field file to write."""
     preset: str = "fast"
@@ -80,6 +83,16 @@ class Train:
     """Learn transmittance on camera rays alone."""
     no_colour_loss: bool = False
     """Do not compare pixels lit by the learned transmittance with the photographs."""
+    size: int | None = None
+    """Scale photographs to so many pixels along their longer side, in linear light."""
+    masks: Path | None = None
+    """Folder of masks, named as the photographs (white: object)."""
+    background: str | None = None
+    """black: no masks, the photographs were taken with a flash in a dark room."""
+    flash_offset: Annotated[str | None, arg(metavar="R,U,F")] = None
+    """Flash beside the lens: right,up,forward of it in the data set's lengths, or `estimate`."""
+    no_gains: bool = False
+    """All photographs have one exposure and white balance, although the flash's intensity is not known."""
     no_bounces: bool = False
     """The photographs hold no light that the object throws on itself, as renderings with one bounce."""
     no_fresnel: bool = False
@@ -96,15 +109,46 @@ class Train:
     def run(self) -> None:
         if self.minutes is not None and self.steps is not None:
             raise UsageError("give --minutes or --steps, not both")
+        estimate = self.flash_offset == "estimate"
+        offset = None if estimate else _offset(self.flash_offset)
+        reading = {"size": self.size, "masks": self.masks, "background": self.background, "flash_offset": offset}
         from mi_ntf.train import train
 
         report = train(self.dataset, self.output, preset=self.preset, minutes=self.minutes, steps=self.steps,
                        seed=self.seed, tensorboard=self.tensorboard, field=self.field, ntf=self.ntf,
                        augmentation=not self.no_augmentation, colour_loss=not self.no_colour_loss,
+                       reading=reading, estimate=estimate, gains=not self.no_gains,
                        visibility_mlp=self.visibility_mlp, bounces=not self.no_bounces,
                        fresnel=not self.no_fresnel)
         if report:  # under torchrun, only the first process has one
             _report(report, self.json, _print_training)
+
+
+@dataclass
+class Inspect:
+    """Show a data set before training: cameras, masks, brightness, and what will harm."""
+
+    dataset: Positional[Path]
+    """Folder of photographs, in any form that `train` reads."""
+    output: Annotated[Path | None, arg(aliases=("-o",), metavar="FILE")] = None
+    """HTML page to write; DIR-inspect.html here unless given."""
+    size: int | None = None
+    """Scale photographs to so many pixels along their longer side."""
+    masks: Path | None = None
+    """Folder of masks, named as the photographs (white: object)."""
+    background: str | None = None
+    """black: no masks, a flash in a dark room."""
+    flash_offset: Annotated[str | None, arg(metavar="R,U,F")] = None
+    """Flash beside the lens: right,up,forward of it."""
+    json: bool = False
+    """Print JSON in place of a summary."""
+
+    def run(self) -> None:
+        offset = _offset(self.flash_offset)
+        from mi_ntf.data.inspect import inspect, print_table
+
+        _report(inspect(self.dataset, self.output, size=self.size, masks=self.masks, background=self.background,
+                        flash_offset=offset), self.json, print_table)
 
 
 @dataclass
@@ -246,6 +290,7 @@ class Doctor:
 
 Command = (
     Annotated[Capture, subcommand("capture")]
+    | Annotated[Inspect, subcommand("inspect")]
     | Annotated[Train, subcommand("train")]
     | Annotated[Swap, subcommand("swap")]
     | Annotated[Render, subcommand("render")]
@@ -283,6 +328,18 @@ def parse(words: list[str]) -> Any:
     if words[:1] == ["render"]:  # its flags belong to another parser
         return Render(tuple(words[1:]))
     return tyro.cli(Command, prog="mi-ntf", description=__doc__, args=words, config=(tyro.conf.FlagCreatePairsOff,))
+
+
+def _offset(text: str | None) -> tuple[float, float, float] | None:
+    """Right, up, forward of the lens."""
+    if text is None:
+        return None
+    try:
+        right, up, forward = map(float, text.split(","))
+    except ValueError:
+        raise UsageError(f"--flash-offset is '{text}', expected three numbers right,up,forward (write "
+                         "--flash-offset=-1,2,0 where the first is negative)") from None
+    return right, up, forward
 
 
 def _definitions(items: Sequence[str]) -> dict[str, str]:

@@ -29,6 +29,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list:
 
     table = {"psnr": 30.5, "inner": {"a": 1}}
     stand_in("mi_ntf.data.capture", capture=note())
+    stand_in("mi_ntf.data.inspect", inspect=note(table), print_table=lambda values: print("table", values["psnr"]))
     stand_in("mi_ntf.train", train=note(table))
     stand_in("mi_ntf.render.swap", swap=note())
     stand_in("mi_ntf.evaluate.compare", compare=note(table), print_table=lambda values: print("table", values["psnr"]))
@@ -43,14 +44,20 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list:
         (
             "capture s.xml data --views 7 --size 32",
             (Path("s.xml"), Path("data")),
-            {"views": 7, "size": 32, "test_views": 20, "spp": 64, "seed": 0},
+            {"views": 7, "size": 32, "test_views": 20, "spp": 64, "seed": 0, "flash_offset": (0.0, 0.0, 0.0)},
+        ),
+        (
+            "capture s.xml data --flash-offset=-1,2e-1,0",
+            (Path("s.xml"), Path("data")),
+            {"views": 100, "size": 128, "test_views": 20, "spp": 64, "seed": 0, "flash_offset": (-1.0, 0.2, 0.0)},
         ),
         (
             "train data -o f.safetensors --minutes 2.5",
             (Path("data"), Path("f.safetensors")),
             {"preset": "fast", "minutes": 2.5, "steps": None, "seed": 0, "tensorboard": None, "field": None,
              "ntf": None, "augmentation": True, "colour_loss": True, "visibility_mlp": False,
-             "bounces": True, "fresnel": True},
+             "bounces": True, "fresnel": True, "gains": True, "estimate": False,
+             "reading": {"size": None, "masks": None, "background": None, "flash_offset": None}},
         ),
         (
             "train data -o f --steps 9 --field g --ntf ray --no-augmentation --no-colour-loss --no-bounces "
@@ -58,7 +65,34 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list:
             (Path("data"), Path("f")),
             {"preset": "fast", "minutes": None, "steps": 9, "seed": 0, "tensorboard": None, "field": Path("g"),
              "ntf": "ray", "augmentation": False, "colour_loss": False, "visibility_mlp": True,
-             "bounces": False, "fresnel": False},
+             "bounces": False, "fresnel": False, "gains": True, "estimate": False,
+             "reading": {"size": None, "masks": None, "background": None, "flash_offset": None}},
+        ),
+        (
+            "train data -o f --size 768 --background black --flash-offset estimate --no-gains",
+            (Path("data"), Path("f")),
+            {"preset": "fast", "minutes": None, "steps": None, "seed": 0, "tensorboard": None, "field": None,
+             "ntf": None, "augmentation": True, "colour_loss": True, "visibility_mlp": False,
+             "bounces": True, "fresnel": True, "gains": False, "estimate": True,
+             "reading": {"size": 768, "masks": None, "background": "black", "flash_offset": None}},
+        ),
+        (
+            "train data -o f --masks m --flash-offset 0.1,0.2,-0.3",
+            (Path("data"), Path("f")),
+            {"preset": "fast", "minutes": None, "steps": None, "seed": 0, "tensorboard": None, "field": None,
+             "ntf": None, "augmentation": True, "colour_loss": True, "visibility_mlp": False,
+             "bounces": True, "fresnel": True, "gains": True, "estimate": False,
+             "reading": {"size": None, "masks": Path("m"), "background": None, "flash_offset": (0.1, 0.2, -0.3)}},
+        ),
+        (
+            "inspect data",
+            (Path("data"), None),
+            {"size": None, "masks": None, "background": None, "flash_offset": None},
+        ),
+        (
+            "inspect data -o p.html --size 64 --masks m --background black --flash-offset=-1,0,2",
+            (Path("data"), Path("p.html")),
+            {"size": 64, "masks": Path("m"), "background": "black", "flash_offset": (-1.0, 0.0, 2.0)},
         ),
         ("swap s.xml f.safetensors -o out.xml", (Path("s.xml"), Path("f.safetensors"), Path("out.xml")), {}),
         ("compare a.exr b.exr", (Path("a.exr"), Path("b.exr")), {}),
@@ -72,7 +106,8 @@ def test_commands_pass_their_arguments_on(calls: list, line: str, args: tuple, k
     assert calls == [(args, kwargs)]
 
 
-@pytest.mark.parametrize("line", ["compare a b --json", "train d -o f --json", "explain s.xml --json", "info f --json"])
+@pytest.mark.parametrize("line", ["compare a b --json", "train d -o f --json", "explain s.xml --json", "info f --json",
+                                  "inspect d --json"])
 def test_json(calls: list, line: str, capsys: pytest.CaptureFixture[str]):
     assert cli.main(line.split()) == 0
     assert json.loads(capsys.readouterr().out) == {"psnr": 30.5, "inner": {"a": 1}}
@@ -86,6 +121,10 @@ def test_json(calls: list, line: str, capsys: pytest.CaptureFixture[str]):
         "train",
         "capture s.xml data --views many",
         "train data -o f --minutes 1 --steps 5",
+        "train data -o f --flash-offset 1,2",
+        "train data -o f --flash-offset up",
+        "capture s.xml data --flash-offset estimate",
+        "inspect data --flash-offset estimate",
         "explain s.xml -D spp",
         "render",
         "render -D spp scene.xml",

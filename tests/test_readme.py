@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from data import forms
 from helpers.programs import run_program
 
 ROOT = Path(__file__).parents[1]
@@ -18,7 +19,8 @@ CAPTURE = {"--views": "12", "--size": "24", "--test-views": "1", "--spp": "2"}
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """The shipped scenes, a mesh scene of one's own, and two images, as the README's commands expect them."""
+    """The shipped scenes, a mesh scene of one's own, photographs with a COLMAP model, and two images, as the README's
+    commands expect them."""
     folder = tmp_path_factory.mktemp("readme")
     shutil.copytree(ROOT / "scenes", folder / "scenes")
     sys.path.insert(0, str(ROOT / "examples"))
@@ -27,6 +29,7 @@ def folder(tmp_path_factory):
     finally:
         sys.path.pop(0)
     (folder / "scene.xml").write_text(BOXES)
+    forms.colmap(folder / "skull_flash")
     shutil.copy(ROOT / "scenes/statue/reference_point.exr", folder / "a.exr")
     shutil.copy(ROOT / "scenes/statue/reference_env.exr", folder / "reference.exr")
     return folder
@@ -72,7 +75,7 @@ def test_command(folder, words):
 
 def test_every_command_is_shown():
     shown = {words[1] if words[0] == "mi-ntf" else words[0] for words in COMMANDS}
-    assert shown == {"capture", "train", "swap", "mitsuba", "info", "compare", "explain", "bake", "make"}
+    assert shown == {"capture", "inspect", "train", "swap", "mitsuba", "info", "compare", "explain", "bake", "make"}
 
 
 def test_names_in_the_table_are_the_plugins(folder):

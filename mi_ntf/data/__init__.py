@@ -1,2 +1,2 @@
-"""Data sets of collocated photographs: the format (`schema`), everything that is read (`readers`), and the virtual
+"""Data sets of photographs with a flash: the format (`schema`), everything that is read (`readers`), and the virtual
 camera that makes them (`capture`)."""

@@ -28,42 +28,48 @@ def bounding_sphere(points: np.ndarray) -> tuple[np.ndarray, float]:
     return best, radius
 
 
-def find(alpha: np.ndarray, c2w: np.ndarray, focal: np.ndarray, principal: np.ndarray,
-         points: np.ndarray | None) -> tuple[np.ndarray, float, str]:
+def find(images: np.ndarray, c2w: np.ndarray, focal: np.ndarray, principal: np.ndarray,
+         points: np.ndarray | None, alpha: str = "masks") -> tuple[np.ndarray, float, str]:
     """``(center (3,), radius, how)`` of the object's sphere in world units.
 
-    alpha (N, H, W) · c2w (N, 4, 4) · focal, principal (N, 2) pixels · points (P, 3) or None. Raises MiNtfError.
+    images (N, H, W, 4) as stored · c2w (N, 4, 4) · focal, principal (N, 2) pixels · points (P, 3) or None · `alpha`:
+    what it is, for `how`. Raises MiNtfError.
     """
-    if (alpha < COVERED).mean() > 0.01:
-        return *from_masks(alpha >= COVERED, c2w, focal, principal), "from the masks' visual hull"
-    size = np.array(alpha.shape[:0:-1])
+    size = np.array(images.shape[2:0:-1])
+    empty = sum(int(np.count_nonzero(~covered(image))) for image in images)
+    if empty > 0.01 * len(images) * size.prod():
+        return *from_masks(images, c2w, focal, principal), f"from the {alpha}' visual hull"
     if points is not None and len(points) >= 10:
         sphere = from_points(points, size, c2w, focal, principal)
         if sphere is not None:
             return *sphere, "from the reconstructed points"
-    return *from_cameras(size, c2w, focal), "from the cameras alone, as the masks cover everything"
+    return *from_cameras(size, c2w, focal), f"from the cameras alone, as the {alpha} cover everything"
 
 
-def from_masks(covered: np.ndarray, c2w: np.ndarray, focal: np.ndarray, principal: np.ndarray):
-    """Sphere around the visual hull of masks (N, H, W) bool. The hull holds the object, and so does the sphere."""
-    center, reach = _first_guess(covered, c2w, focal, principal)
-    counts = np.zeros((len(covered), covered.shape[1] + 1, covered.shape[2] + 1), np.int32)
-    for count, mask in zip(counts, covered, strict=True):  # summed-area tables: any window's pixels in four look-ups
-        count[1:, 1:] = mask.astype(np.int32).cumsum(0).cumsum(1)
+def covered(image: np.ndarray) -> np.ndarray:
+    """Which pixels of an image (H, W, 4) as stored may show the object, (H, W) bool."""
+    return image[..., 3] >= COVERED * (255 if image.dtype == np.uint8 else 1)
+
+
+def from_masks(images: np.ndarray, c2w: np.ndarray, focal: np.ndarray, principal: np.ndarray):
+    """Sphere around the visual hull of what is :func:`covered` in images (N, H, W, 4). The hull holds the object, and
+    so does the sphere."""
+    center, reach = _first_guess(images, c2w, focal, principal)
     low, high = center - reach, center + reach
     for cells in (32, 64):  # once to find the box, once inside it
         edge = float((high - low).max()) / cells
         shape = np.ceil((high - low) / edge - 1e-9).astype(int)
-        kept = _carve(low, edge, shape, counts, c2w, focal, principal)
+        kept = _carve(low, edge, shape, images, c2w, focal, principal)
         low, high = kept.min(0) - edge, kept.max(0) + edge
     center, radius = bounding_sphere(_shell(kept))
     return center, MARGIN * (radius + 0.5 * np.sqrt(3) * edge)
 
 
-def _first_guess(covered: np.ndarray, c2w: np.ndarray, focal: np.ndarray, principal: np.ndarray):
+def _first_guess(images: np.ndarray, c2w: np.ndarray, focal: np.ndarray, principal: np.ndarray):
     """Centre of a cube that holds the object, and half its edge: where rays through the masks' middles meet."""
     middles, slopes = [], []
-    for i, mask in enumerate(covered):
+    for i, image in enumerate(images):
+        mask = covered(image)
         rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
         box = np.array([[columns[0], rows[0]], [columns[-1] + 1, rows[-1] + 1]])
         plane = (box - principal[i]) / focal[i] * (1, -1)
@@ -78,7 +84,7 @@ def _first_guess(covered: np.ndarray, c2w: np.ndarray, focal: np.ndarray, princi
     return center, 1.5 * float(np.quantile(distance * slopes, 0.9))
 
 
-def _carve(low: np.ndarray, edge: float, shape: np.ndarray, counts: np.ndarray, c2w, focal, principal) -> np.ndarray:
+def _carve(low: np.ndarray, edge: float, shape: np.ndarray, images: np.ndarray, c2w, focal, principal) -> np.ndarray:
     """Centres (K, 3) of the cells that no photograph shows empty and that at least half of them show at all.
 
     A mask that keeps clear of its image's border shows the whole object: outside of such an image all is empty.
@@ -86,10 +92,11 @@ def _carve(low: np.ndarray, edge: float, shape: np.ndarray, counts: np.ndarray, 
     axes = [low[k] + edge * (np.arange(shape[k]) + 0.5) for k in range(3)]
     x = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     seen = np.zeros(len(x), np.int32)
-    height, width = counts.shape[1] - 1, counts.shape[2] - 1
-    within = counts[:, -2, -2] - counts[:, 1, -2] - counts[:, -2, 1] + counts[:, 1, 1]
-    whole = within == counts[:, -1, -1]
-    for i, (count, clear, pose, f, c) in enumerate(zip(counts, whole, c2w, focal, principal, strict=True)):
+    height, width = images.shape[1:3]
+    for i, (image, pose, f, c) in enumerate(zip(images, c2w, focal, principal, strict=True)):
+        count = np.zeros((height + 1, width + 1), np.int32)  # summed-area table: any window's pixels in four look-ups
+        count[1:, 1:] = covered(image).cumsum(0, np.int32).cumsum(1, np.int32)
+        clear = count[-2, -2] - count[1, -2] - count[-2, 1] + count[1, 1] == count[-1, -1]
         local = (x - pose[:3, 3]) @ pose[:3, :3]
         depth = -local[:, 2]
         front = depth > edge

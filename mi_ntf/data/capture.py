@@ -1,9 +1,10 @@
 """A virtual camera with a flash: photographs any ordinary Mitsuba scene, surfaces or media, into a data set (`schema`).
 
-Every view has a point light exactly at the camera (collocated capture, method of Bi et al. 2020), so that the light's
-transmittance is the view's: a medium of density σ dims it twice, L = ∫ σ_s f T² I/t² dt. Alpha is the opacity: the
-share of paths that meet matter. The scene's own sensors and emitters are left out; its shapes, media, materials and,
-where it suits them, its integrator are kept. The one file of `data` that uses Mitsuba.
+Every view has a point light exactly at the camera (collocated capture, method of Bi et al. 2020), or at one place
+beside it, as flashes are. At the camera the light's transmittance is the view's: a medium of density σ dims it twice,
+L = ∫ σ_s f T² I/t² dt. Alpha is the opacity: the share of paths that meet matter. The scene's own sensors and emitters
+are left out; its shapes, media, materials and, where it suits them, its integrator are kept. The one file of `data`
+that uses Mitsuba.
 """
 
 import hashlib
@@ -127,7 +128,7 @@ def _open_manifest(out: Path, settings: dict) -> None:
     path = out / "capture.json"
     if path.exists():
         try:
-            before = dict(json.loads(path.read_bytes()))
+            before = {"flash_offset": [0.0, 0.0, 0.0]} | dict(json.loads(path.read_bytes()))  # older ones do not say
         except (ValueError, TypeError, RecursionError) as error:
             raise MiNtfError(f"{path}: cannot be read ({error}), so what this folder was captured with is not known; "
                              "use another folder or delete this one") from None
@@ -139,23 +140,28 @@ def _open_manifest(out: Path, settings: dict) -> None:
     files.write(path, json.dumps(settings, indent=1) + "\n")
 
 
-def _plan(counts: dict[str, int], center: np.ndarray, radius: float, seed: int) -> dict[str, list[schema.Frame]]:
-    """The frames of every split; the flash has I = pi d^2: a white diffuse surface at the centre has radiance 1."""
+def _plan(counts: dict[str, int], center: np.ndarray, radius: float, offset: np.ndarray,
+          seed: int) -> dict[str, list[schema.Frame]]:
+    """The frames of every split; the flash, at `offset` from the lens, has I = pi d^2: a white diffuse surface at the
+    centre that faces it has radiance 1."""
     rng = np.random.default_rng(seed)
     distance = DISTANCE * radius
-    intensity = np.full(3, np.pi * distance**2)
+    beside = offset * (1.0, 1.0, -1.0)
+    intensity = np.full(3, np.pi * float(((beside + np.array([0, 0, distance])) ** 2).sum()))
     plan = {}
     for split, count in counts.items():
         poses = [camera_to_world(center + distance * d, center) for d in view_directions(count, rng)]
-        plan[split] = [schema.Frame(f"{split}/{i:04d}.exr", c2w, c2w[:3, 3], intensity) for i, c2w in enumerate(poses)]
+        plan[split] = [schema.Frame(f"{split}/{i:04d}.exr", c2w, c2w[:3, 3] + c2w[:3, :3] @ beside, intensity)
+                       for i, c2w in enumerate(poses)]
     return plan
 
 
 def capture(scene: Path, out: Path, *, views: int = 100, size: int = 128, test_views: int = 20, spp: int = 64,
-            seed: int = 0) -> dict:
+            seed: int = 0, flash_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> dict:
     """Photograph `scene` (Mitsuba XML: surfaces, media) into the data set `out`; resumes what an earlier run began.
 
     `views` train, max(4, views // 20) val and `test_views` test photographs of size x size pixels, `spp` paths a pixel.
+    `flash_offset`: right, up and forward from the lens to the flash, scene lengths.
     Returns center, radius, the number of images rendered and kept, and the seconds taken. Raises MiNtfError for a scene
     that cannot be photographed and for a folder that holds a capture with other settings.
     """
@@ -171,12 +177,16 @@ def capture(scene: Path, out: Path, *, views: int = 100, size: int = 128, test_v
     radius *= MARGIN
     angle = float(2.0 * np.arcsin(1.0 / DISTANCE))
     studio = _studio(shapes, integrator, angle, size)
+    offset = np.array(flash_offset, dtype=np.float64)
+    if offset.shape != (3,) or not np.isfinite(offset).all() or offset[2] > 0.5 * DISTANCE * radius:
+        raise MiNtfError(f"capture: flash_offset is {flash_offset}, must be three finite lengths right,up,forward of "
+                         f"the lens, forward at most half of the way to the object ({DISTANCE * radius:.4g})")
     counts = {"train": views, "val": max(4, views // 20), "test": test_views}
     files.make_folder(out)
     _open_manifest(out, {"scene": Path(scene).name, "object": _fingerprint(studio),
                          "integrator": " ".join(str(studio.integrator()).split()), "views": views, "size": size,
-                         "test_views": test_views, "spp": spp, "seed": seed})
-    plan = _plan(counts, center, radius, seed)
+                         "test_views": test_views, "spp": spp, "seed": seed, "flash_offset": offset.tolist()})
+    plan = _plan(counts, center, radius, offset, seed)
     frames = [frame for split in plan.values() for frame in split]
     params, rendered = mi.traverse(studio), 0
     columns = (TextColumn("capture"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())

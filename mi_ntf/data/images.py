@@ -1,83 +1,135 @@
-"""Image files as linear premultiplied RGBA, colour spaces explicit.
+"""Image files as pixels over black, colour spaces explicit.
 
     EXR          linear; alpha premultiplied, as renderers write it
     PNG, JPEG    8 bit, sRGB; alpha straight (JPEG has none)
-    masks        grey level / 255 is the alpha; black: background. Only used where the image itself has no alpha
+    TIFF         8 bit: as PNG; 16 bit: linear, 65535 is 1, alpha straight; floating point: as EXR
+    masks        grey level / 255 is the alpha; black: background
 
-Pillow and OpenEXR are imported where they are needed.
+Pillow, OpenEXR and OpenCV are imported where they are needed.
 """
 
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from mi_ntf.core import files
-from mi_ntf.core.errors import MiNtfError
+from mi_ntf.core.errors import MiNtfError, shown
 
-SUFFIXES = (".png", ".exr", ".jpg", ".jpeg")
+SUFFIXES = (".png", ".exr", ".jpg", ".jpeg", ".tif", ".tiff")
+MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 _LEVELS = np.arange(256) / 255.0
 LINEAR = np.where(_LEVELS <= 0.04045, _LEVELS / 12.92, ((_LEVELS + 0.055) / 1.055) ** 2.4).astype(np.float32)
 """sRGB's 256 levels in linear light (IEC 61966-2-1)."""
 
 
+def linear(stored: np.ndarray) -> np.ndarray:
+    """Linear premultiplied RGBA (..., 4) float32 of pixels as data sets hold them (..., 4): 8-bit sRGB levels of the
+    colour over black and 255 alpha, or floating-point numbers that are linear already."""
+    if stored.dtype != np.uint8:
+        return stored.astype(np.float32)
+    return np.concatenate([LINEAR[stored[..., :3]], stored[..., 3:] / np.float32(255)], -1)
+
+
+def levels(pixels: np.ndarray) -> np.ndarray:
+    """The 8-bit levels (..., 4) nearest to linear premultiplied RGBA; the inverse of :func:`linear`."""
+    rgb = np.clip(pixels[..., :3], 0, 1)
+    srgb = np.where(rgb <= 0.0031308, 12.92 * rgb, 1.055 * np.maximum(rgb, 1e-9) ** (1 / 2.4) - 0.055)
+    return np.round(255 * np.concatenate([srgb, np.clip(pixels[..., 3:], 0, 1)], -1)).astype(np.uint8)
+
+
+class Decoded(NamedTuple):
+    """An image as its file has it."""
+
+    rgb: np.ndarray
+    """(H, W, 3): 8-bit sRGB levels, or linear float32."""
+    alpha: np.ndarray | None
+    """(H, W): 8-bit, or float32."""
+    straight: bool
+    """The colour is not yet multiplied by alpha."""
+
+
+def as_linear(image: Decoded, mask: np.ndarray | None = None) -> np.ndarray:
+    """Linear premultiplied RGBA (H, W, 4) float32; alpha is `mask` (H, W) 8-bit if given, else the image's, else 1."""
+    pixels = np.empty((*image.rgb.shape[:2], 4), np.float32)
+    alpha = image.alpha if mask is None else mask
+    for rows in strips(pixels):
+        part, rgb = pixels[rows], image.rgb[rows]
+        part[..., :3] = LINEAR[rgb] if rgb.dtype == np.uint8 else rgb
+        part[..., 3] = 1 if alpha is None else alpha[rows] / np.float32(255 if alpha.dtype == np.uint8 else 1)
+        if mask is not None or image.straight:
+            part[..., :3] *= part[..., 3:]
+    return pixels
+
+
+def as_levels(image: Decoded, mask: np.ndarray | None = None) -> np.ndarray:
+    """The 8-bit levels of :func:`as_linear` for an 8-bit image; where alpha is 255 they are the file's."""
+    pixels = np.empty((*image.rgb.shape[:2], 4), np.uint8)
+    alpha = image.alpha if mask is None else mask
+    pixels[..., 3] = 255 if alpha is None else alpha
+    for rows in strips(pixels):
+        pixels[rows][..., :3] = image.rgb[rows] if alpha is None else _dimmed()[alpha[rows][..., None], image.rgb[rows]]
+    return pixels
+
+
+def strips(pixels: np.ndarray) -> Iterator[slice]:
+    """Rows of `pixels` (H, W, ...) by some quarter of a million pixels: a look-up takes 8 bytes for each of its own."""
+    step = max(1, (1 << 18) // pixels.shape[1])
+    return (slice(row, row + step) for row in range(0, len(pixels), step))
+
+
+@cache
+def _dimmed() -> np.ndarray:
+    """[alpha, level] (256, 256): the level nearest to the light of a level times alpha."""
+    light = LINEAR * (np.arange(256, dtype=np.float32) / 255)[:, None]
+    return levels(np.repeat(light[..., None], 4, -1))[..., 0]
+
+
 def read_image(path: Path) -> np.ndarray:
-    """Linear premultiplied RGBA (H, W, 4) float32 of an EXR, PNG or JPEG; alpha 1 where the file has none.
+    """Linear premultiplied RGBA (H, W, 4) float32 of an image file; alpha 1 where it has none.
 
     Raises MiNtfError where the file is missing, unreadable, of another kind, or holds NaN or infinity.
     """
-    rgb, alpha = _decode(Path(path))
-    return _premultiplied(rgb, np.ones(rgb.shape[:2], np.float32) if alpha is None else alpha)
+    return as_linear(decode(Path(path)))
 
 
-def read_photograph(path: Path, masks: list[Path]) -> np.ndarray:
-    """:func:`read_image`, with the first existing file of `masks` as alpha where the image has none.
-
-    Training must know which pixels show the object, so an image with neither is an error.
-    """
-    rgb, alpha = _decode(Path(path))
-    if alpha is None:
-        mask = next((m for m in masks if m.is_file()), None)
-        if mask is None:
-            raise MiNtfError(f"{path}: has no alpha channel and no mask{' (' + str(masks[0]) + ')' if masks else ''}; "
-                             "training must tell the object from what is behind it: put a mask there (PNG, white: "
-                             "object, black: background), or write the photograph as RGBA PNG")
-        alpha = _read_mask(mask)
-        if alpha.shape != rgb.shape[:2]:
-            raise MiNtfError(f"{mask}: is {alpha.shape[1]}x{alpha.shape[0]}, its photograph {path} is "
-                             f"{rgb.shape[1]}x{rgb.shape[0]}; a mask has the size of its photograph")
-        return _premultiplied(rgb * alpha[..., None], alpha)
-    return _premultiplied(rgb, alpha)
-
-
-def _premultiplied(rgb: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    return np.concatenate([rgb, alpha[..., None]], -1).astype(np.float32)
-
-
-def _decode(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """Linear RGB (H, W, 3), premultiplied if there is alpha, and alpha (H, W) or None."""
+def check_exists(path: Path) -> None:
+    """Raise MiNtfError if the photograph `path` is missing."""
     if not path.is_file():
         raise MiNtfError(f"{path} does not exist; the data set is incomplete: put the file there, take its entry out, "
                          "or run the capture again (it resumes)")
-    reader = {".exr": _read_exr, ".png": _read_srgb, ".jpg": _read_srgb, ".jpeg": _read_srgb}.get(path.suffix.lower())
+
+
+def decode(path: Path) -> Decoded:
+    """The image in `path`. Raises MiNtfError."""
+    check_exists(path)
+    reader = {".exr": _read_exr, ".png": _read_srgb, ".jpg": _read_srgb, ".jpeg": _read_srgb, ".tif": _read_tiff,
+              ".tiff": _read_tiff}.get(path.suffix.lower())
     if reader is None:
-        raise MiNtfError(f"{path}: images of type '{path.suffix}' are not read; convert it to .exr, .png or .jpg")
+        raise MiNtfError(f"{path}: images of type '{path.suffix}' are not read; convert it to .exr, .tif, .png or .jpg")
     try:
-        rgb, alpha = reader(path)
+        image = reader(path)
     except MiNtfError:
         raise
-    except Exception as error:  # OpenEXR and Pillow raise many kinds for a damaged file
-        raise MiNtfError(f"{path}: cannot be read as an image ({error}); delete it and capture or copy it again"
-                         ) from error
-    finite = np.isfinite(rgb).all(-1) & (True if alpha is None else np.isfinite(alpha))
-    bad = int(np.count_nonzero(~finite))
+    except Exception as error:  # OpenEXR, Pillow and OpenCV raise many kinds for a damaged file
+        raise MiNtfError(f"{path}: cannot be read as an image ({shown(str(error))}); delete it and capture or copy it "
+                         "again") from error
+    bad = 0 if image.rgb.dtype == np.uint8 else sum(_count_bad(image, rows) for rows in strips(image.rgb))
     if bad:
         raise MiNtfError(f"{path}: {bad} pixels are NaN or infinite (half precision ends at 65504); write it with 32 "
                          "bits a channel or under a weaker light. One of `mi-ntf capture` can be deleted: the same "
                          "command makes it anew")
-    return rgb, alpha
+    return image
 
 
-def _read_exr(path: Path):
+def _count_bad(image: Decoded, rows: slice) -> int:
+    finite = np.isfinite(image.rgb[rows]).all(-1)
+    return int(np.count_nonzero(~(finite if image.alpha is None else finite & np.isfinite(image.alpha[rows]))))
+
+
+def _read_exr(path: Path) -> Decoded:
     import OpenEXR
 
     with OpenEXR.File(str(path), separate_channels=True) as file:
@@ -86,31 +138,91 @@ def _read_exr(path: Path):
     if missing:
         raise MiNtfError(f"{path}: has channels {', '.join(sorted(channels))}, lacks {', '.join(missing)}; "
                          "write it as RGB or RGBA")
-    return np.stack([channels["R"], channels["G"], channels["B"]], -1), channels.get("A")
+    return Decoded(np.stack([channels["R"], channels["G"], channels["B"]], -1), channels.get("A"), False)
 
 
-def _read_srgb(path: Path):
+def _read_srgb(path: Path) -> Decoded:
     """8-bit image. The Exif orientation is left aside on purpose: poses and masks belong to the stored pixels."""
     from PIL import Image
 
     with Image.open(path) as image:
         if image.mode not in ("L", "LA", "P", "RGB", "RGBA"):
-            raise MiNtfError(f"{path}: image of mode '{image.mode}'; write it with 8 bits a channel, or as EXR")
+            raise MiNtfError(f"{path}: image of mode '{image.mode}'; write it with 8 bits a channel, or as EXR or TIFF")
         has_alpha = image.mode in ("LA", "RGBA") or "transparency" in image.info
-        stored = np.asarray(image.convert("RGBA"))
-    linear, alpha = LINEAR[stored[..., :3]], stored[..., 3] / np.float32(255)
-    return (linear * alpha[..., None], alpha) if has_alpha else (linear, None)
+        stored = np.asarray(image.convert("RGBA" if has_alpha else "RGB"))
+    return Decoded(stored[..., :3], stored[..., 3] if has_alpha else None, True)
 
 
-def _read_mask(path: Path) -> np.ndarray:
-    """Alpha (H, W) float32 in [0, 1] of a mask; a grey level is a share of coverage, no colour."""
+def _read_tiff(path: Path) -> Decoded:
+    """8 bits are sRGB; 16 bits, and floating point, are what a raw converter writes that is asked for linear light.
+
+    Pillow would cut 16 bits to 8, and OpenCV multiplies 8 bits by alpha; each reads what it reads well.
+    """
+    bits, premultiplied = _tiff_tags(path)
+    if bits and max(bits) <= 8:
+        return _read_srgb(path)
+    stored = opencv(f"{path}: TIFF of more than 8 bits").imread(str(path), -1)  # -1: as it is, IMREAD_UNCHANGED
+    if stored is None:
+        raise ValueError("OpenCV finds no image in it")
+    stored = stored[..., None] if stored.ndim == 2 else stored
+    whole = stored.dtype == np.uint16
+    if stored.shape[2] not in (1, 3, 4) or not (whole or stored.dtype.kind == "f"):
+        raise MiNtfError(f"{path}: TIFF of {stored.shape[2]} channels of {stored.dtype}; write it as RGB with 8 or 16 "
+                         "bits or floating-point numbers a channel")
+    stored = stored.astype(np.float32) / np.float32(65535 if whole else 1)
+    rgb = stored[..., [2, 1, 0]] if stored.shape[2] > 1 else np.repeat(stored, 3, -1)
+    return Decoded(rgb, stored[..., 3] if stored.shape[2] == 4 else None, whole and not premultiplied)
+
+
+def _tiff_tags(path: Path) -> tuple[tuple[int, ...], bool]:
+    """Bits of each sample, and whether alpha is associated, as far as Pillow knows the file."""
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(path) as image:
+            tags = image.tag_v2
+            return tuple(tags.get(258, (1,))), 1 in tuple(tags.get(338, ()))
+    except UnidentifiedImageError:
+        return (), False
+
+
+def opencv(what: str):
+    """The module `cv2`, or MiNtfError: `what` needs it."""
+    try:
+        import cv2
+    except ImportError:
+        raise MiNtfError(f"{what} needs OpenCV, which is not installed: run pip install 'mi-ntf[train]'") from None
+    return cv2
+
+
+def size_of(path: Path) -> tuple[int, int] | None:
+    """(width, height) in pixels as the head of an image file says it; None where only reading the whole would tell."""
+    try:
+        if path.suffix.lower() == ".exr":
+            import OpenEXR
+
+            low, high = OpenEXR.File(str(path), header_only=True).header()["dataWindow"]
+            return tuple(int(n) for n in high - low + 1)
+        from PIL import Image
+
+        with Image.open(path) as image:
+            return image.size
+    except Exception:  # told when it is read
+        return None
+
+
+def read_mask(path: Path) -> np.ndarray:
+    """Alpha (H, W) of 8 bits of a mask; a grey level is a share of coverage, no colour."""
     from PIL import Image
 
     try:
         with Image.open(path) as image:
-            return np.asarray(image.convert("L"), dtype=np.float32) / 255.0
+            if image.mode[:1] in ("I", "F"):
+                raise ValueError(f"mode '{image.mode}'")
+            return np.asarray(image.convert("L"))
     except Exception as error:
-        raise MiNtfError(f"{path}: cannot be read as a mask ({error}); write it as 8-bit grey PNG") from error
+        raise MiNtfError(f"{path}: cannot be read as a mask ({shown(str(error))}); write it as 8-bit grey PNG"
+                         ) from error
 
 
 def is_file_name(name: object) -> bool:
@@ -121,16 +233,17 @@ def is_file_name(name: object) -> bool:
     return 0 < sum(parts) <= 2000 and max(parts) <= 240
 
 
-def mask_places(root: Path, name: str) -> list[Path]:
-    """Where the mask of photograph `name` (relative to `root`) may lie: `root`/masks, the same name, as PNG or as
-    COLMAP writes it (name.jpg.png). A leading folder `images` is left out."""
+def mask_places(masks: Path, name: str) -> list[Path]:
+    """Where in the folder `masks` the mask of photograph `name` may lie: the same name as PNG, as COLMAP writes it
+    (name.jpg.png), or with another suffix. A leading folder `images` (`images_4`) is left out."""
     relative = Path(name)
-    if relative.is_absolute():
+    if relative.is_absolute() or not relative.name:
         return []
-    if relative.parts[:1] == ("images",):
-        relative = relative.relative_to("images")
-    base = root / "masks" / relative
-    return [base.with_suffix(".png"), base.with_name(base.name + ".png")]
+    if len(relative.parts) > 1 and relative.parts[0].startswith("images"):
+        relative = Path(*relative.parts[1:])
+    base = masks / relative
+    return [base.with_suffix(".png"), base.with_name(base.name + ".png"),
+            *(base.with_suffix(suffix) for suffix in MASK_SUFFIXES[1:])]
 
 
 def write_exr(path: Path, rgba: np.ndarray) -> None:

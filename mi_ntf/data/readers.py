@@ -1,76 +1,185 @@
 """Everything that training reads, behind one function: :func:`load_dataset` tells a folder's form by its files.
 
     transforms_train.json    captures of `mi-ntf capture`, NeRF-synthetic (Blender), NRHints: `transforms_json`
+    transforms.json          nerfstudio, instant-ngp: `nerfstudio`
     a COLMAP model           cameras, images, points3D (.bin or .txt) and `images/`: `colmap`
+    poses_bounds.npy         LLFF, with `images/`: `llff`
 
 What a form leaves open is decided here, alike for all, and said aloud: held-back views are split off, the object's
-sphere is found (`bounds`), the light is put at the camera and its intensity estimated (`light`). Every fault raises
-MiNtfError.
+sphere is found (`bounds`), the light is put at the camera or beside it, its intensity estimated (`light`). Every fault
+raises MiNtfError.
 """
 
+from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from mi_ntf.core.errors import MiNtfError
-from mi_ntf.data import bounds, colmap, light, poses, transforms_json
-from mi_ntf.data.images import read_photograph
-from mi_ntf.data.schema import Found, Split, View, focal_length
+from mi_ntf.data import bounds, colmap, images, lens, light, llff, nerfstudio, photographs, poses, transforms_json
+from mi_ntf.data.schema import Found, Split, View
+
+FORMS = (
+    ("transforms_<split>.json", lambda folder: (folder / "transforms_train.json").is_file(), transforms_json.read),
+    (nerfstudio.FORM, lambda folder: (folder / "transforms.json").is_file(), nerfstudio.read),
+    (colmap.FORM, lambda folder: colmap.find_model(folder) is not None, colmap.read),
+    (llff.FORM, lambda folder: (folder / "poses_bounds.npy").is_file(), llff.read),
+)
+"""Name, whether a folder is of the form, reader. Where a folder is of several, the first is the one that says most."""
+BACKGROUNDS = ("black",)
+SMALLEST = 8
+"""Pixels of the longer side that photographs may be scaled down to."""
 
 
-def load_dataset(folder: Path, say: Callable[[str], None] = print) -> dict[str, Split]:
+def load_dataset(folder: Path, say: Callable[[str], None] = print, *, size: int | None = None,
+                 masks: Path | None = None, background: str | None = None,
+                 flash_offset: tuple[float, float, float] | None = None) -> dict[str, Split]:
     """The splits `train`, `val` and `test` with all their images, in one similarity. Raises MiNtfError.
 
-    `say` is called with one sentence for each thing that the data set left open.
+    `say` is called with one sentence on what was found, and one for each thing that the data set left open.
+
+    `size`: longer side, pixels, that photographs are scaled down to, in linear light. `masks`: folder of masks by the
+    photographs' names, instead of alpha channels and what the form says. `background` "black": no masks, the
+    photographs were taken with a flash in a dark room (:attr:`Split.masked`). `flash_offset`: the flash's place (right,
+    up, forward) from the lens in the data set's own lengths, for one that says no `pl_pos`.
     """
-    found = _find(Path(folder))
-    for note in found.notes:
-        say(note)
-    views = split_off(found.views, say)
+    folder = Path(folder)
+    _check_options(size, masks, background, flash_offset)
+    form, reader, notes = _find(folder)
+    try:
+        found = reader(folder)
+        form = found.form
+        views = _with_options(found.views, masks, flash_offset)
+        say(_summary(found, folder, size, background))
+        for note in [*notes, *found.notes]:
+            say(note)
+        return _load(folder, found, split_off(views, say), say, size, background == "black", flash_offset)
+    except MiNtfError as error:
+        raise MiNtfError(f"{error} (read as {form})") from error
+
+
+def _load(folder: Path, found: Found, views: dict[str, list[View]], say: Callable[[str], None], size: int | None,
+          black: bool, flash_offset: tuple[float, float, float] | None) -> dict[str, Split]:
+    """The splits of `views` with their images, and what the data set leaves open."""
     every = [view for split in views.values() for view in split]
+    _check_lights(every)
+    poses.check_views(views["train"], None if found.sphere is None else found.sphere[0])
+    for view in every:  # before an hour is spent on those that are there
+        images.check_exists(view.image)
+    loaded = {name: photographs.load(split, size, black) for name, split in views.items()}
+    _check_masks(views["train"], loaded["train"][0])
+    _say_pixels(loaded["train"][0], size, black, say)
+    if found.sphere is None:
+        center, radius, how = bounds.find(*loaded["train"], found.points, "lit regions" if black else "masks")
+        say(f"the object's sphere is found {how}: center {center.round(4).tolist()}, radius {radius:.4g}")
+    else:
+        (center, radius), how = found.sphere, "'unit_sphere' of the data set"
+    poses.check_outside(every, center, radius, how)
+    places = {name: _light_positions(split) for name, split in views.items()}
+    if flash_offset is not None:
+        say("the flash is taken to be {:g} right, {:g} up, {:g} forward of the lens, in the data set's lengths".format(
+            *flash_offset))
+    elif every[0].light_pos is None:
+        say("no light positions given ('pl_pos'): a flash at the lens is assumed; under any other light the "
+            "reflectance comes out wrong (--flash-offset says where it is)")
+    intensity = None
+    if every[0].light_intensity is None:
+        intensity = light.estimate(loaded["train"][0], places["train"], center, radius)
+        say(f"no light intensity given ('pl_intensity'): {intensity:.4g} W/sr estimated, so that bright surfaces have "
+            f"albedo {light.ALBEDO}; photographs determine intensity times albedo alone")
+    return {name: Split(*loaded[name], places[name], _intensities(split, intensity), center, radius,
+                        tuple(_name(view, folder) for view in split), not black, intensity is None,
+                        every[0].light_pos is not None)
+            for name, split in views.items()}
+
+
+def _check_options(size: int | None, masks: Path | None, background: str | None, flash_offset) -> None:
+    if size is not None and size < SMALLEST:
+        raise MiNtfError(f"size is {size}, must be {SMALLEST} or more: the pixels of the photographs' longer side")
+    if background is not None and background not in BACKGROUNDS:
+        raise MiNtfError(f"background is {background!r}, must be {' or '.join(map(repr, BACKGROUNDS))}, for "
+                         "photographs with a flash in a dark room; leave it out where there are masks")
+    if background is not None and masks is not None:
+        raise MiNtfError(f"masks ({masks}) and background {background!r} are both given; before a black background no "
+                         "masks are looked for: leave one of the two out")
+    if masks is not None and not Path(masks).is_dir():
+        raise MiNtfError(f"{masks} does not exist or is no folder; name the folder that holds the masks, named as the "
+                         "photographs are (white: object)")
+    if flash_offset is not None and not (len(flash_offset) == 3 and np.isfinite(flash_offset).all()):
+        raise MiNtfError(f"flash_offset is {flash_offset}, expected three numbers: right, up, forward of the lens")
+
+
+def _find(folder: Path) -> tuple[str, Callable[[Path], Found], list[str]]:
+    """``(form, reader, notes)`` of what lies in `folder`."""
+    if not folder.is_dir():
+        raise MiNtfError(f"{folder} does not exist or is no folder; make a data set with "
+                         f"`mi-ntf capture SCENE.xml {folder}`")
+    there = [(form, reader) for form, is_there, reader in FORMS if is_there(folder)]
+    if not there:
+        raise MiNtfError(f"{folder}: no data set is here: neither transforms_train.json (capture, NeRF-synthetic, "
+                         "NRHints) nor transforms.json (nerfstudio) nor a COLMAP model (cameras and images, .bin or "
+                         ".txt, in sparse/0, sparse or the folder itself) nor poses_bounds.npy (LLFF); "
+                         f"make one with `mi-ntf capture SCENE.xml {folder}`")
+    notes = [f"also in the folder, and left aside: {form}" for form, _ in there[1:]]
+    return *there[0], notes
+
+
+def _with_options(views: dict[str, list[View]], masks: Path | None, flash_offset) -> dict[str, list[View]]:
+    """`views` with the user's folder of masks and place of the flash."""
+    every = [view for split in views.values() for view in split]
+    alone = Counter(Path(view.name).stem for view in every)
+
+    def change(view: View) -> View:
+        if masks is not None:
+            plain = Path(view.name).name
+            places = images.mask_places(Path(masks), view.name)
+            if alone[Path(plain).stem] == 1:  # else a mask could be another photograph's
+                places += images.mask_places(Path(masks), plain)
+            view = replace(view, masks=places, mask_first=True)
+        if flash_offset is None:
+            return view
+        if view.light_pos is not None:
+            raise MiNtfError(f"{view.where}: 'pl_pos' says where the light is, and so does a flash offset of "
+                             f"{list(flash_offset)}; leave one of the two out")
+        right, up, forward = flash_offset
+        return replace(view, light_pos=(view.c2w @ (right, up, -forward, 1.0))[:3])
+
+    return {name: [change(view) for view in split] for name, split in views.items()}
+
+
+def _summary(found: Found, folder: Path, size: int | None, background: str | None) -> str:
+    """What the data set is, in one line."""
+    every = [view for split in found.views.values() for view in split]
+    pixels, told = images.size_of(every[0].image), ""
+    if pixels is not None:
+        told = ", {}x{} pixels".format(*pixels)
+        if lens.shrunk(*pixels, size) != pixels:
+            told += ", scaled to {}x{}".format(*lens.shrunk(*pixels, size))
+    bent = any(getattr(view.camera, "distortion", ()) for view in every)
+    return (f"{found.form} in {folder}: {len(every)} photographs{told}{', lens distortion undone' if bent else ''}"
+            f"{f', {background} background' if background else ''}")
+
+
+def _say_pixels(stored: np.ndarray, size: int | None, black: bool, say: Callable[[str], None]) -> None:
+    height, width = stored.shape[1:3]
+    if size is not None and max(height, width) < size:
+        say(f"size {size} is more than the photographs have ({width}x{height}): they are left as they are")
+    if black:
+        empty, matter = (np.mean([np.mean(image[..., 3] == v) for image in stored])
+                         for v in (0, stored.dtype.type(255 if stored.dtype == np.uint8 else 1)))
+        say(f"black background: of a photograph for training {empty:.0%} is known to be empty, {matter:.0%} lit; what "
+            "is between is learned. Everything that the flash lights is taken for the object")
+
+
+def _check_lights(every: list[View]) -> None:
     for key, alone in (("light_pos", "pl_pos"), ("light_intensity", "pl_intensity")):
         lacking = [view for view in every if getattr(view, key) is None]
         if 0 < len(lacking) < len(every):
             raise MiNtfError(f"{lacking[0].where}: '{alone}' is missing, {len(every) - len(lacking)} other frames have "
                              f"it; give it in all frames (for a flash on the camera, pl_pos is the camera's position) "
                              "or in none")
-    poses.check_views(views["train"], None if found.sphere is None else found.sphere[0])
-    pictures = {name: _load(split) for name, split in views.items()}
-    cameras = {name: _cameras(split, pictures[name]) for name, split in views.items()}
-    _check_masks(views["train"], pictures["train"])
-    if found.sphere is None:
-        center, radius, how = bounds.find(pictures["train"][..., 3], *cameras["train"], found.points)
-        say(f"the object's sphere is found {how}: center {center.round(4).tolist()}, radius {radius:.4g}")
-    else:
-        (center, radius), how = found.sphere, "'unit_sphere' of the data set"
-    poses.check_outside(every, center, radius, how)
-    places = {name: _light_positions(split) for name, split in views.items()}
-    if every[0].light_pos is None:
-        say("no light positions given ('pl_pos'): a flash at the lens is assumed; under any other light the "
-            "reflectance comes out wrong")
-    intensity = None
-    if every[0].light_intensity is None:
-        intensity = light.estimate(pictures["train"], places["train"], center, radius)
-        say(f"no light intensity given ('pl_intensity'): {intensity:.4g} W/sr estimated, so that bright surfaces have "
-            f"albedo {light.ALBEDO}; photographs determine intensity times albedo alone")
-    return {name: Split(pictures[name], *cameras[name], places[name], _intensities(split, intensity), center, radius)
-            for name, split in views.items()}
-
-
-def _find(folder: Path) -> Found:
-    """What lies in `folder`, by its form."""
-    if not folder.is_dir():
-        raise MiNtfError(f"{folder} does not exist or is no folder; make a data set with "
-                         f"`mi-ntf capture SCENE.xml {folder}`")
-    if (folder / "transforms_train.json").is_file():
-        return transforms_json.read(folder)
-    model = colmap.find_model(folder)
-    if model is not None:
-        return colmap.read(folder, model)
-    raise MiNtfError(f"{folder}: no data set is here: neither transforms_train.json (capture, NeRF-synthetic, NRHints) "
-                     "nor a COLMAP model (cameras and images, .bin or .txt, in sparse/0, sparse or the folder itself); "
-                     f"make one with `mi-ntf capture SCENE.xml {folder}`")
 
 
 def split_off(views: dict[str, list[View]], say: Callable[[str], None]) -> dict[str, list[View]]:
@@ -92,49 +201,13 @@ def split_off(views: dict[str, list[View]], say: Callable[[str], None]) -> dict[
     return {name: views[name] for name in ("train", "val", "test")}
 
 
-def _load(views: list[View]) -> np.ndarray:
-    """The photographs of a split, (N, H, W, 4) float32, all of one size."""
-    images = np.empty((0, 0, 0, 4), np.float32)
-    for i, view in enumerate(views):
-        pixels = read_photograph(view.image, view.masks)
-        size = pixels.shape[1], pixels.shape[0]
-        if view.size is not None and size != view.size:
-            raise MiNtfError(f"{view.image}: is {size[0]}x{size[1]}, {view.where} says {view.size[0]}x{view.size[1]}; "
-                             "photograph and camera must belong together: scale one of them")
-        if i == 0:
-            images = np.empty((len(views), *pixels.shape), np.float32)
-        if pixels.shape != images.shape[1:]:
-            raise MiNtfError(f"{view.image}: is {size[0]}x{size[1]}, {views[0].image} is {images.shape[2]}x"
-                             f"{images.shape[1]}; all photographs of a split have one size: scale or crop them")
-        images[i] = pixels
-    return images
-
-
-def _check_masks(views: list[View], images: np.ndarray) -> None:
+def _check_masks(views: list[View], stored: np.ndarray) -> None:
     """A photograph for training that shows nothing would empty the whole space."""
-    for view, image in zip(views, images, strict=True):
-        if image[..., 3].max() < bounds.COVERED:
-            raise MiNtfError(f"{view.image}: its alpha is {image[..., 3].max():.2g} at most, so it shows no object; "
-                             "repair its mask (white: object) or take the photograph out")
-
-
-def _cameras(views: list[View], images: np.ndarray):
-    """``(c2w (N, 4, 4), focal (N, 2), principal (N, 2))``, float64; pixels."""
-    height, width = images.shape[1:3]
-    full = []
-    for view in views:
-        camera = view.camera
-        if len(camera) == 1:
-            camera = (*(2 * (focal_length(camera[0], width),)), 0.5 * width, 0.5 * height)
-        if not (0 < camera[2] < width and 0 < camera[3] < height):
-            raise MiNtfError(f"{view.where}: its principal point is ({camera[2]:g}, {camera[3]:g}), outside the image "
-                             f"of {width}x{height} pixels; scale the camera's intrinsics with the image")
-        if not all(1e-3 * width < f < 1e6 * width for f in camera[:2]):
-            raise MiNtfError(f"{view.where}: its focal lengths are {camera[0]:g} and {camera[1]:g} pixels, for an "
-                             f"image of {width}x{height} pixels that is no pinhole camera; correct the camera")
-        full.append(camera)
-    intrinsics = np.array(full, dtype=np.float64)
-    return np.stack([view.c2w for view in views]), intrinsics[:, :2], intrinsics[:, 2:]
+    for view, image in zip(views, stored, strict=True):
+        if not bounds.covered(image).any():
+            most = float(image[..., 3].max()) / (255 if image.dtype == np.uint8 else 1)
+            raise MiNtfError(f"{view.image}: its alpha is {most:.2g} at most, so it shows no object; repair its mask "
+                             "(white: object) or take the photograph out")
 
 
 def _light_positions(views: list[View]) -> np.ndarray:
@@ -144,3 +217,7 @@ def _light_positions(views: list[View]) -> np.ndarray:
 def _intensities(views: list[View], estimated: float | None) -> np.ndarray:
     return np.stack([v.light_intensity if estimated is None else np.full(3, estimated) for v in views]
                     ).astype(np.float32)
+
+
+def _name(view: View, folder: Path) -> str:
+    return str(view.image.relative_to(folder) if view.image.is_relative_to(folder) else view.image)

@@ -26,7 +26,7 @@ import numpy as np
 from mi_ntf.core import files
 from mi_ntf.data.images import read_image, write_exr
 
-__all__ = ["SPLITS", "Found", "Frame", "Split", "Transforms", "View", "fingerprint", "focal_length",
+__all__ = ["SPLITS", "Camera", "Found", "Frame", "Split", "Transforms", "View", "fingerprint", "focal_length",
            "mitsuba_to_opengl", "pixel_rays", "read_image", "write_exr", "write_transforms"]
 
 SPLITS = ("train", "val", "test")
@@ -55,28 +55,48 @@ class Transforms:
 
 
 @dataclass(frozen=True)
+class Camera:
+    """A pinhole, and the lens before it. Pixels; (0, 0) is the corner of the top left pixel."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = ()
+    """OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]]; none: straight."""
+
+
+@dataclass(frozen=True)
 class View:
     """One photograph as a reader found it, pixels not yet read. `None`: the data set does not say."""
 
     where: str
     """File and frame, for messages."""
     image: Path
+    name: str
+    """The photograph's file as the data set calls it: by that its mask is found."""
     masks: list[Path]
     """Where its mask may lie."""
     c2w: np.ndarray
     """(4, 4) camera-to-world, OpenGL axes."""
-    camera: tuple[float, ...]
-    """(horizontal field of view in radians,), or (fx, fy, cx, cy) in pixels; cx, cy from the top left corner."""
+    camera: Camera | float
+    """A number: the horizontal field of view in radians, of square pixels and a centred camera."""
     size: tuple[int, int] | None = None
     """(width, height) in pixels."""
     light_pos: np.ndarray | None = None
     light_intensity: np.ndarray | None = None
+    mask_first: bool = False
+    """The mask is the alpha, whatever the image has."""
+    rescaled: bool = False
+    """The photograph may be a copy of another size than `size`; `camera` is that of `size`."""
 
 
 @dataclass(frozen=True)
 class Found:
     """What a reader found in a folder, pixels not yet read. World units; `sphere` is (center (3,), radius)."""
 
+    form: str
+    """What the data set is and where it lies, for messages."""
     views: dict[str, list[View]]
     sphere: tuple[np.ndarray, float] | None = None
     points: np.ndarray | None = None
@@ -88,7 +108,8 @@ class Found:
 class Split:
     """A split in memory. N frames of H x W pixels; float32 unless noted.
 
-    images (N, H, W, 4) linear premultiplied RGBA · c2w (N, 4, 4) float64, OpenGL axes · focal (N, 2) fx, fy and
+    images (N, H, W, 4) RGBA as they are stored, which :func:`mi_ntf.data.images.linear` makes linear premultiplied
+    float32: 8-bit levels, or float16 or float32 · c2w (N, 4, 4) float64, OpenGL axes · focal (N, 2) fx, fy and
     principal (N, 2) cx, cy in pixels from the top left corner, float64 · light_pos (N, 3) world ·
     light_intensity (N, 3) · center (3,) and radius: field = (world - center) / radius.
     """
@@ -101,6 +122,15 @@ class Split:
     light_intensity: np.ndarray
     center: np.ndarray
     radius: float
+    names: tuple[str, ...] = ()
+    """The photographs' files, for messages."""
+    masked: bool = True
+    """Alpha is the object's share of the pixel; if not, the background is black, and alpha says what is known: 1
+    matter, 0 none, all between unknown."""
+    calibrated: bool = True
+    """The lights' intensities were given; if not, they are estimated, alike for all photographs."""
+    located: bool = True
+    """The lights' places were given; if not, they are the lenses'."""
 
 
 def write_transforms(folder: Path, split: str, transforms: Transforms) -> Path:
@@ -118,7 +148,7 @@ def write_transforms(folder: Path, split: str, transforms: Transforms) -> Path:
 
 def fingerprint(splits: dict[str, Split]) -> dict[str, str]:
     """Hashes of all that `splits` hold, by what it is: tells changed data from the same ones, in whatever files."""
-    parts = {"photographs or masks": ("images",), "cameras": ("c2w", "focal", "principal"),
+    parts = {"photographs or masks": ("images", "masked"), "cameras": ("c2w", "focal", "principal"),
              "lights": ("light_pos", "light_intensity"), "the object's sphere": ("center", "radius")}
     found = {}
     for what, names in parts.items():

@@ -12,15 +12,13 @@ Source of the two foreign dialects: the public loaders of NeRF (Mildenhall et al
 2023).
 """
 
-import json
 from pathlib import Path
 
 import numpy as np
 
-from mi_ntf.core.errors import MiNtfError, shown
-from mi_ntf.data.images import SUFFIXES, is_file_name, mask_places
-from mi_ntf.data.poses import check_rigid
-from mi_ntf.data.schema import SPLITS, Found, View
+from mi_ntf.core.errors import MiNtfError
+from mi_ntf.data import json_entries as entries
+from mi_ntf.data.schema import SPLITS, Camera, Found, View
 
 
 def read(folder: Path) -> Found:
@@ -37,95 +35,32 @@ def read(folder: Path) -> Found:
             raise MiNtfError(f"{folder / f'transforms_{split}.json'}: 'unit_sphere' is {center.tolist()}, {radius:g}, "
                              f"another split says {sphere[0].tolist()}, {sphere[1]:g}; all splits show one object: "
                              "write the same sphere")
-    return Found(views, sphere)
+    return Found(_dialect(views["train"], sphere), views, sphere)
 
 
-def _read_split(folder: Path, path: Path):
+def _dialect(views: list[View], sphere: tuple[np.ndarray, float] | None) -> str:
+    """What the data set is by what it says."""
+    if sphere is not None:
+        return "photographs of `mi-ntf capture`"
+    if any(isinstance(view.camera, Camera) or view.light_pos is not None for view in views):
+        return "NRHints data set"
+    return "NeRF-synthetic (Blender) data set"
+
+
+def _read_split(folder: Path, path: Path) -> tuple[list[View], tuple[np.ndarray, float] | None]:
     """``(views, sphere or None)`` of one file."""
-    try:
-        data = json.loads(path.read_text())
-    except (ValueError, RecursionError) as error:  # also text that is not UTF-8
-        raise MiNtfError(f"{path}: not valid JSON ({error}); the file is damaged, capture or copy it again") from None
-    if not isinstance(data, dict) or not isinstance(data.get("frames"), list) or not data["frames"]:
-        raise MiNtfError(f"{path}: 'frames' is empty or missing; a split needs one photograph at least")
-    camera, size = _camera(data, str(path)), None
-    if "w" in data or "h" in data:
-        size = (int(_positive(data, "w", str(path))), int(_positive(data, "h", str(path))))
-    views = [_view(entry, f"{path}, frame {i}", folder, camera, size) for i, entry in enumerate(data["frames"])]
-    sphere = None
-    if "unit_sphere" in data:
-        where = f"{path}, unit_sphere"
-        sphere = _numbers(data["unit_sphere"], "center", (3,), where), _positive(data["unit_sphere"], "radius", where)
-    return views, sphere
+    data = entries.load(path)
+    camera, size = _camera(data, str(path)), entries.size(data, str(path))
+    views = [entries.view(entry, f"{path}, frame {i}", folder, camera, size) for i, entry in enumerate(data["frames"])]
+    return views, entries.unit_sphere(data, path)
 
 
-def _camera(data: dict, where: str) -> tuple[float, ...]:
-    """The camera of a split as :class:`View` wants it."""
-    if "camera_intrinsics" in data:
-        cx, cy, fx, fy = _numbers(data, "camera_intrinsics", (4,), where)
-        if min(fx, fy) <= 0:
-            raise MiNtfError(f"{where}: 'camera_intrinsics' is {data['camera_intrinsics']}; the focal lengths, its "
-                             "last two numbers [cx, cy, fx, fy], must be positive")
-        return float(fx), float(fy), float(cx), float(cy)
-    angle = _positive(data, "camera_angle_x", where)
-    if angle >= np.pi:
-        raise MiNtfError(f"{where}: 'camera_angle_x' is {angle:g}, must be below pi; it is in radians")
-    return (angle,)
-
-
-def _view(entry: dict, where: str, folder: Path, camera: tuple[float, ...], size) -> View:
-    if not isinstance(entry, dict) or "file_path" not in entry:
-        raise MiNtfError(f"{where}: 'file_path' is missing; name the image relative to the folder")
-    c2w = _numbers(entry, "transform_matrix", (4, 4), where)
-    check_rigid(c2w, where, "'transform_matrix'")
-    position = _numbers(entry, "pl_pos", (3,), where) if "pl_pos" in entry else None
-    intensity = None
-    if "pl_intensity" in entry:
-        shape = () if isinstance(entry["pl_intensity"], int | float) else (3,)
-        intensity = np.broadcast_to(_numbers(entry, "pl_intensity", shape, where), (3,)).copy()
-        if intensity.min() < 0 or intensity.max() <= 0:
-            raise MiNtfError(f"{where}: 'pl_intensity' is {intensity.tolist()}, must be positive; leave it out in all "
-                             "frames to have it estimated")
-    name = _file_name(entry, "file_path", where)
-    if Path(name).suffix.lower() not in SUFFIXES:
-        told = _file_name(entry, "file_ext", where) if entry.get("file_ext") else None
-        name = _with_suffix(folder, name, told, where)
-    return View(where, folder / name, mask_places(folder, name), c2w, camera, size, position, intensity)
-
-
-def _file_name(entry: dict, key: str, where: str) -> str:
-    if not is_file_name(entry[key]):
-        raise MiNtfError(f"{where}: '{key}' is {shown(entry[key])}, expected the name of a file")
-    return entry[key]
-
-
-def _with_suffix(folder: Path, name: str, told: str | None, where: str) -> str:
-    """`name` with the extension of the file that exists. One that is named and not read is kept for its own error."""
-    tried = [told] if told else [*SUFFIXES, ""]
-    for suffix in tried:
-        if (folder / f"{name}{suffix}").is_file():
-            return f"{name}{suffix}"
-    raise MiNtfError(f"{where}: {folder / name} does not exist with any of the extensions "
-                     f"{' '.join(filter(None, tried))}; put the photograph there or take the frame out")
-
-
-def _numbers(entry: dict, key: str, shape: tuple[int, ...], where: str) -> np.ndarray:
-    """The finite float array `entry[key]` of `shape` (float64), or a MiNtfError that begins with `where`."""
-    if not isinstance(entry, dict) or key not in entry:
-        raise MiNtfError(f"{where}: '{key}' is missing; see mi_ntf/data/schema.py for the format")
-    try:
-        value = np.array(entry[key], dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        raise MiNtfError(f"{where}: '{key}' is {shown(entry[key])}, expected numbers of shape {shape}") from None
-    if value.shape != shape:
-        raise MiNtfError(f"{where}: '{key}' has shape {value.shape}, expected {shape}; write it as nested lists")
-    if not (np.abs(value) < 1e30).all():
-        raise MiNtfError(f"{where}: '{key}' is not finite: {shown(value.tolist())}; correct the pose or light")
-    return value
-
-
-def _positive(entry: dict, key: str, where: str) -> float:
-    value = float(_numbers(entry, key, (), where))
-    if not 1e-12 < value < 1e12:
-        raise MiNtfError(f"{where}: '{key}' is {value:g}, must be positive, from 1e-12 to 1e12")
-    return value
+def _camera(data: dict, where: str) -> Camera | float:
+    """The camera of a split."""
+    if "camera_intrinsics" not in data:
+        return entries.angle_x(data, where)
+    cx, cy, fx, fy = map(float, entries.numbers(data, "camera_intrinsics", (4,), where))
+    if min(fx, fy) <= 0:
+        raise MiNtfError(f"{where}: 'camera_intrinsics' is {data['camera_intrinsics']}; the focal lengths, its "
+                         "last two numbers [cx, cy, fx, fy], must be positive")
+    return Camera(fx, fy, cx, cy)

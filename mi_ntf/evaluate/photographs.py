@@ -15,6 +15,7 @@ import numpy as np
 
 from ..core import field_file
 from ..core.errors import MiNtfError
+from ..data.images import linear
 from ..data.readers import load_dataset
 from . import metrics
 
@@ -28,7 +29,8 @@ def study(field: Path, dataset: Path, mesh: Path | None = None, spp: int = 32, d
     ball = field_ball(field)
     originals = None if mesh is None else mi.load_file(str(mesh))
     scores, angles = [], []
-    for i, photograph in enumerate(split.images):
+    for i, stored in enumerate(split.images):
+        photograph = linear(stored)
         view = sensor(split, i)
         lamp = {"type": "point", "position": split.light_pos[i].tolist(),
                 "intensity": {"type": "rgb", "value": split.light_intensity[i].tolist()}}

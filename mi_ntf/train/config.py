@@ -23,6 +23,8 @@ class TrainConfig:
     """Density grid for normals, cells along an edge."""
     lr_planes: float = 0.1
     lr_layers: float = 3e-3
+    lr_gains: float = 0.02
+    """Of the photographs' exposure and white balance, where those are learned."""
     lr_end: float = 0.03
     """Share of the learning rates that is left at the end (exponential decay)."""
     log_density: float = 3.0
@@ -52,6 +54,8 @@ class TrainConfig:
     where none are seen drive both to an end of their range, where sigmoids have no slope to come back by."""
     smooth: float = 2e-4
     """Weight of total variation of the planes."""
+    shadows_from: float = 0.1
+    """From here a flash that is not at the lens throws shadows: there has to be a skin first."""
     ntf_from: float = 0.8
     """Transmittance training starts here, the field has formed."""
     ntf_alone: float = 0.9
@@ -64,6 +68,8 @@ class TrainConfig:
     """Also compare pixels lit by the learned transmittance with the photographs."""
     bounces: bool = True
     """The photographs hold light of the flash that the object throws on itself."""
+    gains: bool = True
+    """Each photograph has an exposure and a white balance of its own, unless its light's intensity is known."""
 
     def sharpened(self, pixel: float) -> "TrainConfig":
         """The recipe for photographs whose pixels are `pixel` wide at the object, in field units. Its own lengths are
@@ -117,18 +123,19 @@ logistic from the ray's end points alone, of a size that CPUs can train."""
 
 
 def configured(preset: str, *, ntf: str | None = None, augmentation: bool = True, colour_loss: bool = True,
-               visibility_mlp: bool = False, bounces: bool = True,
-               fresnel: bool = True) -> TrainConfig | HierarchicalConfig:
+               visibility_mlp: bool = False, bounces: bool = True, fresnel: bool = True,
+               gains: bool = True) -> TrainConfig | HierarchicalConfig:
     """The recipe `preset` with another transmittance network, without parts of its training, for photographs without
-    further `bounces` or of materials without a `fresnel` effect, or with the baseline's network (NeRV's, of a point and
-    a direction) trained on the same transmittance beside it."""
+    further `bounces`, of one exposure without `gains`, or of materials without a `fresnel` effect, or with the
+    baseline's network (NeRV's, of a point and a direction) trained on the same transmittance beside it."""
     if preset not in PRESETS:
         raise MiNtfError(f"preset '{preset}' is unknown; it is one of {', '.join(PRESETS)}")
     if ntf is not None and ntf not in NTF:
         raise MiNtfError(f"--ntf '{ntf}' is unknown; it is one of {', '.join(NTF)}")
     config = replace(PRESETS[preset], augmentation=augmentation, colour_loss=colour_loss)
     if isinstance(config, TrainConfig):
-        config = replace(config, bounces=bounces, architecture=replace(config.architecture, fresnel=fresnel))
+        architecture = replace(config.architecture, fresnel=fresnel)
+        config = replace(config, bounces=bounces, gains=gains, architecture=architecture)
     architecture = config.architecture
     if ntf is not None:
         architecture = replace(architecture, transmittance=NTF[ntf])

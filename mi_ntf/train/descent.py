@@ -2,6 +2,7 @@
 
 import functools
 import math
+import time
 from pathlib import Path
 
 import torch
@@ -11,10 +12,19 @@ from ..core.errors import MiNtfError
 from ..data.readers import load_dataset
 from . import device, monitor, networks, parallel, rays
 from .bounced import Bounced
+from .evaluate import Light
 from .occupancy import Occupancy
+from .photometry import Gains
 
 FIELD = ("density", "reflectance")
 """Networks that photographs train; the others learn from the field."""
+SOLID = 0.5
+"""Share of the object's pixels that nothing may shine through, or it is smoke, which has no skin, and whose
+bounces are others."""
+SCORING = 0.06
+"""Share of the minutes that is left for the scores of the finished field."""
+SURVEYED = 1 << 18
+"""Pixels that tell how bright the photographs are, and how opaque the object."""
 
 
 class Descent:
@@ -29,28 +39,39 @@ class Descent:
     """Attributes that hold tensors, and which."""
     optimizers: dict[str, torch.optim.Optimizer]
 
-    def __init__(self, dataset: Path, config, minutes: float | None, steps: int | None, seed: int):
+    def __init__(self, dataset: Path, config, minutes: float | None, steps: int | None, seed: int,
+                 reading: dict | None = None):
         self.config, self.minutes, self.steps = config, minutes or math.inf, steps or math.inf
-        self.splits = load_dataset(dataset, monitor.note if parallel.first() else lambda _: None)
-        self.rays, views = {}, 0
+        start = time.monotonic()
+        self.notes: list[str] = []
+        """What was said of the photographs."""
+        self.splits = load_dataset(dataset, self.note, **(reading or {}))
+        self.photographs, views = {}, 0
         for name, split in self.splits.items():
-            self.rays[name] = rays.from_split(split, name, views)
+            self.photographs[name] = rays.Photographs(split, views)
             views += len(split.images)
         self.generator = device.generator(seed)
         self.nets = parallel.share(networks.initial(config.architecture, config.log_density, self.generator))
-        target = self.rays["train"].target
-        matter = target[target[:, 3] > 0.01]
+        pool = self.photographs["train"]
+        some = pool.pixels(torch.randint(len(pool), (min(len(pool), SURVEYED),), generator=device.generator(5)))
+        matter = some[some[:, 3] > (0.01 if pool.masked else 0.99)]
         self.opaque = float((matter[:, 3] > 0.99).float().mean()) if len(matter) else 1.0
         """Share of the object's pixels that nothing shines through: 0.9 and more of solid things, 0.01 of a cloud."""
         bright = matter[matter[:, 3] > 0.5][:, :3].mean(1)
         self.exposure = 1 / max(float(bright.quantile(0.95)) if 0 < len(bright) else 1.0, 1e-6)
         x, y, z = map(float, self.splits["train"].center)
         self.similarity = Similarity((x, y, z), float(self.splits["train"].radius))
+        self.solid = self.opaque > SOLID
+        """Whether the object has a skin."""
+        self.on_lens = all(p.on_lens for p in self.photographs.values())
+        """Whether all lights are at their lenses, as far as the data set tells."""
+        self.gains: Gains | None = None
+        """Exposure and white balance of the photographs for training, where nobody measured them."""
         self.bounced: Bounced | None = None
         """Light of the flashes that bounced, of a recipe that counts with it."""
         self.given: dict | None = None
         """How the field was trained that :meth:`take` took."""
-        self.step, self.spent = 0, 0.0
+        self.step, self.spent = 0, time.monotonic() - start
         self.rate = 1.0
         """Factor of the learning rates, halved by every fault."""
         self.watch = monitor.Watch()
@@ -59,9 +80,21 @@ class Descent:
         self.trained = [0, 0]
         """Camera rays and their samples that this process has trained on."""
 
+    def note(self, text: str) -> None:
+        """Tell the user `text`, once, and keep it for the report."""
+        if text not in self.notes:
+            self.notes.append(text)
+            if parallel.first():
+                monitor.note(text)
+
+    @property
+    def light(self) -> Light:
+        """What lights the photographs."""
+        return Light(self.bounced)
+
     def progress(self) -> float:
         """Share of the run that is done, in [0, 1]."""
-        return max(self.step / self.steps, self.spent / (60 * self.minutes))
+        return max(self.step / self.steps, self.spent / (60 * self.minutes * (1 - SCORING)))
 
     def advance(self) -> float:
         """One optimiser step of whatever the recipe trains now; returns the loss. Raises Fault."""

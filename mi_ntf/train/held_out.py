@@ -7,29 +7,29 @@ from .losses import tau
 from .marched import Marched, chords, uniform_directions
 from .networks import Networks, crossings
 from .occupancy import Occupancy
-from .rays import Rays
+from .rays import Photographs
 
 STEPS = 2048
 
 
 @torch.no_grad()
-def score(networks: Networks, occupancy: Occupancy, rays: Rays, count: int = 4096,
+def score(networks: Networks, occupancy: Occupancy, photographs: Photographs, count: int = 4096,
           chunk: int = 512) -> dict[str, float]:
     """``rms`` and ``bias`` of τ_nt against the field's own marched τ, on about `count` pairs of a shading point of the
-    (held-out) `rays` and a light in a random direction; `occupancy`: of :func:`mi_ntf.train.evaluate.occupied`. Empty
-    where no ray sees matter."""
+    (held-out) `photographs` and a light in a random direction; `occupancy`: of
+    :func:`mi_ntf.train.evaluate.occupied`. Empty where no ray sees matter."""
     generator = device.generator(4)
     marched = Marched()
     marched.update(networks, occupancy)
-    rays = rays[(rays.target[:, 3] > 0.5).nonzero()[:, 0]]
     errors = [torch.zeros(0)]
-    for _ in range(0, count if len(rays) else 0, chunk):
-        some = rays[torch.randint(len(rays), (chunk,), generator=generator)]
+    for _ in range(0, count, chunk):
+        some = photographs[photographs.random(16 * chunk, generator)]
+        some = some[(some.target[:, 3] > 0.5).nonzero()[:chunk, 0]]
         m, h = chords(some.o, some.d)
         profile = marched.march(m, -some.d, h, STEPS)
-        lost = torch.rand(chunk, 1, generator=generator) * -torch.expm1(-profile[:, :1])
+        lost = torch.rand(len(some), 1, generator=generator) * -torch.expm1(-profile[:, :1])
         x = m - crossings(profile, h, -torch.log1p(-lost)) * some.d
-        d = uniform_directions(chunk, generator)
+        d = uniform_directions(len(some), generator)
         m, h = chords(x, d)
         profile = marched.march(m, d, h, STEPS)
         t = (x * d).sum(1, keepdim=True)

@@ -11,10 +11,10 @@ from pathlib import Path
 import torch
 
 from ..core.errors import MiNtfError
-from . import device, evaluate, losses, networks, occupancy, parallel
+from . import device, losses, networks, occupancy, parallel
 from .config import HierarchicalConfig
 from .descent import FIELD, Descent, total
-from .marched import chords, random_chords
+from .marched import CUT, chords, random_chords
 from .networks import Networks, density_from_log
 from .rays import Rays
 from .render import Image, render, scatter_sum
@@ -84,10 +84,11 @@ class Hierarchical(Descent):
 
     config: HierarchicalConfig
 
-    def __init__(self, dataset: Path, config: HierarchicalConfig, minutes: float | None, steps: int | None, seed: int):
+    def __init__(self, dataset: Path, config: HierarchicalConfig, minutes: float | None, steps: int | None, seed: int,
+                 reading: dict | None = None, estimate: bool = False):
         if config.architecture.transmittance.encoding.kind == "depth":
             raise MiNtfError("the paper's recipe bakes no density, which this --ntf reads; take --ntf ray or none")
-        super().__init__(dataset, config, minutes, steps, seed)
+        super().__init__(dataset, config, minutes, steps, seed, reading)
         initial = networks.initial(config.architecture, config.log_density, self.generator)
         tensors = {k: v for k, v in initial.tensors.items() if k.split(".")[0] in FIELD}
         self.coarse = parallel.share(Networks(config.architecture, tensors))
@@ -95,8 +96,11 @@ class Hierarchical(Descent):
         field = [v for k, v in fine if k.split(".")[0] in FIELD] + list(tensors.values())
         rest = [v for k, v in fine if k.split(".")[0] not in FIELD]
         self.optimizers = {"field": self._adam(field), "ntf": self._adam(rest)}
-        camera = self.rays["train"]
-        self.distance, self.light = camera.o.norm(dim=1).mean(), camera.light.mean(0)
+        camera = self.photographs["train"]
+        if estimate or not self.on_lens:
+            raise MiNtfError("the preset 'paper' needs a flash at the lens, and these photographs' is elsewhere; take "
+                             "the preset 'fast'")
+        self.distance, self.power = camera.origin.norm(dim=1).mean().float(), camera.light.mean(0)
 
     def _adam(self, tensors: list[torch.Tensor]) -> torch.optim.Adam:
         return torch.optim.Adam([{"params": tensors, "base": self.config.lr}], fused=True)
@@ -106,19 +110,20 @@ class Hierarchical(Descent):
 
     def occupied(self) -> occupancy.Occupancy:
         generator = device.generator(3)
-        return occupancy.from_networks(self.nets, self.config.cells, evaluate.CUT, generator)
+        return occupancy.from_networks(self.nets, self.config.cells, CUT, generator)
 
     def patches(self) -> Rays:
         """The rays of one square patch of each of ``config.images`` random photographs."""
         c, g = self.config, self.generator
-        count, height, width = self.splits["train"].images.shape[:3]
+        pool = self.photographs["train"]
+        count, height, width = pool.views, pool.height, pool.width
         size = min(c.patch, height, width)
         image = torch.randperm(count, generator=g)[:c.images]
         row = torch.randint(height - size + 1, (len(image),), generator=g)
         column = torch.randint(width - size + 1, (len(image),), generator=g)
         step = torch.arange(size)
         pixel = ((image * height + row)[:, None, None] + step[:, None]) * width + column[:, None, None] + step
-        return self.rays["train"][pixel.reshape(-1)]
+        return pool[pixel.reshape(-1)]
 
     def random_rays(self) -> Rays:
         """Chords of two uniform points, seen and lit from as far as the photographs were taken; no pixels."""
@@ -126,7 +131,7 @@ class Hierarchical(Descent):
         m, h = chords(m, toward)
         far = torch.maximum(self.distance, h + 0.01)
         n = len(m)
-        return Rays(m + far[:, None] * toward, -toward, far - h, far + h, torch.zeros(n, 4), self.light.expand(n, 3),
+        return Rays(m + far[:, None] * toward, -toward, far - h, far + h, torch.zeros(n, 4), self.power.expand(n, 3),
                     torch.zeros(n, dtype=torch.long))
 
     def ntf_loss(self, seen: View, rays: Rays, target: torch.Tensor) -> dict[str, torch.Tensor]:

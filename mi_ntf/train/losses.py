@@ -19,13 +19,15 @@ DARK = 0.05
 """Brightness, in units of the photographs' bright parts, below which differences count absolutely."""
 
 
-def color(predicted: torch.Tensor, target: torch.Tensor, exposure: float) -> torch.Tensor:
+def color(predicted: torch.Tensor, target: torch.Tensor, exposure: float,
+          trust: torch.Tensor | float = 1.0) -> torch.Tensor:
     """(p − t)²/(p + DARK) of exposed linear RGB: the squared error after a square-root tone curve, to first order.
 
-    The denominator is detached, so the minimum is the mean of noisy targets (Mildenhall et al. 2022, eq. 4).
+    The denominator is detached, so the minimum is the mean of noisy targets (Mildenhall et al. 2022, eq. 4). `trust`
+    (n, 3): what each channel counts.
     """
     p, t = predicted * exposure, target * exposure
-    return ((p - t) ** 2 / (p.detach() + DARK)).mean()
+    return (trust * (p - t) ** 2 / (p.detach() + DARK)).mean()
 
 
 def normals(image: Image, d: torch.Tensor, baked: Baked):
@@ -173,8 +175,9 @@ def training_rays(marched: Marched, rays: Rays, count: int, augment: bool, gener
 
 
 def transmittance_color(networks: Networks, marched: Marched, image: Image, rays: Rays, exposure: float,
-                        count: int) -> torch.Tensor:
-    """‖I_nt − I‖² of the first `count` rays: pixels lit by τ_nt instead of the marched light (method.md, section 5)."""
+                        count: int, gain: torch.Tensor | float = 1.0) -> torch.Tensor:
+    """‖I_nt − I‖² of the first `count` rays: pixels lit by τ_nt instead of the marched light (method.md, section 5),
+    times `gain` (count, 3)."""
     near = (image.shaded < count).nonzero()[:, 0]
     ray, x = image.shaded[near], image.x[near]
     o, toward = rays.o[:count], -rays.d[:count]
@@ -183,4 +186,4 @@ def transmittance_color(networks: Networks, marched: Marched, image: Image, rays
     lit = tau(mix[ray], (x * toward[ray]).sum(1, keepdim=True))
     pixel = scatter_sum(image.weight[near, None].detach() * lit * image.radiance[near].detach(), ray, count)
     other = image.bounced[:count].detach() if torch.is_tensor(image.bounced) else 0.0
-    return color(pixel + other, rays.target[:count, :3], exposure)
+    return color(gain * (pixel + other), rays.target[:count, :3], exposure)

@@ -7,10 +7,16 @@ from ..core import spheres
 from ..core.architecture import LOG_FLOOR, MAX_LOG_DENSITY
 from . import ops
 from .baked import fetch
-from .evaluate import CUT
 from .networks import Networks
 from .occupancy import Occupancy
+from .rays import sphere_span
 
+CUT = 0.1
+"""The renderer treats σ below this as empty."""
+STEP = 1 / 128
+"""Of :func:`walk`."""
+BLOCK = 16
+"""Its steps between two looks at which rays have ended."""
 SCALE = 2
 """Voxels per cell of the occupancy grid, along an edge: 192³ in all, 288³ for photographs of 512². The renderer has
 384³."""
@@ -19,6 +25,10 @@ SCALE = 2
 class Marched:
     """`log_sigma` (1, 1, k, k, k), ln σ on [−1, 1]³ as [z, y, x], baked as the renderer does, and `reach`, the radius
     of the ball around the origin that holds all matter; both from :meth:`update`."""
+
+    @property
+    def known(self) -> bool:
+        return hasattr(self, "log_sigma")
 
     @torch.no_grad()
     def update(self, networks: Networks, occupancy: Occupancy) -> None:
@@ -79,3 +89,31 @@ def chords(o: torch.Tensor, d: torch.Tensor):
     """``(m, h)``, midpoints (n, 3) and half chords (n,) of lines that meet the sphere."""
     _, m, h = spheres.chord(ops, o.unbind(1), d.unbind(1))
     return torch.stack(m, 1), h
+
+
+def walk(marched: Marched, o: torch.Tensor, d: torch.Tensor, until: float, reach: torch.Tensor | float = torch.inf):
+    """``(t, depth)`` of rays from `o` (n, 3) along `d`, which end at the distance `reach`: where they pass the optical
+    depth `until` (infinity: nowhere within the unit sphere), and the depth at their ends, that of a ray which passes
+    `until` within the next BLOCK steps."""
+    t, depth = torch.full((len(o),), torch.inf), torch.zeros(len(o))
+    start, end = sphere_span(o, d)
+    start = torch.where((o * o).sum(1) < 1, 0.0, start)
+    end = torch.minimum(end, torch.as_tensor(reach))
+    active, first = (end > start).nonzero()[:, 0], 0
+    while len(active):
+        k = first + torch.arange(BLOCK)
+        along = start[active, None] + (k + 0.5) * STEP
+        x = o[active, None] + along[:, :, None] * d[active, None]
+        sigma = fetch(marched.log_sigma, x.reshape(-1, 3))[0].view(along.shape).exp()
+        sigma = torch.where((sigma > CUT) & (along < end[active, None]), sigma, 0.0)
+        total = depth[active, None] + (sigma * STEP).cumsum(1)
+        passed = total >= until
+        some = passed.any(1)
+        place = passed.to(torch.uint8).argmax(1, keepdim=True)
+        over = (total.gather(1, place) - until) / (sigma.gather(1, place) * STEP).clamp(min=1e-9)
+        at = along.gather(1, place) + (0.5 - over.clamp(0, 1)) * STEP
+        t[active] = torch.where(some, at[:, 0], t[active])
+        depth[active] = total[:, -1]
+        first += BLOCK
+        active = active[~some & (start[active] + first * STEP < end[active])]
+    return t, depth

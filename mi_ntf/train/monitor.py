@@ -4,6 +4,7 @@ import math
 import resource
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,6 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from ..core.errors import MiNtfError
-from .evaluate import srgb
 
 
 class Fault(MiNtfError):
@@ -49,14 +49,17 @@ class Watch:
 
 
 class Display:
-    """Progress bar with loss, validation PSNR, memory and time left, on standard error; silent unless `shown`."""
+    """Progress bar with time left, of a run with loss, validation PSNR and memory, on standard error; silent unless
+    `shown`. `what`: its name."""
 
-    def __init__(self, shown: bool):
-        columns = (TextColumn("train"), BarColumn(), TextColumn("{task.percentage:3.0f}%"),
-                   TextColumn("step {task.fields[step]}  loss {task.fields[loss]:.4f}  val {task.fields[psnr]:.2f} dB  "
-                              "{task.fields[memory]:.1f} GiB"), TimeRemainingColumn())
+    RUN = "step {task.fields[step]}  loss {task.fields[loss]:.4f}  val {task.fields[psnr]:.2f} dB  "
+
+    def __init__(self, shown: bool, what: str = "train"):
+        columns = (TextColumn(what), BarColumn(), TextColumn("{task.percentage:3.0f}%"),
+                   TextColumn((self.RUN if what == "train" else "") + "{task.fields[memory]:.1f} GiB"),
+                   TimeRemainingColumn())
         self.bar = Progress(*columns, console=Console(stderr=True, quiet=not shown), disable=not shown)
-        self.task = self.bar.add_task("train", total=1.0, step=0, loss=0.0, psnr=float("nan"), memory=0.0)
+        self.task = self.bar.add_task(what, total=1.0, step=0, loss=0.0, psnr=float("nan"), memory=0.0)
 
     def __enter__(self) -> "Display":
         self.bar.__enter__()
@@ -65,7 +68,7 @@ class Display:
     def __exit__(self, *reason) -> None:
         self.bar.__exit__(*reason)
 
-    def update(self, progress: float, step: int, loss: float) -> None:
+    def update(self, progress: float, step: int = 0, loss: float = 0.0) -> None:
         self.bar.update(self.task, completed=progress, step=step, loss=loss, memory=memory())
 
     def validated(self, entry: dict) -> None:
@@ -110,13 +113,12 @@ class Log:
         for name, value in (values | rates).items():
             self.writer.add_scalar(name, value, step)
 
-    def validated(self, entry: dict, target: torch.Tensor, color: torch.Tensor, normal: torch.Tensor) -> None:
-        """Write the PSNR of `entry`, and pictures (h, w, 3) side by side: photograph, prediction (linear), normals."""
+    def validated(self, entry: dict, picture: Callable[[], torch.Tensor]) -> None:
+        """Write the PSNR of `entry` and a picture (h, w, 3) of photograph, prediction and normals, side by side."""
         if self.writer is None:
             return
-        picture = torch.cat([srgb(target), srgb(color), (normal + 1) / 2], 1)
         self.writer.add_scalar("validation/PSNR dB", entry["psnr"], entry["step"])
-        self.writer.add_image("validation/photograph, prediction, normals", picture.clamp(0, 1), entry["step"],
+        self.writer.add_image("validation/photograph, prediction, normals", picture(), entry["step"],
                               dataformats="HWC")
         self.writer.flush()
 

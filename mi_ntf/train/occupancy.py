@@ -72,19 +72,10 @@ class Occupancy:
         i, j, k = (((c + 1) * (n / 2)).int().clamp(0, n - 1) for c in (x, y, z))
         return self.sigma[(i * n + j) * n + k]
 
-    @torch.no_grad()
-    def tighten(self, rays: Rays, chunk: int = 32768) -> tuple[torch.Tensor, Rays]:
-        """The rays that meet an occupied cell, with `t0`, `t1` around those cells. Also returns their indices.
-
-        Two passes, blocks of 4³ cells (and their neighbours), then cells: most rays leave early.
-        """
-        n, block = self.cells, 4
-        full = F.pad((self.sigma >= 0).float().view(1, 1, n, n, n), (0, -n % block) * 3)
-        coarse = F.max_pool3d(F.max_pool3d(full, block), 3, 1, 1)[0, 0] > 0
-        extent = 2 * coarse.shape[0] * block / n  # blocks may stick out of [−1, 1]³
-        index, rays = _spans(rays, coarse, extent, 2 * block / n, chunk)
-        fine, rays = _spans(rays, (self.sigma >= 0).view(n, n, n), 2.0, 1 / n, chunk)
-        return index[fine], rays
+    def tighten(self, rays: Rays) -> tuple[torch.Tensor, Rays]:
+        """:class:`Spans` of the cells that are occupied now."""
+        n = self.cells
+        return Spans((self.sigma >= 0).view(n, n, n))(rays)
 
     @torch.no_grad()
     def visible(self, rays: Rays, step: float, generator: torch.Generator):
@@ -99,6 +90,35 @@ class Occupancy:
         ahead = depth - sigma.clamp(min=0) * step < OPAQUE_DEPTH
         ray, k = torch.nonzero((sigma >= 0) & ahead & (t < rays.t1[:, None]) & (t > rays.t0[:, None]), as_tuple=True)
         return ray, (rays.t0[:, None] + near * step)[ray, k]
+
+
+class Spans:
+    """Which rays meet a cell of `full` (n, n, n) bool, [x, y, z], that covers [−1, 1]³, and between where and where.
+
+    Two passes, blocks of 4³ cells (and their neighbours), then cells: most rays leave early.
+    """
+
+    BLOCK = 4
+
+    def __init__(self, full: torch.Tensor):
+        n = full.shape[0]
+        self.full = full
+        padded = F.pad(full.float()[None, None], (0, -n % self.BLOCK) * 3)
+        self.coarse = F.max_pool3d(F.max_pool3d(padded, self.BLOCK), 3, 1, 1)[0, 0] > 0
+
+    @torch.no_grad()
+    def __call__(self, rays: Rays, chunk: int = 32768) -> tuple[torch.Tensor, Rays]:
+        """Indices of those `rays`, and they with `t0`, `t1` around the cells."""
+        n, edge = self.full.shape[0], self.BLOCK * self.coarse.shape[0]
+        extent = 2 * edge / n  # blocks may stick out of [−1, 1]³
+        index, rays = _spans(rays, self.coarse, extent, 2 * self.BLOCK / n, chunk)
+        fine, rays = _spans(rays, self.full, 2.0, 1 / n, chunk)
+        return index[fine], rays
+
+    def points(self) -> torch.Tensor:
+        """Centres (k, 3) of the blocks that hold full cells or are beside one that does."""
+        width = 2 * self.BLOCK / self.full.shape[0]
+        return (self.coarse.nonzero() + 0.5) * width - 1
 
 
 def widest(grid: torch.Tensor) -> torch.Tensor:
@@ -135,6 +155,8 @@ def _spans(rays: Rays, full: torch.Tensor, extent: float, step: float, chunk: in
         keep.append(some + first)
         starts.append(torch.maximum(part.t0[some] + (a - 0.5) * step, part.t0[some]))
         ends.append(torch.minimum(part.t0[some] + (b + 1.5) * step, part.t1[some]))
+    if not keep:
+        return torch.arange(0), rays
     index = torch.cat(keep)
     kept = rays[index]
     return index, Rays(kept.o, kept.d, torch.cat(starts), torch.cat(ends), kept.target, kept.light,

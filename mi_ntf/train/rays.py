@@ -1,4 +1,4 @@
-"""Photographs as a pool of camera rays in field coordinates, and what of space they leave possibly occupied."""
+"""Photographs as camera rays in field coordinates, and what of space they leave possibly occupied."""
 
 import math
 from dataclasses import dataclass
@@ -9,7 +9,8 @@ import torch.nn.functional as F
 
 from ..core import spheres
 from ..core.errors import MiNtfError
-from ..data.schema import Split, pixel_rays
+from ..data.images import LINEAR
+from ..data.schema import Split
 from . import ops
 
 
@@ -17,7 +18,7 @@ from . import ops
 class Rays:
     """n camera rays: `o`, `d` (n, 3) field coordinates, `t0`, `t1` (n,) the piece to march, `target` (n, 4) linear
     premultiplied RGBA, `light` (n, 3) the light's radiant intensity over radius²: I/d² = light/t² in scene units;
-    `view` (n,): number of the photograph."""
+    `view` (n,): number of the photograph among those of all splits."""
 
     o: torch.Tensor
     d: torch.Tensor
@@ -34,28 +35,94 @@ class Rays:
         return Rays(*(getattr(self, k)[index] for k in ("o", "d", "t0", "t1", "target", "light", "view")))
 
 
-def from_split(split: Split, name: str, first: int = 0) -> Rays:
-    """All pixels of a split, frame by frame, row by row; photographs are numbered from `first` on. The light must be at
-    the camera (method.md, section 2)."""
-    n, height, width = split.images.shape[:3]
-    away = np.linalg.norm(split.light_pos - split.c2w[:, :3, 3], axis=1) / split.radius
-    if away.max() > 0.02:
-        raise MiNtfError(f"split '{name}', frame {away.argmax()}: the light is {away.max():.3g} object radii from the "
-                         "camera; training needs photographs with a flash at the lens, as `mi-ntf capture` makes them")
-    origins, directions = pixel_rays(split.c2w, split.focal, width, height, split.principal)
-    origins = (origins - split.center) / split.radius
-    intensity = np.broadcast_to((split.light_intensity / split.radius**2)[:, None, None], (n, height, width, 3))
-    o, d, light = (torch.as_tensor(np.array(a, np.float32).reshape(-1, 3)) for a in
-                   (origins, directions, intensity))
-    t0, t1 = sphere_span(o, d)
-    view = torch.arange(first, first + n).repeat_interleave(height * width)
-    return Rays(o, d, t0, t1, torch.as_tensor(split.images.reshape(-1, 4)), light, view)
+ON_LENS = 0.02
+"""Object radii between light and lens up to which they count as one."""
 
 
-def flashes(split: Split) -> tuple[torch.Tensor, torch.Tensor]:
-    """Where the lights of the photographs are (frames, 3), field coordinates, and their :class:`Rays`' `light`."""
-    place, power = (split.light_pos - split.center) / split.radius, split.light_intensity / split.radius**2
-    return torch.as_tensor(place).float(), torch.as_tensor(power).float()
+class Photographs:
+    """The photographs of a split, as they are stored, and the camera rays through their pixels: frame by frame, row by
+    row. Pixels are decoded and rays made when they are asked for, so that a data set takes 4 to 8 bytes a pixel.
+
+    `views`: their number · `height`, `width` in pixels · `first`: the number of the first of them among all splits'.
+    """
+
+    def __init__(self, split: Split, first: int = 0):
+        self.views, self.height, self.width = split.images.shape[:3]
+        self.first, self.names, self.masked = first, split.names, split.masked
+        self.stored = torch.as_tensor(split.images).reshape(-1, 4)
+        self.levels = self.stored.dtype == torch.uint8
+        """Whether pixels are 8-bit levels, which end at both ends."""
+        exact = {"dtype": torch.float64}
+        self.rotation = torch.as_tensor(split.c2w[:, :3, :3], **exact)
+        self.origin = torch.as_tensor((split.c2w[:, :3, 3] - split.center) / split.radius, **exact)
+        self.focal, self.principal = (torch.as_tensor(v, **exact) for v in (split.focal, split.principal))
+        self.flash = torch.as_tensor((split.light_pos - split.center) / split.radius, **exact)
+        """Where the light is (views, 3), field coordinates."""
+        self.light = torch.as_tensor(split.light_intensity / split.radius**2).float()
+        self.windows = torch.tensor([0, self.height, 0, self.width]).expand(self.views, 4)
+        """First and last row and column (exclusive) that :meth:`random` draws from, (views, 4)."""
+
+    def __len__(self) -> int:
+        return len(self.stored)
+
+    @property
+    def on_lens(self) -> bool:
+        """Whether all lights are at their cameras."""
+        return bool((self.flash - self.origin).norm(dim=1).max() <= ON_LENS)
+
+    def pixels(self, index: torch.Tensor) -> torch.Tensor:
+        """Linear premultiplied RGBA (n, 4) of the pixels `index` (n,)."""
+        found = self.stored[index]
+        if not self.levels:
+            return found.float()
+        return torch.cat([torch.as_tensor(LINEAR)[found[:, :3].int()], found[:, 3:] / 255.0], 1)
+
+    def __getitem__(self, index: torch.Tensor | slice) -> Rays:
+        """The rays through pixels (n,), with `t0`, `t1` where they are inside the unit sphere."""
+        if isinstance(index, slice):
+            index = torch.arange(len(self))[index]
+        frame, place = index // (self.height * self.width), index % (self.height * self.width)
+        image = torch.stack([place % self.width, place // self.width], 1) + 0.5
+        across = (image - self.principal[frame]) / self.focal[frame]
+        local = torch.stack([across[:, 0], -across[:, 1], -torch.ones_like(across[:, 0])], 1)
+        d = F.normalize((self.rotation[frame] @ local[:, :, None])[:, :, 0], dim=1).float()
+        o = self.origin[frame].float()
+        return Rays(o, d, *sphere_span(o, d), self.pixels(index), self.light[frame], frame + self.first)
+
+    def random(self, count: int, generator: torch.Generator) -> torch.Tensor:
+        """`count` random pixels of the windows, all equally likely."""
+        top, bottom, left, right = self.windows.unbind(1)
+        ends = ((bottom - top) * (right - left)).cumsum(0)
+        pick = torch.randint(int(ends[-1]), (count,), generator=generator)
+        frame = torch.searchsorted(ends, pick, right=True)
+        place = ends[frame] - 1 - pick
+        wide = (right - left)[frame]
+        return (frame * self.height + top[frame] + place // wide) * self.width + left[frame] + place % wide
+
+    def look_at(self, points: torch.Tensor, margin: float) -> None:
+        """Set the windows around all `points` (n, 3), each with `margin` around it, field coordinates."""
+        windows = []
+        for rotation, origin, focal, principal in zip(self.rotation, self.origin, self.focal, self.principal,
+                                                      strict=True):
+            local = (points.double() - origin) @ rotation
+            depth = -local[:, 2]
+            near = depth.clamp(min=2 * margin)
+            across = local[:, :2] / near[:, None] * torch.tensor([1.0, -1.0], dtype=torch.float64) * focal + principal
+            reach = margin / (near - margin)[:, None] * focal * (local.norm(dim=1) / near)[:, None] + 1
+            low, high = (across - reach).amin(0), (across + reach).amax(0)
+            size = torch.tensor([self.width, self.height])
+            if bool((depth < 2 * margin).any()):  # the camera is among the points
+                low, high = torch.zeros(2), size
+            low = torch.minimum(low.floor().clamp(min=0).long(), size - 1)
+            high = torch.maximum(torch.minimum(high.ceil().long(), size), low + 1)
+            windows.append(torch.stack([low[1], high[1], low[0], high[0]]))
+        self.windows = torch.stack(windows)
+
+    def frame(self, number: int, stride: int = 1) -> tuple[torch.Tensor, int, int]:
+        """``(pixels, rows, columns)`` of photograph `number` (0 to views − 1), every `stride`-th row and column."""
+        rows, columns = (torch.arange(stride // 2, n, stride) for n in (self.height, self.width))
+        pixels = ((number * self.height + rows[:, None]) * self.width + columns).reshape(-1)
+        return pixels, len(rows), len(columns)
 
 
 def sphere_span(o: torch.Tensor, d: torch.Tensor):
@@ -72,7 +139,7 @@ def pixel_width(split: Split) -> float:
     return float(np.median(distance / split.focal.max(1)))
 
 
-def visual_hull(split: Split, cells: int) -> torch.Tensor:
+def visual_hull(photographs: Photographs, cells: int) -> torch.Tensor:
     """Cells (cells, cells, cells) bool, [x, y, z], of [−1, 1]³ that no photograph shows empty.
 
     A cell is empty if some image that contains it has alpha 0 wherever the cell can project to.
@@ -81,21 +148,21 @@ def visual_hull(split: Split, cells: int) -> torch.Tensor:
     x = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
     inside = (x.norm(dim=1) < 1 + 2 / cells).nonzero()[:, 0]
     x = x[inside]
-    height, width = split.images.shape[1:3]
-    for image, c2w, focal, principal in zip(split.images, split.c2w, split.focal, split.principal, strict=True):
-        (fx, fy), (cx, cy) = focal.tolist(), principal.tolist()
-        rotation = torch.tensor(c2w[:3, :3], dtype=torch.float32)
-        origin = torch.tensor((c2w[:3, 3] - split.center) / split.radius, dtype=torch.float32)
-        local = (x - origin) @ rotation
+    height, width = photographs.height, photographs.width
+    for number in range(photographs.views):
+        (fx, fy), (cx, cy) = photographs.focal[number].tolist(), photographs.principal[number].tolist()
+        local = (x - photographs.origin[number].float()) @ photographs.rotation[number].float()
         depth = (-local[:, 2]).clamp(min=1e-3)
         nearest = max(float(depth.min()), 2 / cells)
         reach = math.ceil(math.sqrt(3) / cells * max(fx, fy) / nearest) + 1
-        alpha = torch.tensor(image[None, None, :, :, 3])
-        alpha = F.max_pool2d(alpha, 2 * reach + 1, 1, reach)[0, 0]
+        pixels, *_ = photographs.frame(number)
+        shown = (photographs.pixels(pixels)[:, 3] >= 1e-3).float().view(1, 1, height, width)
+        for size in ((2 * reach + 1, 1), (1, 2 * reach + 1)):
+            shown = F.max_pool2d(shown, size, 1, (size[0] // 2, size[1] // 2))
         u = (cx + fx * local[:, 0] / depth).floor().long()
         v = (cy - fy * local[:, 1] / depth).floor().long()
         seen = (u >= 0) & (u < width) & (v >= 0) & (v < height) & (local[:, 2] < 0)
-        empty = seen & (alpha[v.clamp(0, height - 1), u.clamp(0, width - 1)] < 1e-3)
+        empty = seen & (shown[0, 0, v.clamp(0, height - 1), u.clamp(0, width - 1)] == 0)
         x, inside = x[~empty], inside[~empty]
     if not len(inside):
         raise MiNtfError("no point in space is covered by the object in all photographs; check 'transform_matrix' "

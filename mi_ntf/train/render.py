@@ -17,6 +17,7 @@ import torch.nn.functional as F
 
 from ..core import fresnel, microfacet
 from . import ops
+from .flash import Flash
 from .networks import Networks, density_from_log
 from .rays import Rays
 
@@ -48,24 +49,38 @@ class Image:
     index: torch.Tensor
     weight: torch.Tensor
     normal: torch.Tensor
+    albedo: torch.Tensor
     gloss: tuple[torch.Tensor, torch.Tensor]
     radiance: torch.Tensor
     raw: torch.Tensor
     bounced: torch.Tensor | float
 
 
-def weights(sigma: torch.Tensor, ray: torch.Tensor, width: float | torch.Tensor):
-    """``(w, v)``, alpha and light weights of packed samples: `ray` (s,) ascending, `sigma` (s,), `width` one or (s,).
+@dataclass(frozen=True)
+class Optical:
+    """Packed samples' optical depths (s,): `depth` of their cells, `front` of what is between them and the camera."""
 
-    Sums run over all rays at once, in float64: at the last ray the sum is 10⁵, of which float32 keeps two decimals.
-    """
-    depth = sigma * width
-    total = depth.double().cumsum(0)
-    first = torch.searchsorted(ray, ray)
-    before = total - depth
-    front = (before - before[first]).float()
-    t = torch.exp(-front)
-    return t * (1 - torch.exp(-depth)), t * t * (1 - torch.exp(-2 * depth)) / 2
+    depth: torch.Tensor
+    front: torch.Tensor
+
+    @classmethod
+    def of(cls, sigma: torch.Tensor, ray: torch.Tensor, width: float | torch.Tensor) -> "Optical":
+        """`ray` (s,) ascending, `sigma` (s,), `width` one or (s,).
+
+        Sums run over all rays at once, in float64: at the last ray the sum is 10⁵, of which float32 keeps two decimals.
+        """
+        depth = sigma * width
+        total = depth.double().cumsum(0)
+        before = total - depth
+        return cls(depth, (before - before[torch.searchsorted(ray, ray)]).float())
+
+    def __getitem__(self, index) -> "Optical":
+        return Optical(self.depth[index], self.front[index])
+
+    def weights(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """``(w, v)``, alpha and light weights."""
+        t = torch.exp(-self.front)
+        return t * (1 - torch.exp(-self.depth)), t * t * (1 - torch.exp(-2 * self.depth)) / 2
 
 
 @torch.no_grad()
@@ -131,28 +146,46 @@ def diffuse_albedo(reflectance: tuple, rim: bool) -> torch.Tensor:
     return fresnel.diffuse_albedo(ops, albedo, roughness[:, None], specular[:, None], rim)
 
 
-def render(networks: Networks, rays: Rays, samples, bounced=None,
-           generator: torch.Generator | None = None, lobes: bool = True) -> Image:
+def render(networks: Networks, rays: Rays, samples, bounced=None, generator: torch.Generator | None = None,
+           lobes: bool = True, flash: Flash | None = None) -> Image:
     """Colour and alpha of `rays` from packed samples ``(ray, t, width)``, each in a cell of its width.
 
     `bounced` (:class:`mi_ntf.train.bounced.Bounced`, drawn from by `generator`): further bounces of the flashes' light.
-    `lobes`: whether roughness and specular weight have derivatives.
+    `lobes`: whether roughness and specular weight have derivatives. `flash`: where the light comes from; the lens,
+    unless told.
     """
     ray, t, width = samples
     x = torch.addcmul(rays.o[ray], rays.d[ray], t[:, None])
     raw = networks.log_density(x)
-    w, v = weights(density_from_log(raw), ray, width)
+    seen = Optical.of(density_from_log(raw), ray, width)
+    w, v = seen.weights()
     alpha = scatter_sum(w, ray, len(rays))
     near = (w.detach() > MIN_WEIGHT).nonzero()[:, 0]
-    ray, t, x = ray[near], t[near], x[near]
+    ray, t, x, w, view = ray[near], t[near], x[near], w[near], rays.view[ray[near]]
     reflectance = networks.reflectance(x)
     if not lobes:
         reflectance = *reflectance[:2], *(v.detach() for v in reflectance[2:])
-    radiance = shade(reflectance, rays.d[ray], t, rays.light[ray], networks.fresnel)
-    color, indirect = scatter_sum(v[near, None] * radiance, ray, len(rays)), 0.0
+    if flash is None:
+        radiance = shade(reflectance, rays.d[ray], t, rays.light[ray], networks.fresnel)
+        color = scatter_sum(v[near, None] * radiance, ray, len(rays))
+    else:
+        radiance = flash.send(seen[near], reflectance, rays.d[ray], x, view, rays.light[ray], networks.fresnel)
+        color = scatter_sum(radiance, ray, len(rays)) * _lit(flash, rays, ray, w.detach(), x, reflectance[0].detach())
+    indirect: torch.Tensor | float = 0.0
     if bounced is not None and bounced.known:
-        irradiance = bounced(rays.view[ray], x, reflectance[0], generator)
+        irradiance = bounced(view, x, reflectance[0], generator)
         sent = diffuse_albedo(reflectance, networks.fresnel) * irradiance * microfacet.INV_PI
-        indirect = scatter_sum(w[near, None] * sent, ray, len(rays))
+        indirect = scatter_sum(w[:, None] * sent, ray, len(rays))
         color = color + indirect
-    return Image(color, alpha, x, ray, near, w[near], reflectance[0], reflectance[2:], radiance, raw, indirect)
+    normal, albedo, *gloss = reflectance
+    return Image(color, alpha, x, ray, near, w, normal, albedo, tuple(gloss), radiance, raw, indirect)
+
+
+def _lit(flash: Flash, rays: Rays, ray: torch.Tensor, w: torch.Tensor, x: torch.Tensor, normal: torch.Tensor):
+    """Share (n, 1) of the flash's light that reaches what each of the rays sees."""
+    both = scatter_sum(torch.cat([w[:, None] * x, w[:, None] * normal], 1), ray, len(rays))
+    total = scatter_sum(w, ray, len(rays))
+    some = (total > MIN_WEIGHT).nonzero()[:, 0]
+    found = torch.ones(len(rays), 1)
+    found[some, 0] = flash.lit(rays.view[some], both[some, :3] / total[some, None], both[some, 3:])
+    return found

@@ -6,21 +6,29 @@ from pathlib import Path
 import torch
 
 from ..core.architecture import MAX_LOG_DENSITY, Header
-from . import losses, rays, render
+from ..core.errors import MiNtfError
+from . import device, losses, offset, rays, render
 from .baked import Baked
-from .bounced import Bounced
+from .bounced import SEEN, Bounced
 from .config import TrainConfig
 from .descent import FIELD, Descent, total
+from .evaluate import Light
+from .flash import Flash
 from .marched import Marched
-from .occupancy import LOG_EMPTY, Occupancy
+from .occupancy import LOG_EMPTY, Occupancy, Spans
+from .photometry import Gains, trust
 
 ROUNDS = (0.3, 0.45, 0.6, 0.75)
 """Shares of the run at which the light that bounced is found: the skin has formed, and albedo follows at once."""
 SPACED = 20.0
 """Seconds of a run for each of these rounds, which take some each: the shortest runs do without."""
-SOLID = 0.5
-"""Share of the object's pixels that nothing may shine through, or it is smoke, which has no skin, and whose
-bounces are others."""
+ESTIMATES = (0.1, 0.2, 0.3, 0.4, 0.55)
+"""Shares of the run at which the flash's place is looked for, if that is not known: the place and the shape that is
+learned with it come nearer to the truth in turns."""
+NOTICED = 6.0
+"""Degrees between flash and lens that are worth a warning: nearer ones, as on cameras, change no reflectance."""
+ROOM = 0.02
+"""Share of the flash that the room sends back, at the start."""
 SURFACE_LEVEL = 3.0
 """ln σ where skins meet the surfaces that photographs show: of `statue`, within 0.001 radii of the mesh (median)."""
 REFRESH = 32
@@ -33,34 +41,67 @@ NEAR = 96
 class Stepper(Descent):
     """The recipe of the project's own: planes, an occupancy grid in the visual hull, transmittance after the field."""
 
-    HELD = (*Descent.HELD, "samples_per_ray", "last_bake", "rounds", "steep")
+    HELD = (*Descent.HELD, "samples_per_ray", "last_bake", "rounds", "steep", "meeting", "estimates", "notes")
     GRIDS = (("occupancy", ("sigma", "level", "stray")), ("baked", ("slope",)), ("marched", ("log_sigma", "reach")),
-             ("bounced", ("table", "light")))
+             ("bounced", ("table", "light", "open")), ("flash", ("place",)))
     config: TrainConfig
 
-    def __init__(self, dataset: Path, config: TrainConfig, minutes: float | None, steps: int | None, seed: int):
-        super().__init__(dataset, config, minutes, steps, seed)
+    def __init__(self, dataset: Path, config: TrainConfig, minutes: float | None, steps: int | None, seed: int,
+                 reading: dict | None = None, estimate: bool = False):
+        super().__init__(dataset, config, minutes, steps, seed, reading)
+        if estimate and not self.on_lens:
+            raise MiNtfError("--flash-offset estimate: the data set says where its lights are; leave the option out")
+        pool = self.photographs["train"]
         self.config = config = config.sharpened(rays.pixel_width(self.splits["train"]))
+        if config.gains and not self.splits["train"].calibrated:
+            self.gains = Gains(pool)
+        self.room = None if self.gains is None else torch.nn.Parameter(torch.full((3,), math.log(ROOM)))
+        """What the room sends back of the flash, see :class:`mi_ntf.train.bounced.Bounced`; renderings have no room."""
         self.optimizers = {"field": self._optimizer(*FIELD), "ntf": self._optimizer("transmittance", "visibility")}
-        self.occupancy = Occupancy(rays.visual_hull(self.splits["train"], config.cells))
+        hull = rays.visual_hull(pool, config.cells)
+        self.occupancy, self.spans = Occupancy(hull), Spans(hull)
         # Rays that miss the hull have nothing to teach. All others stay for good: matter may grow into any of them.
-        _, self.seen = self.occupancy.tighten(self.rays["train"])
+        pool.look_at(self.spans.points(), Spans.BLOCK * math.sqrt(3) / config.cells)
+        self.meeting = 0.5
+        """Share of the pixels looked at whose rays meet the hull."""
         self.baked, self.marched = Baked(config.bake), Marched()
         self.samples_per_ray, self.last_bake = 30.0, 0
         self.rounds = 0
         """How often the bounced light was found."""
-        solid = self.opaque > SOLID
-        self.steep = not solid
+        self.steep = not self.solid
         """Whether skins were made steeper, or there are none."""
-        if config.bounces and solid:
-            flashes = [rays.flashes(split) for split in self.splits.values()]
-            self.bounced = Bounced(*(torch.cat(parts) for parts in zip(*flashes, strict=True)))
+        everyone = list(self.photographs.values())
+        self.flash = Flash(everyone, self.solid, self.marched)
+        """Where the lights are."""
+        self.estimating, self.estimates = estimate, 0
+        """Whether the lights' place beside the lenses is to be found, and how often it was."""
+        self.lens = self.on_lens and not estimate
+        """Whether the lights are at the lenses for good."""
+        if config.bounces and self.solid:
+            self.bounced = Bounced(self.flash, torch.cat([p.light for p in everyone]), self.room)
+
+    @property
+    def light(self) -> Light:
+        return Light(self.bounced, self.elsewhere, self.gains is not None)
+
+    @property
+    def elsewhere(self) -> Flash | None:
+        """The lights, if they are not at the lenses."""
+        return None if self.lens else self.flash
+
+    def parameters(self) -> dict[str, torch.Tensor]:
+        if self.gains is None or self.room is None:
+            return self.nets.tensors
+        return self.nets.tensors | {"gains": self.gains.logs, "room": self.room}
 
     def _optimizer(self, *names: str) -> torch.optim.Adam:
         tensors = {k: v for k, v in self.nets.tensors.items() if k.split(".")[0] in names}
         planes = {"params": [v for k, v in tensors.items() if ".planes." in k], "base": self.config.lr_planes}
         layers = {"params": [v for k, v in tensors.items() if ".layers." in k], "base": self.config.lr_layers}
-        return torch.optim.Adam([planes, layers], betas=(0.9, 0.99), eps=1e-12, fused=True)
+        groups = [planes, layers]
+        if self.gains is not None and names == FIELD:
+            groups.append({"params": [self.gains.logs, self.room], "base": self.config.lr_gains})
+        return torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12, fused=True)
 
     def carve(self, steps: int = 300, points: int = 4096) -> None:
         """Give the density the shape of the visual hull, ln σ by regression: seconds that save minutes."""
@@ -103,12 +144,38 @@ class Stepper(Descent):
         if not self.steep and not done and self.progress() >= self.config.steepen_at:
             self.make_steep()
         due = self.step % (4 * REFRESH) == 0 and not (done and self.step > self.last_bake + 8 * REFRESH)
-        if due or (self.progress() >= self.config.ntf_from and not hasattr(self.marched, "log_sigma")):
+        if due or (self.progress() >= self.config.ntf_from and not self.marched.known):
             self.bake()
         if not done and self.rounds < len(ROUNDS) and self.progress() >= ROUNDS[self.rounds]:
             # Runs given in steps are the same whatever the clock says.
             if self.minutes == math.inf or self.spent >= SPACED * (self.rounds + 1):
                 self.find_bounced()
+        looked = self.solid and (self.estimating or not self.splits["train"].located)
+        if looked and not done and self.estimates < len(ESTIMATES) and self.progress() >= ESTIMATES[self.estimates]:
+            self.find_flash()
+
+    def find_flash(self) -> None:
+        """Find where the flash stands beside the lens, and put it there; or warn if the lens was taken for its place.
+        """
+        self.estimates += 1
+        self.baked.update(self.nets, self.occupancy)
+        self.marched.update(self.nets, self.occupancy)
+        pool = self.photographs["train"]
+        some = self.draw(4 * offset.POINTS, device.generator(7 + self.estimates))
+        seen = offset.observe(pool, some, self.baked, self.marched)
+        distance = float(pool.origin.norm(dim=1).median())
+        found = offset.estimate(seen, self.flash, pool.views, distance)
+        if found is None:
+            return self.note("the photographs show too little of the same points to tell where the flash stands")
+        angle = math.degrees(math.atan2(float(found.norm()), distance))
+        lengths = ",".join(f"{v * self.similarity.radius:.4g}" for v in found.tolist())
+        if self.estimating:
+            self.flash.move(found)
+            self.notes = [text for text in self.notes if not text.startswith("the flash is found")]
+            self.note(f"the flash is found {angle:.1f} degrees off the lens: --flash-offset {lengths}")
+        elif angle > NOTICED and self.estimates == len(ESTIMATES):
+            self.note(f"warning: the photographs look like those of a flash {angle:.0f} degrees off the lens, which is "
+                      f"taken for its place; give --flash-offset {lengths} or --flash-offset estimate")
 
     @torch.no_grad()
     def make_steep(self) -> None:
@@ -124,19 +191,28 @@ class Stepper(Descent):
         """Bring the light that bounced up to date."""
         if self.bounced is not None:
             self.marched.update(self.nets, self.occupancy)
-            self.bounced.update(self.nets, self.marched, self.seen, self.rounds)
+            some = self.draw(SEEN, device.generator(self.rounds))
+            self.bounced.update(self.nets, self.marched, some, self.rounds)
         self.rounds += 1
 
     def bake(self) -> None:
         self.baked.update(self.nets, self.occupancy)
-        if self.progress() >= self.config.ntf_from:
+        if self.progress() >= (self.config.ntf_from if self.lens else self.config.shadows_from):
             self.marched.update(self.nets, self.occupancy)
         self.last_bake = self.step
 
+    def draw(self, count: int, generator: torch.Generator) -> rays.Rays:
+        """About `count` random camera rays that meet the visual hull, and where they do."""
+        pool = self.photographs["train"]
+        looked = pool[pool.random(int(count / self.meeting) + 16, generator)]
+        _, found = self.spans(looked)
+        self.meeting = max(0.9 * self.meeting + 0.1 * len(found) / len(looked), 0.01)
+        return found[slice(count)]
+
     def batch(self):
         """Random camera rays and their samples, about ``config.samples`` of them: ``(rays, (ray, t, width))``."""
-        count = min(8192, max(256, int(self.config.samples / self.samples_per_ray)))
-        batch = self.seen[torch.randint(len(self.seen), (count,), generator=self.generator)]
+        batch = self.draw(min(8192, max(256, int(self.config.samples / self.samples_per_ray))), self.generator)
+        count = len(batch)
         cells = self.occupancy.visible(batch, self.config.step, self.generator)
         samples = render.unspent(self.nets, batch, cells, self.config.step, self.generator)
         self.samples_per_ray = 0.9 * self.samples_per_ray + 0.1 * max(1.0, len(samples[0]) / count)
@@ -152,9 +228,14 @@ class Stepper(Descent):
     def field_loss(self, batch: rays.Rays, samples):
         """``(terms, image)``: name → weighted term of the photographs; see :mod:`mi_ntf.train.losses`."""
         c, g = self.config, self.generator
-        image = render.render(self.nets, batch, samples, self.bounced, g, self.progress() >= c.lobes_from)
-        terms = {"colour": losses.color(image.color, batch.target[:, :3], self.exposure),
-                 "alpha": c.alpha * (image.alpha - batch.target[:, 3]).square().mean()}
+        image = render.render(self.nets, batch, samples, self.bounced, g, self.progress() >= c.lobes_from,
+                              self.elsewhere)
+        pool, target = self.photographs["train"], batch.target
+        color = image.color if self.gains is None else image.color * self.gains(batch.view)
+        trusted = trust(color, target) if pool.levels else 1.0
+        known = 1.0 if pool.masked else ((target[:, 3] == 0) | (target[:, 3] == 1)).float()
+        terms = {"colour": losses.color(color, target[:, :3], self.exposure, trusted),
+                 "alpha": c.alpha * (known * (image.alpha - target[:, 3]).square()).mean()}
         toward, away = losses.normals(image, batch.d, self.baked)
         terms["normal"], terms["facing"] = c.normal * toward, c.facing * away
         terms["bounds"] = c.empty * torch.relu(image.raw - MAX_LOG_DENSITY).mean()
@@ -177,9 +258,10 @@ class Stepper(Descent):
         terms = {"transmittance": losses.transmittance(self.nets, targets)}
         if c.architecture.visibility is not None:
             terms["visibility"] = losses.visibility(self.nets, targets)
-        if c.colour_loss:
+        if c.colour_loss and self.lens:  # its light comes by the camera's own rays, which the image knows
             near = min(NEAR, len(batch))
-            lit = losses.transmittance_color(self.nets, self.marched, image, batch, self.exposure, near)
+            gain = 1.0 if self.gains is None else self.gains(batch.view[:near]).detach()
+            lit = losses.transmittance_color(self.nets, self.marched, image, batch, self.exposure, near, gain)
             terms["lit colour"] = 0.1 * lit
         return terms
 
@@ -194,7 +276,7 @@ class Stepper(Descent):
             few = samples[0] < NEAR
             with torch.no_grad():
                 image = render.render(self.nets, batch[slice(NEAR)], tuple(part[few] for part in samples), self.bounced,
-                                      self.generator)
+                                      self.generator, flash=self.elsewhere)
             self.terms = {}
         else:
             self.terms, image = self.field_loss(batch, samples)

@@ -17,30 +17,37 @@ from ..core.errors import MiNtfError
 from ..data.schema import fingerprint
 from . import checkpoint, device, evaluate, held_out, networks, parallel
 from .config import HierarchicalConfig, TrainConfig, configured, transmittance_alone
-from .descent import Descent
+from .descent import SCORING, Descent
 from .hierarchical import Hierarchical
 from .monitor import Display, Fault, Log
+from .report import photographs, publish
 from .stepper import Stepper
 
 KEEP = 128
 """Steps between two copies of the run's state in memory, to which a fault rolls back."""
 INTERVAL = 50.0
-"""Seconds between two checkpoints, each the latest copy in memory."""
+"""Seconds between two checkpoints, each the latest copy in memory …"""
+LATEST = 75.0
+"""… or, where steps are slow, a copy made for it after so many."""
 FAULTS = 3
 """Rolled-back faults after which the next one ends the run."""
+VALIDATED = 1 << 17
+"""Pixels of a validation in the course of the run."""
 BETTER = 0.02
 """dB by which an earlier field must be better in validation to be taken in place of the last one."""
 
 
 def train(dataset: Path, out: Path, *, preset: str = "fast", minutes: float | None = None, steps: int | None = None,
-          seed: int = 0, tensorboard: Path | None = None, field: Path | None = None, **variant) -> dict:
+          seed: int = 0, tensorboard: Path | None = None, field: Path | None = None, reading: dict | None = None,
+          estimate: bool = False, **variant) -> dict:
     """Train a field on the photographs in `dataset` and write it to `out`. Returns the report (JSON types).
 
     The run lasts `minutes` (10 unless told) or `steps`; runs given in steps are reproducible, bit for bit on one CPU.
     A checkpoint ``OUT.ckpt`` is written every minute, taken up by the same command, deleted at the end.
     Faults (see :class:`mi_ntf.train.monitor.Fault`) are rolled back, listed in the report, and end the run when they
     keep coming. `tensorboard`: a folder for its events. `field`: a field file to keep as it is; its transmittance
-    networks alone are trained, anew. `variant`: ablations, see :func:`config.configured`.
+    networks alone are trained, anew. `reading`: options of :func:`mi_ntf.data.readers.load_dataset`. `estimate`: find
+    where the flash stands beside the lens. `variant`: ablations, see :func:`config.configured`.
 
     Under ``torchrun --nproc-per-node=N -m mi_ntf train DATASET -o FIELD …`` (or any launcher that sets RANK,
     WORLD_SIZE, MASTER_ADDR and MASTER_PORT) N processes share the work of every step and average their gradients; see
@@ -61,9 +68,9 @@ def train(dataset: Path, out: Path, *, preset: str = "fast", minutes: float | No
             files.check(out)
         torch.set_num_threads(_threads() if steps is None and parallel.count() == 1 else 1)
         kind = _HierarchicalRun if isinstance(config, HierarchicalConfig) else _Run
-        run = kind(Path(dataset), Path(out), config, preset,
-                   minutes=None if steps is not None else float(limit), steps=steps, seed=seed, tensorboard=tensorboard,
-                   given=None if field is None else hashlib.sha256(Path(field).read_bytes()).hexdigest())
+        before = None if field is None else hashlib.sha256(Path(field).read_bytes()).hexdigest()
+        run = kind(Path(dataset), Path(out), config, preset, minutes=None if steps is not None else float(limit),
+                   steps=steps, seed=seed, tensorboard=tensorboard, given=before, reading=reading, estimate=estimate)
         if given is not None:
             run.take(field, *given)
         run.resume()
@@ -76,23 +83,29 @@ def train(dataset: Path, out: Path, *, preset: str = "fast", minutes: float | No
 class _Loop(Descent):
     """One training run around a stepper, which a subclass adds: its loop, its validation, its files."""
 
-    OWN = ("history", "validated", "best", "kept", "faults")
+    OWN = ("history", "validated", "best", "kept", "faults", "trace")
     """Attributes that, with the stepper's, generator, networks, optimisers and loss averages, decide how it goes on."""
 
     def __init__(self, dataset: Path, out: Path, config: TrainConfig | HierarchicalConfig, preset: str, *, minutes,
-                 steps, seed, tensorboard=None, given=None):
+                 steps, seed, tensorboard=None, given=None, reading=None, estimate=False):
         self.log = Log(tensorboard if parallel.first() else None)
-        super().__init__(dataset, config, minutes, steps, seed)
+        super().__init__(dataset, config, minutes, steps, seed, reading, estimate)
         self.out, self.checkpoint = out, Path(f"{out}.ckpt")
         identity = {"preset": preset, "minutes": minutes, "steps": steps, "seed": seed,
-                    "config": dataclasses.asdict(config), "field": given,
+                    "config": dataclasses.asdict(config), "field": given, "estimate": estimate,
                     "views": {k: len(s.images) for k, s in self.splits.items()}, "data": fingerprint(self.splits)}
         self.identity = json.loads(json.dumps(identity, sort_keys=True))
         self.history: list[dict] = []
+        self.trace: list[list[float]] = []
+        """Step and running mean of the loss, now and then."""
         self.validated = 0.0
         self.faults: list[dict] = []
         self.best: dict | None = None
         """The field of the best validation so far."""
+        self.saved = time.monotonic()
+        """When the last checkpoint was written."""
+        self.speed = 0.0
+        """Pixels a second of the last validation."""
         self.last = float("nan")
         """PSNR of the last validation."""
         self.kept: dict | None = None
@@ -106,7 +119,7 @@ class _Loop(Descent):
         """Step until the limit; show progress, validate, save checkpoints, roll back faults."""
         self.log.start(self.step)
         self.keep()
-        saved, average = time.monotonic(), None
+        self.saved, traced, average = time.monotonic(), self.progress(), None
         with Display(parallel.first()) as display:
             try:
                 while self.progress() < 1:
@@ -116,11 +129,14 @@ class _Loop(Descent):
                         display.say(self.roll_back(fault))
                         continue
                     average = value if average is None else 0.98 * average + 0.02 * value
+                    if self.progress() - traced > 0.01:
+                        traced = self.progress()
+                        self.trace.append([self.step, average])
                     if self.step % 20 == 0:
                         display.update(self.progress(), self.step, average)
-                    if self.step % KEEP == 0 and time.monotonic() - saved >= INTERVAL:
+                    if self.due():
                         self.save()
-                        saved = time.monotonic()
+                        self.saved = time.monotonic()
                 if self.kept is None:  # field and transmittance have learnt together to the end
                     display.validated(self.validate())
                     display.say(self.choose())
@@ -134,7 +150,8 @@ class _Loop(Descent):
         """One step and what is due around it; returns the loss. Raises Fault."""
         start = time.monotonic()
         finished = self.progress() >= self.config.ntf_alone
-        if self.kept is None if finished else self.progress() - self.validated > 0.1:
+        validate = self.kept is None if finished else self.progress() - self.validated > 0.1
+        if validate:
             self.validated = self.progress()
             display.validated(self.validate())
             if finished:
@@ -146,9 +163,16 @@ class _Loop(Descent):
         self.spent += time.monotonic() - start
         if self.minutes < math.inf:
             self.spent = parallel.agreed(self.spent)
-        if self.step % KEEP == 0 or self.progress() >= 1:
+        if validate and self.minutes < math.inf:
+            self.validated = self.progress()  # however long it took, the next one is a tenth of the run away
+        if self.step % KEEP == 0 or self.progress() >= 1 or self.due():
             self.keep()
         return value
+
+    def due(self) -> bool:
+        """Whether it is time for a checkpoint. Processes whose clocks differ copy their states at the same steps."""
+        age = time.monotonic() - self.saved
+        return age >= (INTERVAL if self.step % KEEP == 0 else LATEST if parallel.count() == 1 else math.inf)
 
     def log_scalars(self) -> None:
         values = {f"loss/{k}": float(v.detach()) for k, v in self.terms.items()}
@@ -156,22 +180,29 @@ class _Loop(Descent):
         self.log.scalars(self.step, values, *self.trained)
 
     def validate(self) -> dict:
-        """PSNR of at most 4 validation views with the current occupancy. Remembers the field if it is the best yet."""
-        split = self.splits["val"]
-        count, shape = min(4, len(split.images)), split.images.shape[1:3]
-        part = self.rays["val"][slice(0, count * shape[0] * shape[1])]
-        generator = device.generator(2)
-        color, _, normal = evaluate.render_all(self.nets, part, self.occupied(), self.config.step, generator,
-                                               self.bounced)
-        exact = evaluate.psnr(color, part.target[:, :3], count)["srgb"]
+        """PSNR of some validation views with the current occupancy. Remembers the field if it is the best yet."""
+        pool, start = self.photographs["val"], time.monotonic()
+        views = min(4, pool.views)
+        scores = evaluate.score(self.nets, self.occupied(), pool, self.config.step, self.light, VALIDATED, views, 1)
+        exact = scores["srgb"]
+        self.speed = min(VALIDATED, views * pool.height * pool.width) / max(time.monotonic() - start, 1e-6)
         entry = {"step": self.step, "psnr": round(exact, 4)}
         self.history.append(entry)
-        pictures = (x[:shape[0] * shape[1], :3].view(*shape, 3) for x in (part.target, color, normal))
-        self.log.validated(entry, *pictures)
+        self.log.validated(entry, self.picture)
         if self.best is None or exact > self.best["psnr"]:
             self.best = {"psnr": exact, "entry": entry} | self.snapshot()
         self.last = exact
         return entry
+
+    def picture(self) -> torch.Tensor:
+        """A held-back photograph, the field's and its normals, side by side (h, w, 3), sRGB, small."""
+        pool = self.photographs["val"]
+        pixels, *shape = pool.frame(0, max(1, round(max(pool.height, pool.width) / 256)))
+        seen = pool[pixels]
+        color, _, normal, _ = evaluate.render_all(self.nets, seen, self.occupied(), self.config.step,
+                                                  device.generator(2), self.light)
+        parts = evaluate.srgb(seen.target[:, :3]), evaluate.srgb(color), (normal + 1) / 2
+        return torch.cat([p.view(*shape, 3) for p in parts], 1).clamp(0, 1)
 
     def choose(self) -> str:
         """The field is finished: go back to the best one in validation if that is not the last; says what was done."""
@@ -242,17 +273,22 @@ class _Loop(Descent):
 
     def resume(self) -> None:
         """Take up a checkpoint if there is one."""
-        state = checkpoint.read(self.checkpoint, self.identity)
+        state, reading = checkpoint.read(self.checkpoint, self.identity), self.spent
         if state is not None:
             self.restore(state)
+            self.spent += reading
         if parallel.agreed(self.step) != self.step:
             raise MiNtfError(f"{self.checkpoint} is at step {self.step} for this process and at another for the first; "
                              "put it where all processes see it, or delete it")
 
+    def affordable(self) -> float:
+        """Pixels of a split that there is time to look at, of both splits twice each."""
+        return math.inf if self.minutes == math.inf else max(VALIDATED, self.speed * 60 * self.minutes * SCORING / 5)
+
     def finish(self) -> dict:
         """Write the field, read it back, measure it, and store the report in its header."""
         tensors = networks.to_tensors(self.nets)
-        report = {k: v for k, v in self.identity.items() if k not in ("config", "field", "data")}
+        report = {k: v for k, v in self.identity.items() if k not in ("config", "field", "data", "estimate")}
         if self.given is not None:
             report["field"] = self.given
         report["bounces"] = self.bounced is not None
@@ -262,12 +298,16 @@ class _Loop(Descent):
         field_file.save(self.out, header, tensors)
         stored = networks.from_tensors(self.config.architecture, field_file.load(self.out)[1])
         occupancy = evaluate.occupied(stored)
-        for name in ("val", "test"):
-            scores = evaluate.score(stored, occupancy, self.rays[name], len(self.splits[name].images),
-                                    self.config.step, self.bounced)
-            report[name] = {k: round(v, 3 if k != "alpha_rmse" else 5) for k, v in scores.items()}
-        report["transmittance"] = held_out.score(stored, occupancy, self.rays["val"])
+        with Display(parallel.first(), "score") as display:
+            for i, name in enumerate(("val", "test")):
+                scores = evaluate.score(stored, occupancy, self.photographs[name], self.config.step, self.light,
+                                        self.affordable(), tell=lambda done, i=i: display.update((i + done) / 2))
+                scores.pop("each")
+                report[name] = {k: round(v, 3 if k != "alpha_rmse" else 5) for k, v in scores.items()}
+        report["transmittance"] = held_out.score(stored, occupancy, self.photographs["val"])
+        agreement = photographs(self, stored, occupancy, report)
         field_file.save(self.out, Header(self.config.architecture, self.similarity, report), tensors)
+        publish(self, stored, occupancy, agreement, report, self.trace, self.out)
         checkpoint.delete(self.checkpoint)
         return report
 

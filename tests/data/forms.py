@@ -93,7 +93,8 @@ def colmap(folder: Path, model: str = "PINHOLE", points: bool = True) -> Path:
     place = folder / "sparse" / "0"
     place.mkdir(parents=True)
     numbers = {"PINHOLE": [FOCAL, FOCAL, SIZE / 2, SIZE / 2], "SIMPLE_PINHOLE": [FOCAL, SIZE / 2, SIZE / 2],
-               "OPENCV": [FOCAL, FOCAL, SIZE / 2, SIZE / 2, 0.1, 0, 0, 0]}[model]
+               "OPENCV": [FOCAL, FOCAL, SIZE / 2, SIZE / 2, 0.02, 0, 0, 0],
+               "OPENCV_FISHEYE": [FOCAL, FOCAL, SIZE / 2, SIZE / 2, 0.1, 0, 0, 0]}[model]
     (place / "cameras.txt").write_text(f"# comment\n1 {model} {SIZE} {SIZE} {' '.join(map(str, numbers))}\n")
     lines = []
     for i, c2w in enumerate(C2W):
@@ -109,6 +110,31 @@ def colmap(folder: Path, model: str = "PINHOLE", points: bool = True) -> Path:
     cloud = surface_points() if points else []
     (place / "points3D.txt").write_text("".join(
         f"{k + 1} {p[0]!r} {p[1]!r} {p[2]!r} 9 9 9 0.5\n" for k, p in enumerate(np.asarray(cloud).tolist())))
+    return folder
+
+
+def nerfstudio(folder: Path) -> Path:
+    """As `ns-process-data` writes it: one file, intrinsics in pixels, splits by lists of names."""
+    frames = []
+    for i, c2w in enumerate(C2W):
+        _save(folder, f"images/frame_{i:05d}.png", PICTURES[i])
+        frames.append({"file_path": f"./images/frame_{i:05d}.png", "transform_matrix": c2w.tolist(), "colmap_im_id": i})
+    lists = {f"{split}_filenames": [f"images/frame_{i:05d}.png" for i in views] for split, views in splits().items()}
+    text = {"camera_model": "OPENCV", "w": SIZE, "h": SIZE, "fl_x": FOCAL, "fl_y": FOCAL, "cx": SIZE / 2,
+            "cy": SIZE / 2, "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0, "frames": frames, **lists}
+    (folder / "transforms.json").write_text(json.dumps(text))
+    return folder
+
+
+def llff(folder: Path, factor: int = 1) -> Path:
+    """As LLFF's `imgs2poses.py`: poses of photographs `factor` times as large as those that are there."""
+    rows = []
+    for i, c2w in enumerate(C2W):
+        _save(folder, f"images/IMG_{i:03d}.png", PICTURES[i])
+        right, up, backward, place = c2w[:3].T
+        matrix = np.stack([-up, right, backward, place, factor * np.array([SIZE, SIZE, FOCAL])], -1)
+        rows.append([*matrix.ravel(), 2.0, 5.0])
+    np.save(folder / "poses_bounds.npy", np.array(rows))
     return folder
 
 

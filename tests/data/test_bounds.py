@@ -9,7 +9,7 @@ from mi_ntf.data import bounds, light, poses
 
 N = forms.VIEWS
 FOCAL, MIDDLE = np.full((N, 2), forms.FOCAL), np.full((N, 2), forms.SIZE / 2)
-ALPHA = forms.PICTURES[..., 3]
+PICTURES, OPAQUE = forms.PICTURES, np.ones_like(forms.PICTURES)
 
 
 def test_nearest_point_of_lines_is_their_common_point():
@@ -25,8 +25,8 @@ def test_masks_that_are_off_centre_and_cut(tmp_path):
     move = np.array([30.0, -7.0, 4.0])
     c2w = forms.C2W.copy()
     c2w[:, :3, 3] += move
-    there = bounds.find(ALPHA[:, :, 7:], c2w, FOCAL, MIDDLE - (7, 0), None)
-    here = bounds.find(ALPHA, forms.C2W, FOCAL, MIDDLE, None)
+    there = bounds.find(PICTURES[:, :, 7:], c2w, FOCAL, MIDDLE - (7, 0), None)
+    here = bounds.find(PICTURES, forms.C2W, FOCAL, MIDDLE, None)
     assert here[2] == there[2] == "from the masks' visual hull"
     for (center, radius, _), offset in ((here, 0), (there, move)):
         for c, r in forms.SPHERES:
@@ -35,8 +35,7 @@ def test_masks_that_are_off_centre_and_cut(tmp_path):
 
 
 def test_points_without_masks():
-    opaque = np.ones_like(ALPHA)
-    center, radius, how = bounds.find(opaque, forms.C2W, FOCAL, MIDDLE, forms.surface_points())
+    center, radius, how = bounds.find(OPAQUE, forms.C2W, FOCAL, MIDDLE, forms.surface_points())
     assert how == "from the reconstructed points"
     true_center, true_radius = forms.true_bounds()
     # a tenth of the points are outliers 40 times as far; the median of the rest lies within the object
@@ -44,15 +43,15 @@ def test_points_without_masks():
 
 
 def test_cameras_alone():
-    center, radius, how = bounds.find(np.ones_like(ALPHA), forms.C2W, FOCAL, MIDDLE, None)
+    center, radius, how = bounds.find(OPAQUE, forms.C2W, FOCAL, MIDDLE, None)
     np.testing.assert_allclose(center, 0, atol=1e-12)  # all look at the origin from 3.2
     assert radius == pytest.approx(3.2 * np.sin(forms.ANGLE / 2)) and "from the cameras alone" in how
 
 
-@pytest.mark.parametrize("alpha", [ALPHA, np.ones_like(ALPHA)])
-def test_parallel_cameras_do_not_tell_where_the_object_is(alpha):
+@pytest.mark.parametrize("pictures", [PICTURES, OPAQUE])
+def test_parallel_cameras_do_not_tell_where_the_object_is(pictures):
     with pytest.raises(MiNtfError, match=r"all 16 cameras look in one direction, .*write 'unit_sphere'"):
-        bounds.find(np.repeat(alpha[:1], N, 0), np.repeat(forms.C2W[:1], N, 0), FOCAL, MIDDLE, None)
+        bounds.find(np.repeat(pictures[:1], N, 0), np.repeat(forms.C2W[:1], N, 0), FOCAL, MIDDLE, None)
 
 
 def test_intensity_of_a_facing_wall_in_closed_form():

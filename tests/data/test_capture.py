@@ -86,6 +86,26 @@ def test_collocated_radiance_of_a_diffuse_sphere_is_the_closed_form(sphere_set):
         assert split.images[i, 16, 16, 3] == 1 and (split.images[i, 0, 0] == 0).all()
 
 
+def test_a_flash_beside_the_lens_lights_the_sphere_from_there(tmp_path):
+    """Radiance of the diffuse sphere at the point that the middle pixel sees, ⟨n,ω⟩ I/d² and all, for a flash right of,
+    above and in front of the lens."""
+    beside = np.array([0.6, 0.9, 0.3])
+    small(write(tmp_path), tmp_path / "out", spp=1024, flash_offset=tuple(beside))
+    split = load_dataset(tmp_path / "out")["train"]
+    for i in range(3):
+        camera, (right, up, back) = split.c2w[i][:3, 3], split.c2w[i][:3, :3].T
+        np.testing.assert_allclose(split.light_pos[i], camera + beside @ [right, up, -back], atol=1e-6)  # float32
+        away = split.light_pos[i] - (np.array([2, -1, 0.5]) + 0.7 * back)
+        distance = np.linalg.norm(away)
+        expected = np.array([0.8, 0.4, 0.2]) / np.pi * split.light_intensity[i] * (away @ back) / distance**3
+        # the cosine's deviation in the pixel is a percent, the mean's of 1024 paths a thirtieth of that
+        np.testing.assert_allclose(split.images[i, 16, 16, :3], expected, rtol=5e-3)
+    with pytest.raises(MiNtfError, match="forward at most half"):
+        small(write(tmp_path), tmp_path / "far", flash_offset=(0.0, 0.0, 2.0))
+    with pytest.raises(MiNtfError, match=r"flash_offset = .*, now flash_offset"):
+        small(write(tmp_path), tmp_path / "out", spp=1024)
+
+
 def test_photographs_of_a_medium_are_the_integral_over_light_dimmed_twice(tmp_path):
     small(write(tmp_path, MEDIUM), tmp_path / "out", size=32, views=2, spp=128)
     split = load_dataset(tmp_path / "out")["train"]

@@ -1,5 +1,7 @@
 """Colour spaces, alpha and masks, and what is said about files that cannot be read."""
 
+import sys
+
 import numpy as np
 import OpenEXR
 import pytest
@@ -9,6 +11,8 @@ from PIL import Image
 
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.data import images
+
+cv2 = pytest.importorskip("cv2", reason="TIFF needs OpenCV: pip install 'mi-ntf[train]'")
 
 
 def linear(srgb):
@@ -21,49 +25,69 @@ def test_png_becomes_linear_and_premultiplied(tmp_path_factory, value, alpha):
     path = tmp_path_factory.mktemp("png") / "a.png"
     Image.fromarray(np.array([[[value, 255, 0, alpha]]], np.uint8), "RGBA").save(path)
     s, a = linear(value / 255), alpha / 255
-    for pixel in (images.read_image(path)[0, 0], images.read_photograph(path, [])[0, 0]):
-        np.testing.assert_allclose(pixel, [s * a, a, 0.0, a], atol=1e-6)  # float32
+    np.testing.assert_allclose(images.read_image(path)[0, 0], [s * a, a, 0.0, a], atol=1e-6)  # float32
 
 
-def test_jpeg_takes_its_alpha_from_the_mask(tmp_path):
-    photo, mask = tmp_path / "a.jpg", tmp_path / "masks" / "a.jpg.png"
-    mask.parent.mkdir()
-    Image.fromarray(np.full((8, 8, 3), (200, 100, 50), np.uint8)).save(photo, quality=100, subsampling=0)
-    grey = np.zeros((8, 8), np.uint8)
-    grey[:, 4:], grey[:, 7] = 255, 128
-    Image.fromarray(grey).save(mask)
-    assert mask in images.mask_places(tmp_path, "images/a.jpg") + images.mask_places(tmp_path, "a.jpg")
-    pixels = images.read_photograph(photo, images.mask_places(tmp_path, "a.jpg"))
-    color = np.array([linear(c / 255) for c in (200, 100, 50)])
-    # one level of 255 is what JPEG's own rounding of a flat block may change; sRGB's slope is below 2.3
-    np.testing.assert_allclose(pixels[0, 5, :3], color, atol=2.3 / 255)
-    np.testing.assert_allclose(pixels[0, 7, :3], color * 128 / 255, atol=2.3 / 255)
-    assert (pixels[:, :4] == 0).all() and (pixels[:, 4:7, 3] == 1).all()
-    assert (images.read_image(photo)[..., 3] == 1).all()
-    Image.fromarray(grey[:4]).save(mask)
-    with pytest.raises(MiNtfError, match=r"a.jpg.png: is 8x4, its photograph .*a.jpg is 8x8; a mask has the size"):
-        images.read_photograph(photo, [mask])
-    mask.write_bytes(b"no image")
-    with pytest.raises(MiNtfError, match=r"a.jpg.png: cannot be read as a mask"):
-        images.read_photograph(photo, [mask])
+def test_levels_over_black_are_the_files_where_it_is_opaque():
+    """Every pair of level and alpha, against the formula; a table looks them up."""
+    alpha, level = (a.astype(np.uint8) for a in np.meshgrid(np.arange(256), np.arange(256), indexing="ij"))
+    straight = images.Decoded(np.repeat(level[..., None], 3, -1), alpha, True)
+    stored = images.as_levels(straight)
+    np.testing.assert_array_equal(stored[255, :, :3], np.repeat(np.arange(256)[:, None], 3, 1))
+    np.testing.assert_array_equal(stored[..., 3], alpha)
+    np.testing.assert_array_equal(images.as_levels(images.Decoded(straight.rgb, None, True), alpha), stored)
+    light = np.array([linear(v / 255) for v in range(256)]) * alpha / 255
+    near = np.array([linear(max(v, 0) / 255) for v in np.arange(256) - 0.5]), np.array(
+        [linear(v / 255) for v in np.arange(256) + 0.5])
+    for found in (stored[..., 1], images.levels(images.as_linear(straight))[..., 1]):
+        assert (light >= near[0][found] - 1e-6).all() and (light <= near[1][found] + 1e-6).all()  # float32
+    np.testing.assert_array_equal(images.levels(images.linear(stored)), stored)
 
 
-def test_a_photograph_without_alpha_and_mask_is_refused(tmp_path):
-    Image.fromarray(np.zeros((2, 2, 3), np.uint8)).save(tmp_path / "a.png")
-    with pytest.raises(MiNtfError, match=r"a.png: has no alpha channel and no mask \(.*masks/a.png\); training must"):
-        images.read_photograph(tmp_path / "a.png", images.mask_places(tmp_path, "a.png"))
+@pytest.mark.parametrize(("dtype", "one"), [(np.uint16, 65535), (np.float32, 1), (np.float64, 1)])
+def test_tiff_of_more_than_8_bits_is_linear(tmp_path, dtype, one):
+    bgra = (np.random.default_rng(0).random((3, 5, 4)) * one).astype(dtype)
+    if one == 1:
+        bgra[..., :3] *= 3  # radiance has no end
+    values = bgra.astype(np.float64) / one
+    straight = values[..., 3:] if dtype == np.uint16 else 1  # of floating point alpha is premultiplied, as in EXR
+    for name, stored, expected in (
+            ("a.tif", bgra, np.concatenate([values[..., 2::-1] * straight, values[..., 3:]], -1)),
+            ("b.TIFF", bgra[..., :3], np.concatenate([values[..., 2::-1], np.ones((3, 5, 1))], -1)),
+            ("c.tif", bgra[..., 0], np.concatenate([np.repeat(values[..., :1], 3, -1), np.ones((3, 5, 1))], -1))):
+        assert cv2.imwrite(str(tmp_path / name), stored)
+        np.testing.assert_allclose(images.read_image(tmp_path / name), expected, rtol=1e-6, atol=1e-7)  # float32
 
 
-def test_exr_without_alpha_is_opaque_or_masked(tmp_path):
-    rgb = np.full((2, 3, 3), 0.25, np.float32)
-    with OpenEXR.File({}, {"RGB": rgb}) as file:
-        file.write(str(tmp_path / "a.exr"))
-    pixels = images.read_image(tmp_path / "a.exr")
-    assert pixels.shape == (2, 3, 4) and (pixels[..., 3] == 1).all() and (pixels[..., :3] == 0.25).all()
-    Image.fromarray(np.array([[0, 255, 51]] * 2, np.uint8)).save(tmp_path / "mask.png")
-    pixels = images.read_photograph(tmp_path / "a.exr", [tmp_path / "none.png", tmp_path / "mask.png"])
-    np.testing.assert_allclose(pixels[0, :, 0], [0, 0.25, 0.05], rtol=1e-6)  # float32
-    np.testing.assert_allclose(pixels[0, :, 3], [0, 1, 0.2], rtol=1e-6)
+def test_tiff_of_8_bits_is_srgb_and_what_is_no_tiff_is_refused(tmp_path):
+    rgba = np.random.default_rng(0).integers(0, 256, (4, 3, 4)).astype(np.uint8)
+    for suffix in ("tif", "png"):
+        Image.fromarray(rgba).save(tmp_path / f"a.{suffix}")
+    np.testing.assert_array_equal(images.read_image(tmp_path / "a.tif"), images.read_image(tmp_path / "a.png"))
+    assert images.size_of(tmp_path / "a.tif") == (3, 4)
+    cv2.imwrite(str(tmp_path / "i.tif"), np.zeros((2, 2, 3), np.int32))
+    with pytest.raises(MiNtfError, match=r"i.tif: TIFF of 3 channels of int32; write it as RGB with 8 or 16 bits or"):
+        images.read_image(tmp_path / "i.tif")
+    cv2.imwrite(str(tmp_path / "n.tif"), np.full((2, 2, 3), np.nan, np.float32))
+    with pytest.raises(MiNtfError, match=r"n.tif: 4 pixels are NaN or infinite"):
+        images.read_image(tmp_path / "n.tif")
+    (tmp_path / "n.tif").write_bytes(b"no image")
+    with pytest.raises(MiNtfError, match=r"n.tif: cannot be read as an image .*OpenCV finds no image in it"):
+        images.read_image(tmp_path / "n.tif")
+
+
+def test_without_opencv_the_extra_is_named(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    (tmp_path / "a.tif").touch()
+    with pytest.raises(MiNtfError, match=r"a.tif: TIFF of more than 8 bits needs OpenCV, .* run pip install .mi-ntf"):
+        images.read_image(tmp_path / "a.tif")
+
+
+def test_sizes_by_the_head_alone(tmp_path):
+    images.write_exr(tmp_path / "a.exr", np.zeros((4, 6, 4)))
+    Image.new("RGB", (7, 3)).save(tmp_path / "a.jpg")
+    cv2.imwrite(str(tmp_path / "a.tif"), np.zeros((2, 5, 3), np.float32))  # Pillow does not know these
+    assert [images.size_of(tmp_path / f"a.{s}") for s in ("exr", "jpg", "tif", "png")] == [(6, 4), (7, 3), None, None]
 
 
 def test_files_that_cannot_be_read(tmp_path):
@@ -75,9 +99,9 @@ def test_files_that_cannot_be_read(tmp_path):
     (tmp_path / "1.exr").write_bytes(b"no image")
     with pytest.raises(MiNtfError, match=r"1.exr: cannot be read as an image"):
         images.read_image(tmp_path / "1.exr")
-    (tmp_path / "1.exr").rename(tmp_path / "1.tif")
-    with pytest.raises(MiNtfError, match=r"1.tif: images of type ..tif. are not read; convert it to .exr"):
-        images.read_image(tmp_path / "1.tif")
+    (tmp_path / "1.exr").rename(tmp_path / "1.gif")
+    with pytest.raises(MiNtfError, match=r"1.gif: images of type ..gif. are not read; convert it to .exr, .tif, .png"):
+        images.read_image(tmp_path / "1.gif")
     with pytest.raises(MiNtfError, match=r"2.png does not exist; the data set is incomplete"):
         images.read_image(tmp_path / "2.png")
     Image.fromarray(np.zeros((2, 2), np.uint16)).save(tmp_path / "16.png")

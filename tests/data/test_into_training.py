@@ -7,7 +7,7 @@ torch = pytest.importorskip("torch", reason="training needs PyTorch: pip install
 
 from data import forms  # noqa: E402
 
-from mi_ntf.core.errors import MiNtfError  # noqa: E402
+from mi_ntf.data import images  # noqa: E402
 from mi_ntf.data.readers import load_dataset  # noqa: E402
 from mi_ntf.data.schema import Split  # noqa: E402
 from mi_ntf.train import rays  # noqa: E402
@@ -17,9 +17,10 @@ from mi_ntf.train.config import TrainConfig  # noqa: E402
 def test_rays_of_all_forms_are_the_same_lines(tmp_path):
     """In world coordinates: forms without a sphere choose their own. 1e-5: float32, lengths up to 4."""
     expected = None
-    for form in (forms.capture, forms.blender, forms.nrhints):
+    for form in (forms.capture, forms.blender, forms.nrhints, forms.nerfstudio):
         split = load_dataset(form(tmp_path / form.__name__), lambda _: None)["train"]
-        found = rays.from_split(split, "train")
+        found = rays.Photographs(split)[:]
+        np.testing.assert_array_equal(found.target.numpy(), images.linear(split.images).reshape(-1, 4))
         world = found.o.numpy() * split.radius + split.center
         expected = (world, found.d.numpy()) if expected is None else expected
         np.testing.assert_allclose(world, expected[0], atol=1e-5)
@@ -28,16 +29,17 @@ def test_rays_of_all_forms_are_the_same_lines(tmp_path):
 
 def test_principal_point_and_focal_lengths_reach_rays_and_hull():
     """A window cut out of a picture, stretched in y by repeated rows, sees the same lines and leaves the same hull."""
-    def split(images, focal, principal):
-        n = len(images)
-        return Split(images.astype(np.float32), forms.C2W[:n], np.tile(focal, (n, 1)), np.tile(principal, (n, 1)),
+    def split(pictures, focal, principal):
+        n = len(pictures)
+        return Split(pictures.astype(np.float32), forms.C2W[:n], np.tile(focal, (n, 1)), np.tile(principal, (n, 1)),
                      forms.C2W[:n, :3, 3].astype(np.float32), np.ones((n, 3), np.float32), np.zeros(3), 1.0)
 
     f, size = forms.FOCAL, forms.SIZE
     whole = split(forms.PICTURES, [f, f], [size / 2, size / 2])
     cut = split(np.repeat(forms.PICTURES[:, 2:, 3:], 3, axis=1), [f, 3 * f], [size / 2 - 3, 3 * (size / 2 - 2)])
-    a = rays.from_split(whole, "train").d.reshape(len(forms.C2W), size, size, 3)[:, 2:, 3:]
-    b = rays.from_split(cut, "train").d.reshape(len(forms.C2W), 3 * (size - 2), size - 3, 3)[:, 1::3]
+    whole, cut = rays.Photographs(whole), rays.Photographs(cut)
+    a = whole[:].d.reshape(len(forms.C2W), size, size, 3)[:, 2:, 3:]
+    b = cut[:].d.reshape(len(forms.C2W), 3 * (size - 2), size - 3, 3)[:, 1::3]
     np.testing.assert_allclose(a, b, atol=1e-6)  # float32
     for hull in (rays.visual_hull(whole, 24), rays.visual_hull(cut, 24)):
         axis = (torch.arange(24) + 0.5) / 12 - 1
@@ -46,11 +48,13 @@ def test_principal_point_and_focal_lengths_reach_rays_and_hull():
         assert hull.numpy()[inside].all() and hull.float().mean() < 0.5
 
 
-def test_a_light_away_from_the_camera_is_refused(tmp_path):
+def test_a_light_away_from_one_camera_is_seen(tmp_path):
     split = load_dataset(forms.nrhints(tmp_path), lambda _: None)["train"]
+    assert rays.Photographs(split).on_lens
     split.light_pos[3] += 0.5
-    with pytest.raises(MiNtfError, match=r"split 'train', frame 3: the light is .* object radii from the camera"):
-        rays.from_split(split, "train")
+    found = rays.Photographs(split)
+    assert not found.on_lens
+    np.testing.assert_allclose(found.flash[3].numpy() * split.radius + split.center, split.light_pos[3], rtol=1e-6)
 
 
 def test_finer_photographs_are_learned_on_finer_grids():

@@ -10,7 +10,7 @@ from data import forms
 from PIL import Image
 
 from mi_ntf.core.errors import MiNtfError
-from mi_ntf.data import schema
+from mi_ntf.data import images, schema
 from mi_ntf.data.readers import load_dataset
 
 
@@ -27,12 +27,13 @@ def check_cameras(split, views, rtol=1e-6):
     np.testing.assert_allclose(split.light_pos, forms.C2W[views][:, :3, 3], rtol=rtol, atol=1e-6)
 
 
-def check_8_bit_pixels(images, views):
-    """Within the rounding to 8 bits: half a level of alpha; of colour half a level times sRGB's slope, at most 2.3, and
-    for one that premultiplication adds, half a level more."""
-    expected = forms.PICTURES[views]
-    np.testing.assert_allclose(images[..., 3], expected[..., 3], atol=0.501 / 255)
-    np.testing.assert_allclose(images[..., :3], expected[..., :3], atol=(2.3 + 1) * 0.5 / 255)
+def check_8_bit_pixels(stored, views):
+    """Within the rounding to 8 bits: half a level of alpha; of colour half a level times sRGB's slope, at most 2.3, in
+    the file and once more over black, and half a level that premultiplication adds."""
+    assert stored.dtype == np.uint8
+    pixels, expected = images.linear(stored), forms.PICTURES[views]
+    np.testing.assert_allclose(pixels[..., 3], expected[..., 3], atol=0.501 / 255)
+    np.testing.assert_allclose(pixels[..., :3], expected[..., :3], atol=(2 * 2.3 + 1) * 0.5 / 255)
 
 
 def check_sphere(split):
@@ -53,10 +54,13 @@ def test_capture(tmp_path):
     splits, said = load(forms.capture(tmp_path))
     for name, views in forms.splits().items():
         check_cameras(splits[name], views)
+        assert splits[name].images.dtype == np.float16
         np.testing.assert_array_equal(splits[name].images, forms.PICTURES[views].astype(np.float16))
         assert (splits[name].light_intensity == forms.INTENSITY).all()
         assert splits[name].radius == 1 and (splits[name].center == 0).all()
-    assert said == "", "nothing was left open"
+        assert splits[name].calibrated and splits[name].masked
+        assert splits[name].names == tuple(f"{name}/{i:04d}.exr" for i in views)
+    assert said == f"photographs of `mi-ntf capture` in {tmp_path}: 16 photographs, 24x24 pixels", "nothing left open"
 
 
 def test_nerf_synthetic(tmp_path):
@@ -66,6 +70,8 @@ def test_nerf_synthetic(tmp_path):
         check_8_bit_pixels(splits[name].images, views)
         check_sphere(splits[name])
         check_estimate(splits[name])
+        assert not splits[name].calibrated
+    assert said.startswith(f"NeRF-synthetic (Blender) data set in {tmp_path}: 16 photographs, 24x24 pixels\n")
     assert "sphere is found from the masks' visual hull" in said
     assert "a flash at the lens is assumed" in said and "W/sr estimated" in said
 
@@ -74,8 +80,10 @@ def test_nrhints(tmp_path):
     splits, said = load(forms.nrhints(tmp_path))
     for name, views in forms.splits().items():
         check_cameras(splits[name], views)
+        assert splits[name].images.dtype == np.float16
         np.testing.assert_array_equal(splits[name].images, forms.PICTURES[views].astype(np.float16))
         check_estimate(splits[name])
+    assert said.startswith(f"NRHints data set in {tmp_path}: 16 photographs, 24x24 pixels\n")
     assert "flash at the lens" not in said and "W/sr estimated" in said
 
 
@@ -103,6 +111,7 @@ def test_colmap(tmp_path, model, binary, place):
         file.rename(tmp_path / place / file.name)
     splits, said = load(tmp_path)
     assert [len(splits[name].images) for name in schema.SPLITS] == [14, 1, 1]
+    assert said.startswith(f"COLMAP model in {tmp_path}: 16 photographs, 24x24 pixels\n")
     assert "no test split: 1 of 16" in said and "no val split: 1 of 15" in said
     # the middle one of 16, then of the 15 that are left
     views = {"train": [*range(7), *range(9, 16)], "val": [7], "test": [8]}
@@ -140,7 +149,8 @@ def _shrink(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(("model", "change", "text"), [
-    ("OPENCV", lambda f: None, "camera 1: its model OPENCV has lens distortion; .*`colmap image_undistorter`"),
+    ("OPENCV_FISHEYE", lambda f: None, r"camera 1: its model OPENCV_FISHEYE is not read .*`colmap image_undistorter` "
+     r"and .* \(read as COLMAP model\)$"),
     ("PINHOLE", _cut, r"points3D.txt: cannot be read .*No such file.*`colmap model_converter`"),
     ("PINHOLE", lambda f: (f / "images").rename(f / "photos"), "images does not exist; put the photographs of"),
     ("PINHOLE", lambda f: (f / "images/002.png").unlink(), "images/002.png does not exist; the data set is incomplete"),
@@ -240,7 +250,7 @@ def test_faults_of_whole_splits(tmp_path):
         load(tmp_path)
     (tmp_path / "transforms_val.json").unlink()
     splits, said = load(tmp_path)
-    assert said == "no val split: 1 of 14 photographs for training are held back for it"
+    assert said.split("\n")[1:] == ["no val split: 1 of 14 photographs for training are held back for it"]
     check_cameras(splits["val"], [7])
     edit(tmp_path, lambda d: d.update(frames=d["frames"][:1]))
     with pytest.raises(MiNtfError, match=r"frame 0: there is no val split and 1 photograph for training, too few"):
@@ -279,7 +289,7 @@ def test_black_pictures_and_masks_that_do_not_meet(tmp_path):
 
 
 def test_folders_that_hold_nothing(tmp_path):
-    with pytest.raises(MiNtfError, match=r"neither transforms_train.json .* nor a COLMAP model .*`mi-ntf capture"):
+    with pytest.raises(MiNtfError, match=r"neither transforms_train.json .* nor a COLMAP model .* nor poses_bounds"):
         load(tmp_path)
     with pytest.raises(MiNtfError, match=r"gone does not exist or is no folder; make a data set with `mi-ntf capture"):
         load(tmp_path / "gone")

@@ -1,5 +1,7 @@
 """The pinhole camera and its axes."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -52,25 +54,40 @@ def test_camera_conversion_is_its_own_inverse_and_keeps_the_handedness(values):
     assert np.linalg.det(there[:3, :3]) == pytest.approx(np.linalg.det(matrix[:3, :3]), abs=1e-7)
 
 
+def split(dtype=np.float64) -> Split:
+    shapes = {"images": (2, 4, 5, 4), "c2w": (2, 4, 4), "focal": (2, 2), "principal": (2, 2), "light_pos": (2, 3),
+              "light_intensity": (2, 3), "center": (3,), "radius": ()}
+    numbers = {k: np.random.default_rng(1).random(shape) for k, shape in shapes.items()}
+    return Split(**numbers | {"images": (200 * numbers["images"]).astype(dtype)})
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.float16, np.float32])
+def test_fingerprints_of_every_kind_of_pixels(dtype):
+    """One level more, another type of the same numbers, and another meaning of alpha are other photographs."""
+    one, other = split(dtype), split(dtype)
+    other.images[1, 2, 3, 0] += 1
+    found = [schema.fingerprint({"train": s}) for s in (one, split(dtype), other, split(np.float64),
+                                                        dataclasses.replace(one, masked=False),
+                                                        dataclasses.replace(one, names=("a", "b")))]
+    assert found[1] == found[0] == found[5]
+    for changed in found[2:5]:
+        assert {k for k in changed if changed[k] != found[0][k]} == {"photographs or masks"}
+
+
 @pytest.mark.parametrize(("name", "place", "what"), [
     ("images", (1, 2, 3, 0), "photographs or masks"), ("images", (0, 0, 0, 3), "photographs or masks"),
     ("c2w", (1, 0, 3), "cameras"), ("focal", (0, 1), "cameras"), ("principal", (1, 0), "cameras"),
     ("light_pos", (0, 2), "lights"), ("light_intensity", (1, 1), "lights"), ("center", (1,), "the object's sphere"),
     ("radius", (), "the object's sphere")])
-@pytest.mark.parametrize("split", ["train", "val"])
-def test_fingerprints_tell_what_changed(split, name, place, what):
+@pytest.mark.parametrize("which", ["train", "val"])
+def test_fingerprints_tell_what_changed(which, name, place, what):
     """The last bit of any number of any split changes the hash of its kind and no other."""
-    def make():
-        shapes = {"images": (2, 4, 5, 4), "c2w": (2, 4, 4), "focal": (2, 2), "principal": (2, 2), "light_pos": (2, 3),
-                  "light_intensity": (2, 3), "center": (3,), "radius": ()}
-        return Split(**{k: np.random.default_rng(1).random(shape) for k, shape in shapes.items()})
-
-    one, other = ({"train": make(), "val": make()} for _ in range(2))
+    one, other = ({"train": split(), "val": split()} for _ in range(2))
     before = schema.fingerprint(one)
     assert schema.fingerprint(other) == before
-    values = np.array(getattr(other[split], name))
+    values = np.array(getattr(other[which], name))
     values[place] = np.nextafter(values[place], 2)
-    object.__setattr__(other[split], name, values)
+    object.__setattr__(other[which], name, values)
     after = schema.fingerprint(other)
     assert {k for k in before if before[k] != after[k]} == {what}
     moved = {"train": one["val"], "val": one["train"], "test": one["val"]}

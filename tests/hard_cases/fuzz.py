@@ -123,18 +123,23 @@ def check_finite(architecture: Architecture, tensors: dict) -> None:
 
 
 def dataset(folder: Path):
-    """One data set of each form with its frames cut to a few."""
+    """One data set of each form with its frames cut to a few, one of them behind a lens; of LLFF the whole."""
+    import cv2  # noqa: F401, for the limit of memory to count it
     from data import forms
 
     bases = {}
-    for form in (forms.capture, forms.blender, forms.nrhints):
+    for form in (forms.capture, forms.blender, forms.nrhints, forms.nerfstudio):
         place = folder / form.__name__
         form(place)
         splits = {}
-        for path in sorted(place.glob("transforms_*.json")):
+        for path in sorted(place.glob("transforms*.json")):
             splits[path.name] = json.loads(path.read_text())
             splits[path.name]["frames"] = splits[path.name]["frames"][:6]
         bases[form.__name__] = (place, splits)
+    splits["transforms.json"] |= {"k1": 0.02, "train_filenames": [], "val_filenames": ["images/frame_00002.png"],
+                                  "test_filenames": ["images/frame_00004.png"]}
+    place = forms.llff(folder / "llff")
+    bases["llff"] = (place, {"poses_bounds.npy": (place / "poses_bounds.npy").read_bytes()})
     return bases
 
 
@@ -143,10 +148,11 @@ def dataset_case(rng, _folder: Path, bases):
 
     form = str(rng.choice(sorted(bases)))
     place, splits = bases[form]
-    victim = str(rng.choice(sorted(splits), p=[0.15, 0.7, 0.15]))
+    victim = str(rng.choice(sorted(splits), p=[0.15, 0.7, 0.15] if len(splits) == 3 else None))
     kind = rng.choice(["tree", "bytes", "folder"], p=[0.75, 0.2, 0.05])
+    kind = "bytes" if form == "llff" and kind == "tree" else kind
     for name, data in splits.items():
-        (place / name).write_text(json.dumps(data))
+        (place / name).write_bytes(data if form == "llff" else json.dumps(data).encode())
     if kind == "tree":
         (place / victim).write_text(json.dumps(mutate.tree(rng, splits[victim])))
     elif kind == "bytes":
@@ -159,19 +165,20 @@ def dataset_case(rng, _folder: Path, bases):
 def check_splits(splits: dict) -> None:
     for split in splits.values():
         for value in vars(split).values():
-            assert np.isfinite(value).all(), "a data set that loads is not finite"
+            assert value is split.names or np.isfinite(value).all(), "a data set that loads is not finite"
 
 
 # --- COLMAP -----------------------------------------------------------------------------------------------------------
 
 
 def colmap(folder: Path):
-    """Files of a model by name, as text and in binary; the photographs are beside it."""
+    """Files of a model with a lens by name, as text and in binary; the photographs are beside it."""
+    import cv2  # noqa: F401, for the limit of memory to count it
     import pycolmap
     from data import forms
 
     place = folder / "colmap"
-    forms.colmap(place)
+    forms.colmap(place, "OPENCV")
     model = place / "sparse" / "0"
     text = {p.name: p.read_bytes() for p in model.iterdir()}
     pycolmap.Reconstruction(str(model)).write_binary(str(model))

@@ -12,7 +12,7 @@ from helpers.variants import VARIANT
 from scipy.ndimage import map_coordinates
 
 from mi_ntf.data import capture as cap
-from mi_ntf.data import schema
+from mi_ntf.data import images, schema
 from mi_ntf.data.readers import load_dataset
 from mi_ntf.data.schema import read_image
 
@@ -124,7 +124,7 @@ def test_photograph_of_the_cloud_is_the_march_through_its_volumes(volumes, tmp_p
     size = 24
     cap.capture(CLOUD / "mesh.xml", tmp_path, views=1, test_views=1, size=size, spp=64)
     split = load_dataset(tmp_path)["val"]
-    for i, image in enumerate(split.images):
+    for i, image in enumerate(images.linear(split.images)):
         # 2 x 2 rays a pixel stand for its area
         rays = schema.pixel_rays(split.c2w[i], 2 * split.focal[i], 2 * size, 2 * size, 2 * split.principal[i])
         expected = march(volumes, *rays, split.light_intensity[i]).reshape(size, 2, size, 2, 4).mean((1, 3))

@@ -19,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from train import two_spheres
 
-from mi_ntf.train import evaluate, networks, parallel, train, trainer
+from mi_ntf.train import networks, parallel, train, trainer
 
 trainer.KEEP, trainer.INTERVAL = 4, 0.0
 
@@ -50,7 +50,7 @@ def main(dataset: str, out: str, steps: str, death: str = "") -> None:
     trainer._Run.advance, trainer._Run.finish, os.replace = recorded, finished, replaced
     trainer._Run.carve = functools.partialmethod(trainer._Run.carve, steps=20)
     two_spheres.coarsen(pytest.MonkeyPatch())
-    evaluate.score = lambda *_: {"srgb": 0.0}  # seconds, and no matter here
+    two_spheres.glance(pytest.MonkeyPatch())
     report = train(Path(dataset), Path(out), steps=int(steps))
     assert bool(report) == (parallel.first() and os.environ.get("RANK", "0") == "0")
 

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 import torch
 from helpers import fields
+from train import shots
 
 from mi_ntf.core import radiosity
 from mi_ntf.train import bounced, networks, rays, render
-from mi_ntf.train.marched import Marched
+from mi_ntf.train.marched import Marched, walk
 from mi_ntf.train.occupancy import from_networks
 
 PLACES = (-0.45, 0.45)
@@ -41,11 +42,14 @@ def test_walk_ends_on_the_skin_and_knows_the_depth(spheres):
     """Straight at a sphere: at its radius; past both: nowhere, at no depth."""
     o = torch.tensor([[-0.45, 0.0, 2.0], [0.0, 0.0, 2.0], [-0.45, 0.0, 2.0]])
     d = torch.tensor([[0.0, 0.0, -1.0]] * 3)
-    t, depth = bounced._walk(spheres[1], o[:2], d[:2])
+    t, depth = walk(spheres[1], o[:2], d[:2], radiosity.DEPTH)
     assert float(t[0]) == pytest.approx(2 - RADIUS, abs=0.02) and not t[1].isfinite() and depth[1] == 0
-    _, whole = bounced._walk(spheres[1], o[2:], d[2:], np.inf)
+    _, whole = walk(spheres[1], o[2:], d[2:], np.inf)
     # Some σ = e^5.5 over the diameter, but for its soft ends: measured 0.945.
     assert 0.93 < float(whole[0]) / (np.exp(5.5) * 2 * RADIUS) < 1
+    # It ends at the lamp: before the skin there is nothing, half of the way through half of the depth.
+    _, part = walk(spheres[1], o[2:].expand(2, 3), d[2:].expand(2, 3), np.inf, torch.tensor([2 - RADIUS - 0.1, 2.0]))
+    assert float(part[0]) == 0 and float(part[1]) == pytest.approx(float(whole[0]) / 2, rel=0.02)
 
 
 class Outward:
@@ -65,7 +69,7 @@ class Outward:
 
 @pytest.fixture(scope="module")
 def light(spheres):
-    found = bounced.Bounced(FLASH, POWER)
+    found = bounced.Bounced(shots.flash(FLASH, spheres[1]), POWER)
     assert not found.known
     side, bounced.SIDE = bounced.SIDE, 24  # 576 rays a patch, of which some 60 meet the other sphere
     found.update(Outward(spheres[0]), spheres[1], camera_rays(), 0)
@@ -136,7 +140,7 @@ def test_albedo_learns_of_the_bounced_light(spheres, light):
 
 def test_the_same_patches_as_ever(spheres, light):
     """One seed, one result: a resumed run is the same run."""
-    once, again = (bounced.Bounced(FLASH, POWER) for _ in range(2))
+    once, again = (bounced.Bounced(shots.flash(FLASH, spheres[1]), POWER) for _ in range(2))
     for each in (once, again):
         each.update(Outward(spheres[0]), spheres[1], camera_rays(), 0)
     assert torch.equal(again.table, once.table) and torch.equal(again.light, once.light)

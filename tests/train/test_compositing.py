@@ -9,6 +9,7 @@ import pytest
 torch = pytest.importorskip("torch", reason="training needs PyTorch: pip install 'mi-ntf[train]'")
 
 import torch.nn.functional as F  # noqa: E402
+from train import shots  # noqa: E402
 
 from mi_ntf.core import fresnel, microfacet  # noqa: E402
 from mi_ntf.core import ops as numpy_ops  # noqa: E402
@@ -56,7 +57,7 @@ def test_packed_weights_equal_a_double_loop():
     counts, step = [3, 0, 5, 1], 0.05
     ray = np.repeat(np.arange(4), counts)
     sigma = rng.uniform(0, 40, len(ray)).astype(np.float32)
-    w, v = render.weights(torch.tensor(sigma), torch.tensor(ray), step)
+    w, v = render.Optical.of(torch.tensor(sigma), torch.tensor(ray), step).weights()
     for r in range(4):
         front = 1.0
         for j in np.nonzero(ray == r)[0]:
@@ -123,7 +124,7 @@ def test_the_most_of_the_neighbours(shape):
 def test_an_opaque_plane_looks_like_its_surface():
     """The reason of SURFACE: v sums to 1/2 behind an opaque front, however coarse the cells are."""
     for step in (0.2, 0.01):
-        w, v = render.weights(torch.full((400,), 600.0), torch.zeros(400, dtype=torch.long), step)
+        w, v = render.Optical.of(torch.full((400,), 600.0), torch.zeros(400, dtype=torch.long), step).weights()
         assert abs(float(w.sum()) - 1) < 1e-6
         assert abs(render.SURFACE * float(v.sum()) - 1) < 1e-6
 
@@ -137,6 +138,15 @@ def test_a_ray_outside_the_occupied_cells_is_dropped_and_others_are_tightened():
     # A cell (1/16) more at most at either end than the cube itself, 3 ± 1/8
     assert (kept.t0 <= 3 - 1 / 8).all() and (kept.t0 >= 3 - 1 / 8 - 1 / 8).all()
     assert (kept.t1 >= 3 + 1 / 8).all() and (kept.t1 <= 3 + 1 / 8 + 1 / 8).all()
+
+
+def test_a_field_without_matter_is_black():
+    """No ray meets a cell, not even a block of cells."""
+    grid = Occupancy(torch.zeros((32,) * 3, dtype=torch.bool))
+    index, kept = grid.tighten(rays(5))
+    assert len(index) == len(kept) == 0
+    found = evaluate.render_all(Slab(), rays(5), grid, 0.01, torch.Generator().manual_seed(0))
+    assert [v.shape for v in found] == [(5, 3), (5,), (5, 3), (5, 3)] and not any(v.any() for v in found)
 
 
 def ball(cells=48, radius=0.5, sigma=40.0):
@@ -247,7 +257,8 @@ def test_evenness_sees_slopes_along_the_surface_alone():
     def image(normal):
         n = 500
         return render.Image(color=None, alpha=None, x=torch.zeros(n, 3), shaded=None, index=None, weight=torch.ones(n),
-                            gloss=None, normal=torch.tensor(normal).expand(n, 3), radiance=None, raw=None, bounced=0.0)
+                            gloss=None, normal=torch.tensor(normal).expand(n, 3), albedo=None, radiance=None, raw=None,
+                            bounced=0.0)
 
     generator = torch.Generator().manual_seed(0)
     # float32 rounding of offsets of 0.02
@@ -258,11 +269,32 @@ def test_evenness_sees_slopes_along_the_surface_alone():
     assert value == pytest.approx(128 * offset, rel=0.1)
 
 
-def test_psnr_of_a_known_error():
-    a, b = torch.full((8, 3), 0.5), torch.full((8, 3), 0.6)
-    assert evaluate.psnr(a, b, 2)["linear"] == pytest.approx(20.0, abs=1e-3)
+def test_psnr_of_a_known_error(monkeypatch):
+    """Two photographs of 0.6, of which the second has matter in one pixel alone, where the prediction is right."""
+    pictures = np.full((2, 1, 4, 4), 0.6, np.float32)
+    pictures[..., 3] = [[[1, 1, 1, 1]], [[1, 0, 0, 0]]]
+    pictures[1, 0, 0, :3] = 0.5
+    pool = shots.photographs(pictures)
+
+    def constant(networks, rays, *_):
+        return torch.full((len(rays), 3), 0.5), torch.full((len(rays),), 0.75), None, None
+
+    monkeypatch.setattr(evaluate, "render_all", constant)
+    told = []
+    found = evaluate.score(None, None, pool, 0.01, views=1, tell=told.append)
+    assert found["linear"] == pytest.approx(20.0, abs=1e-3)
     # sRGB of 0.5 and 0.6: 0.73536 and 0.79774 → −20 lg 0.06238
-    assert evaluate.psnr(a, b, 2)["srgb"] == pytest.approx(24.10, abs=0.01)
+    assert found["srgb"] == found["object"] == found["each"][0] == pytest.approx(24.10, abs=0.01)
+    assert found["alpha_rmse"] == pytest.approx(0.25) and told == [1.0]
+    found = evaluate.score(None, None, pool, 0.01)
+    assert found["each"] == pytest.approx([24.10, 24.10 + 10 * math.log10(4 / 3)], abs=0.01)
+    assert found["srgb"] == pytest.approx(np.mean(found["each"])) and found["linear"] == pytest.approx(20.625, abs=1e-3)
+    assert found["object"] == pytest.approx((24.10 + 120) / 2, abs=0.01)  # no error counts as 1e-12
+    assert found["alpha_rmse"] == pytest.approx(math.sqrt((0.25**2 + (0.25**2 + 3 * 0.75**2) / 4) / 2))
+    # Three pixels of each at most, the same ones in every call; with gains of their own, constants are met exactly.
+    assert evaluate.score(None, None, pool, 0.01, most=6) == evaluate.score(None, None, pool, 0.01, most=6)
+    fit = evaluate.score(None, None, pool, 0.01, evaluate.Light(fit=True), views=1)
+    assert fit["srgb"] == pytest.approx(120, abs=20)  # float32
 
 
 @pytest.mark.parametrize("rim", [False, True])
@@ -292,10 +324,10 @@ def test_held_out_score_of_a_network_that_knows_no_shadow():
         def ray_mixture(self, o, d, profile):
             return torch.ones(len(o), dtype=torch.bool), torch.tensor([1.0, 1.0, -100.0]).expand(len(o), 1, 3)
 
-    batch = rays()[torch.zeros(50, dtype=torch.long)]
-    batch.target[:] = 1
+    # A lens so long that all of its pixels see the same point.
+    pool = shots.photographs(np.ones((1, 5, 10, 4), np.float32), focal=1e6, c2w=shots.facing((0, 0, -3.0))[None])
     field = Field()
-    found = held_out.score(field, evaluate.occupied(field), batch)
+    found = held_out.score(field, evaluate.occupied(field), pool)
     # 4096 pairs of deviation 0.3, and voxels of 1/128 that smear the surface
     assert found["bias"] == pytest.approx(1 - (1 - math.log(2)) / 2, abs=0.03)
     assert found["bias"] < found["rms"] < 1
@@ -306,7 +338,7 @@ def test_rough_lobes_cost_more():
     gloss = torch.tensor([1.0, 0.5, 1.0]), torch.tensor([0.2, 0.4, math.exp(-7)])
     image = render.Image(color=None, alpha=None, x=None, shaded=None, index=None,
                          weight=torch.tensor([0.5, 0.25, 0.25]),
-                         normal=None, gloss=gloss, radiance=None, raw=None, bounced=0.0)
+                         normal=None, albedo=None, gloss=gloss, radiance=None, raw=None, bounced=0.0)
     wanted = 0.5 * 0.2 * 60.5 + 0.25 * 0.4 * (0.5 + 60 / 256) + 0.25 * (math.exp(-7) * 60.5 + 0.4)
     assert float(losses.gloss(image, 0.0, 0.5, 4)) == pytest.approx(wanted / 4)
     above = dataclasses.replace(image, gloss=(gloss[0], 0.04 + 0.96 * gloss[1]))

@@ -160,7 +160,7 @@ def test_a_short_run_learns_and_is_written(photographs, tmp_path, monkeypatch):
     assert header.architecture == SMALL.architecture and not any("coarse" in name for name in tensors)
     assert report["kept"] in report["history"] and report["test"]["srgb"] > 8, report
     json.dumps(report)
-    assert [p.name for p in tmp_path.iterdir()] == ["f"]
+    assert {p.name for p in tmp_path.iterdir()} == {"f", "f.html"}
 
 
 def test_a_checkpoint_continues_the_run(photographs, tmp_path):
@@ -205,12 +205,12 @@ def test_the_baselines_network_learns_beside_and_is_stored(photographs, tmp_path
         if "visibility" in state.terms:
             values.append(float(state.terms["visibility"].detach()))
     if preset == "fast":  # its steps see other rays each: the same ones, then
-        o, d = losses.training_rays(state.marched, state.seen, 128, True, state.generator)
+        o, d = losses.training_rays(state.marched, state.draw(2000, state.generator), 128, True, state.generator)
         rays = losses.targets(state.marched, o, d, state.generator)
         assert values
         values = [state._descend("ntf", losses.visibility(state.nets, rays), 1.0) for _ in range(80)]
     assert values[-1] < 0.8 * values[0], values
-    monkeypatch.setattr(evaluate, "score", lambda *_: {"srgb": 0.0})  # seconds, and no matter here
+    two_spheres.glance(monkeypatch)
     state.finish()
     header, tensors = field_file.load(tmp_path / "f")
     assert header.architecture.visibility == VISIBILITY

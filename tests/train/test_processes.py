@@ -57,7 +57,7 @@ def test_a_run_killed_twice_ends_where_an_undisturbed_one_ends(photographs, undi
     assert found["history"] == expected["history"]
     for name, value in tensors.items():
         assert value.tobytes() == values[name].tobytes(), name
-    assert {p.name for p in tmp_path.iterdir()} == {"f", "f.npz", "f.json"}
+    assert {p.name for p in tmp_path.iterdir()} == {"f", "f.html", "f.npz", "f.json"}
 
 
 def test_two_processes_are_one(photographs, undisturbed, tmp_path):
@@ -76,4 +76,4 @@ def test_two_processes_are_one(photographs, undisturbed, tmp_path):
     assert len(relative) == STEPS and max(relative.values()) < 1e-5, relative
     for name, value in tensors.items():  # of order 1
         assert np.sqrt(np.mean((values[name] - value) ** 2)) < 1e-4, name
-    assert {p.name for p in tmp_path.iterdir()} == {"f", "f.npz", "f.json"}
+    assert {p.name for p in tmp_path.iterdir()} == {"f", "f.html", "f.npz", "f.json"}

@@ -30,7 +30,7 @@ def test_short_run_learns_the_spheres(photographs, tmp_path):
     assert str(tmp_path) not in json.dumps(header.to_json())
     assert report["faults"] == [] and report["kept"] == report["history"][-1]
     assert out.stat().st_size < 4e6
-    assert list(tmp_path.iterdir()) == [out], "checkpoint and temporary files are gone"
+    assert {*tmp_path.iterdir()} == {out, out.with_suffix(".html")}, "checkpoint and temporary files are gone"
 
 
 def test_a_finished_field_learns_another_transmittance(photographs, tmp_path, monkeypatch):
@@ -130,11 +130,15 @@ def test_bad_photographs(tmp_path):
     assert not (tmp_path / "f").exists()
 
 
-def test_a_light_away_from_the_camera_is_refused(tmp_path):
+def test_a_light_away_from_the_camera_is_refused_by_what_cannot_have_it(tmp_path):
+    """By the paper's recipe, and by the search for a light whose place the data set tells; one photograph's does."""
     folder = two_spheres.write(tmp_path / "set", {"train": 2, "val": 1, "test": 1}, size=8)
     path = folder / "transforms_train.json"
     data = json.loads(path.read_text())
     data["frames"][1]["pl_pos"][0] += 1.0
     path.write_text(json.dumps(data))
-    with pytest.raises(MiNtfError, match="split 'train', frame 1: the light is 1 object radii from the camera"):
-        train(folder, tmp_path / "f", steps=1)
+    with pytest.raises(MiNtfError, match=r"the preset 'paper' needs a flash at the lens, .* the preset 'fast'"):
+        train(folder, tmp_path / "f", steps=1, preset="paper")
+    with pytest.raises(MiNtfError, match="--flash-offset estimate: the data set says where its lights are; leave"):
+        train(folder, tmp_path / "f", steps=1, estimate=True)
+    assert not (tmp_path / "f").exists()

@@ -11,7 +11,7 @@ from train import two_spheres  # noqa: E402
 
 from mi_ntf.core import field_file  # noqa: E402
 from mi_ntf.core.errors import MiNtfError  # noqa: E402
-from mi_ntf.train import config, evaluate, monitor, stepper, train, trainer  # noqa: E402
+from mi_ntf.train import config, descent, monitor, stepper, train, trainer  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +24,7 @@ def quick(monkeypatch):
     two_spheres.coarsen(monkeypatch)
     monkeypatch.setattr(trainer, "KEEP", 4)
     monkeypatch.setattr(trainer._Run, "carve", functools.partialmethod(trainer._Run.carve, steps=5))
-    monkeypatch.setattr(evaluate, "score", lambda *_: {"srgb": 0.0})  # seconds, and no matter here
+    two_spheres.glance(monkeypatch)
 
 
 def tamper(monkeypatch, name, change):
@@ -123,6 +123,7 @@ def test_the_best_field_is_the_one_that_is_written(photographs, tmp_path, monkey
         return loss
 
     tamper(monkeypatch, "field", spoil)
+    monkeypatch.setattr(trainer._Run, "carve", functools.partialmethod(trainer._Run.carve, steps=60))
     fields = {}
     validate = trainer._Run.validate
 
@@ -184,5 +185,5 @@ def test_skins_get_steeper_once_around_the_surface(photographs, tmp_path, monkey
     torch.testing.assert_close(run.nets.log_density(x).detach(), expected, rtol=1e-4, atol=1e-4)
     run.refresh()
     torch.testing.assert_close(run.nets.log_density(x).detach(), expected, rtol=1e-4, atol=1e-4)
-    monkeypatch.setattr(stepper, "SOLID", 1.0)
+    monkeypatch.setattr(descent, "SOLID", 1.0)
     assert start().steep

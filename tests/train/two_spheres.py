@@ -1,6 +1,7 @@
-"""A small data set without a renderer: two Lambert spheres, ray-traced in NumPy with the light at the lens."""
+"""A small data set without a renderer: two Lambert spheres, ray-traced in NumPy, the light at the lens or beside it."""
 
 import dataclasses
+import json
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,18 @@ def coarsen(monkeypatch) -> None:
     monkeypatch.setattr(evaluate, "CELLS", 32)
 
 
+def glance(monkeypatch) -> None:
+    """Finished fields are compared with 500 pixels of the photographs: for runs whose scores do not matter."""
+    from mi_ntf.train import evaluate
+
+    whole = evaluate.score
+
+    def score(networks, occupancy, photographs, step, light, most, views=None, passes=1, tell=None):
+        return whole(networks, occupancy, photographs, step, light, 500 if views is None else most, views, passes)
+
+    monkeypatch.setattr(evaluate, "score", score)
+
+
 def camera(direction: np.ndarray) -> np.ndarray:
     """OpenGL camera-to-world (4, 4) at DISTANCE along the unit `direction`, looking at the origin."""
     right = np.cross((0.0, 0.0, 1.0), direction)
@@ -31,36 +44,72 @@ def camera(direction: np.ndarray) -> np.ndarray:
     return c2w
 
 
-def photograph(c2w: np.ndarray, focal: float, size: int, oversample: int = 3) -> np.ndarray:
-    """Premultiplied RGBA (size, size, 4): albedo/π · cos · I/d², box filter."""
+def photograph(c2w: np.ndarray, focal: float, size: int, oversample: int = 3, offset=(0.0, 0.0, 0.0)) -> np.ndarray:
+    """Premultiplied RGBA (size, size, 4): albedo/π · cos · I/d², box filter. The light is `offset`, right, up, forward,
+    from the lens; what one sphere sends to the other is left out, the shadow that it throws is not."""
     n = size * oversample
     o, d = schema.pixel_rays(c2w, focal * oversample, n, n)
+    light = flash(c2w, offset)
     nearest, image = np.full((n, n), np.inf), np.zeros((n, n, 4))
     for center, radius, albedo in SPHERES:
-        b = np.sum((o - center) * d, -1)
-        disc = b**2 - np.sum((o - center) ** 2, -1) + radius**2
-        t = np.where(disc > 0, -b - np.sqrt(np.maximum(disc, 0)), np.inf)
+        t = _meet(o, d, center, radius)
         hit = t < nearest
         nearest = np.where(hit, t, nearest)
-        x = o + np.where(hit, t, 0)[..., None] * d
-        cos = -np.sum((x - center) / radius * d, -1)
-        value = np.asarray(albedo) / np.pi * (cos * INTENSITY / np.where(hit, t, 1) ** 2)[..., None]
+        x = o + np.where(hit, t, 1)[..., None] * d
+        away = light - x
+        distance = np.linalg.norm(away, axis=-1)
+        away = away / distance[..., None]
+        cos = np.maximum(np.sum((x - center) / radius * away, -1), 0)
+        for other in SPHERES:
+            if other[0] != center and any(offset):
+                between = _meet(x, away, *other[:2])
+                cos = np.where((between > 0) & (between < distance), 0, cos)
+        value = np.asarray(albedo) / np.pi * (cos * INTENSITY / distance**2)[..., None]
         image[hit] = np.concatenate([value, np.ones((n, n, 1))], -1)[hit]
     return image.reshape(size, oversample, size, oversample, 4).mean((1, 3))
 
 
-def write(folder: Path, views: dict[str, int] | None = None, size: int = 32) -> Path:
-    """Write a data set of `views` (split → count) photographs and return its folder."""
+def flash(c2w: np.ndarray, offset) -> np.ndarray:
+    """Where the light is that stands `offset`, right, up, forward, from the lens."""
+    right, up, forward = offset
+    return (c2w @ (right, up, -forward, 1.0))[:3]
+
+
+def _meet(o: np.ndarray, d: np.ndarray, center, radius: float) -> np.ndarray:
+    """Where rays enter a sphere; infinity where they do not."""
+    b = np.sum((o - center) * d, -1)
+    disc = b**2 - np.sum((o - center) ** 2, -1) + radius**2
+    return np.where(disc > 0, -b - np.sqrt(np.maximum(disc, 0)), np.inf)
+
+
+def gains(split: str, count: int) -> np.ndarray:
+    """Factors (count, 3) of the photographs of a split whose exposure and white balance change: 0.5 to 2."""
+    return 2 ** np.random.default_rng(list(split.encode())).uniform(-1, 1, (count, 3))
+
+
+def write(folder: Path, views: dict[str, int] | None = None, size: int = 32, offset=(0.0, 0.0, 0.0),
+          left_out: tuple[str, ...] = ()) -> Path:
+    """Write a data set of `views` (split → count) photographs and return its folder.
+
+    `offset`: the light's place, as of :func:`photograph`. `left_out`: what the data set does not say, of `pl_pos`, and
+    `pl_intensity`, without which photographs have :func:`gains`.
+    """
     rng = np.random.default_rng(7)
     angle = 0.62
     for split, count in (views or {"train": 16, "val": 2, "test": 2}).items():
         frames = []
         (folder / split).mkdir(parents=True)
+        factors = gains(split, count) if "pl_intensity" in left_out else np.ones((count, 3))
         for i in range(count):
             direction = rng.normal(size=3)
             c2w = camera(direction / np.linalg.norm(direction))
             name = f"{split}/{i:04d}.exr"
-            schema.write_exr(folder / name, photograph(c2w, schema.focal_length(angle, size), size))
-            frames.append(schema.Frame(name, c2w, c2w[:3, 3], np.full(3, INTENSITY)))
-        schema.write_transforms(folder, split, schema.Transforms(angle, size, size, np.zeros(3), 1.0, frames))
+            picture = photograph(c2w, schema.focal_length(angle, size), size, offset=offset)
+            schema.write_exr(folder / name, picture * (*factors[i], 1))
+            frames.append(schema.Frame(name, c2w, flash(c2w, offset), np.full(3, INTENSITY)))
+        path = schema.write_transforms(folder, split, schema.Transforms(angle, size, size, np.zeros(3), 1.0, frames))
+        if left_out:
+            data = json.loads(path.read_text())
+            data["frames"] = [{k: v for k, v in frame.items() if k not in left_out} for frame in data["frames"]]
+            path.write_text(json.dumps(data))
     return folder

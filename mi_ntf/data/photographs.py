@@ -1,0 +1,127 @@
+"""Photographs with their masks and lenses, read one at a time into the array that a split holds.
+
+Of all of them together nothing exists but that array: 8-bit files make an array of bytes, 4 a pixel. Any other file
+makes one of half precision, or of single precision where half would not hold a photograph's light.
+"""
+
+import numpy as np
+
+from mi_ntf.core.errors import MiNtfError
+from mi_ntf.data import background, images, lens
+from mi_ntf.data.schema import Camera, View, focal_length
+
+HALF = (1e-3, 65504.0)
+"""Between these, the brightest light of a photograph for which half precision will do: it has 11 bits down to 6e-5."""
+
+
+def load(views: list[View], size: int | None = None, black: bool = False):
+    """``(images (N, H, W, 4) as stored, c2w (N, 4, 4), focal (N, 2), principal (N, 2))`` of a split; pixels, float64.
+
+    `size`: longer side in pixels that photographs are scaled down to. `black`: alpha is what the black background tells
+    (`background`) instead of masks. Every photograph has one size in the end. Raises MiNtfError.
+    """
+    stored, straighten, intrinsics = np.empty((0, 0, 0, 4), np.uint8), lens.Straightener(), []
+    for i, view in enumerate(views):
+        pixels, camera = read(view, size, black, straighten)
+        if i == 0:
+            stored = np.empty((len(views), *pixels.shape), _fitting(pixels))
+        if pixels.shape != stored.shape[1:]:
+            raise MiNtfError(f"{view.image}: is {pixels.shape[1]}x{pixels.shape[0]}, {views[0].image} is "
+                             f"{stored.shape[2]}x{stored.shape[1]}; all photographs of a split have one size: scale or "
+                             "crop them")
+        stored = _held(stored, i, _fitting(pixels))
+        stored[i] = pixels if pixels.dtype == stored.dtype or pixels.dtype != np.uint8 else images.linear(pixels)
+        intrinsics.append((camera.fx, camera.fy, camera.cx, camera.cy))
+    numbers = np.array(intrinsics, dtype=np.float64)
+    return stored, np.stack([view.c2w for view in views]), numbers[:, :2], numbers[:, 2:]
+
+
+def _fitting(pixels: np.ndarray) -> np.dtype:
+    """The smallest type that holds a photograph."""
+    if pixels.dtype == np.uint8:
+        return np.dtype(np.uint8)
+    brightest = max(float(pixels[..., :3].max()), -float(pixels[..., :3].min()))
+    return np.dtype(np.float16 if brightest == 0 or HALF[0] < brightest <= HALF[1] else np.float32)
+
+
+def _held(stored: np.ndarray, count: int, dtype: np.dtype) -> np.ndarray:
+    """`stored` with the first `count` photographs kept, of `dtype` where that holds more."""
+    if dtype.itemsize <= stored.dtype.itemsize:
+        return stored
+    wider = np.empty(stored.shape, dtype)
+    for old, new in zip(stored[:count], wider, strict=False):
+        new[:] = images.linear(old)
+    return wider
+
+
+def read(view: View, size: int | None, black: bool, straighten: lens.Straightener) -> tuple[np.ndarray, Camera]:
+    """``(pixels (H, W, 4), camera)`` of one photograph: 8-bit levels, or float32. Raises MiNtfError."""
+    image = images.decode(view.image)
+    height, width = image.rgb.shape[:2]
+    camera, mask = _camera(view, width, height), None if black else _mask(view, image)
+    target, whole = lens.shrunk(width, height, size), image.rgb.dtype == np.uint8
+    bent = any(camera.distortion)
+    if whole and not bent and target == (width, height):
+        pixels = images.as_levels(image, mask)
+    else:
+        pixels = images.as_linear(image, mask)
+        del image, mask  # of 12 megapixels each copy counts
+        if bent:
+            pixels, camera = straighten(pixels, camera, view.where)
+        if target != (width, height):
+            pixels, camera = lens.shrink(pixels, camera, target)
+        if whole:
+            pixels = _as_levels(pixels)
+    if black:
+        pixels[..., 3] = background.alpha(pixels, str(view.image)) * (1 if whole else 1 / 255)
+    return pixels, camera
+
+
+def _as_levels(pixels: np.ndarray) -> np.ndarray:
+    stored = np.empty(pixels.shape, np.uint8)
+    for rows in images.strips(pixels):
+        stored[rows] = images.levels(pixels[rows])
+    return stored
+
+
+def _mask(view: View, image: images.Decoded) -> np.ndarray | None:
+    """The mask that is the photograph's alpha, None where that has its own.
+
+    Training must know which pixels show the object, so a photograph with neither is an error.
+    """
+    if image.alpha is not None and not view.mask_first:
+        return None
+    place = next((place for place in view.masks if place.is_file()), None)
+    if place is None:
+        lacks = "has no mask" if view.mask_first else "has no alpha channel and no mask"
+        raise MiNtfError(f"{view.image}: {lacks}{' (' + str(view.masks[0]) + ')' if view.masks else ''}; training must "
+                         "tell the object from what is behind it: put a mask there (PNG, white: object, black: "
+                         "background), name the masks' folder with --masks DIR, write the photograph as RGBA PNG, or, "
+                         "if all were taken with a flash in a dark room, say --background black")
+    mask = images.read_mask(place)
+    if mask.shape != image.rgb.shape[:2]:
+        raise MiNtfError(f"{place}: is {mask.shape[1]}x{mask.shape[0]}, its photograph {view.image} is "
+                         f"{image.rgb.shape[1]}x{image.rgb.shape[0]}; a mask has the size of its photograph")
+    return mask
+
+
+def _camera(view: View, width: int, height: int) -> Camera:
+    """The camera of the photograph's `width` and `height` in pixels."""
+    camera = view.camera
+    if not isinstance(camera, Camera):
+        focal = focal_length(camera, width)
+        camera = Camera(focal, focal, 0.5 * width, 0.5 * height)
+    if view.size is not None and view.size != (width, height):
+        told = f"{view.image}: is {width}x{height}, {view.where} says {view.size[0]}x{view.size[1]}"
+        if not view.rescaled:
+            raise MiNtfError(f"{told}; photograph and camera must belong together: scale one of them")
+        if abs(width * view.size[1] / (height * view.size[0]) - 1) > 0.02:  # 1 pixel of 50 that rounding took
+            raise MiNtfError(f"{told}; photographs may be scaled, in the same proportion: put the whole ones there")
+        camera = lens.rescaled(camera, view.size, (width, height))
+    if not (0 < camera.cx < width and 0 < camera.cy < height):
+        raise MiNtfError(f"{view.where}: its principal point is ({camera.cx:g}, {camera.cy:g}), outside the image "
+                         f"of {width}x{height} pixels; scale the camera's intrinsics with the image")
+    if not all(1e-3 * width < f < 1e6 * width for f in (camera.fx, camera.fy)):
+        raise MiNtfError(f"{view.where}: its focal lengths are {camera.fx:g} and {camera.fy:g} pixels, for an "
+                         f"image of {width}x{height} pixels that is no pinhole camera; correct the camera")
+    return camera
