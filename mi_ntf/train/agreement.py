@@ -10,7 +10,7 @@ from .networks import Networks
 from .occupancy import Occupancy
 from .rays import Photographs
 
-PIXELS = 2000
+PIXELS = 1000
 """Pixels looked at of each photograph."""
 BEHIND = 5.0
 """dB under the median, and three times the usual spread, from which on a photograph disagrees with the others."""

@@ -21,8 +21,8 @@ FIELD = ("density", "reflectance")
 SOLID = 0.5
 """Share of the object's pixels that nothing may shine through, or it is smoke, which has no skin, and whose
 bounces are others."""
-SCORING = 0.06
-"""Share of the minutes that is left for the scores of the finished field."""
+SCORING = 0.09
+"""Share of the minutes that is left for the scores and the page of the finished field."""
 SURVEYED = 1 << 18
 """Pixels that tell how bright the photographs are, and how opaque the object."""
 

@@ -23,7 +23,9 @@ SHOWN = 3
 WIDTH = 256
 """… and how many pixels of their longer side."""
 TURNS = 8
-"""Places of the lamp that goes around the object."""
+"""Places of the lamp that goes around the object …"""
+TURNED = 180
+"""… and how many pixels of the longer side then."""
 
 
 def complaints(agreement: Agreement, splits: dict[str, Split]) -> list[str]:
@@ -111,7 +113,7 @@ class Report:
     def turning(self, photographs: Photographs) -> None:
         """The first photograph under a lamp that goes around the object, at the camera's height and distance."""
         self.page.section("Under a turning lamp")
-        rays, shape = self._rays(photographs, 0)
+        rays, shape = self._rays(photographs, 0, TURNED)
         rays = replace(rays, view=torch.zeros_like(rays.view))
         lamp = Flash([photographs], self.light.flash is None or self.light.flash.solid, self._marched())
         camera = lamp.camera[0]
@@ -123,7 +125,7 @@ class Report:
             along = up * (up @ camera)
             place = along + (camera - along) * angle.cos() + across * angle.sin()
             lamp.place = (place + 0.3 * camera.norm() * up)[None]
-            color, *_ = self._render(rays, Light(None, lamp))
+            color, *_ = self._render(rays, Light(None, lamp), 1)
             if turn == 0:
                 bright = color.amax(1)
                 exposure = 0.8 / max(float(bright[bright > 0].quantile(0.98)) if bool(bright.any()) else 1.0, 1e-9)
@@ -153,12 +155,12 @@ class Report:
     def write(self, path: Path) -> None:
         self.page.write(path)
 
-    def _rays(self, photographs: Photographs, number: int) -> tuple[Rays, tuple[int, int]]:
-        pixels, *shape = photographs.frame(number, max(1, round(max(photographs.height, photographs.width) / WIDTH)))
+    def _rays(self, photographs: Photographs, number: int, width: int = WIDTH) -> tuple[Rays, tuple[int, int]]:
+        pixels, *shape = photographs.frame(number, max(1, round(max(photographs.height, photographs.width) / width)))
         return photographs[pixels], (shape[0], shape[1])
 
-    def _render(self, rays: Rays, light: Light):
-        return render_all(self.networks, rays, self.occupancy, self.step, device.generator(1), light, 2)
+    def _render(self, rays: Rays, light: Light, passes: int = 2):
+        return render_all(self.networks, rays, self.occupancy, self.step, device.generator(1), light, passes)
 
     def _marched(self) -> Marched:
         marched = Marched()

@@ -283,7 +283,7 @@ class _Loop(Descent):
 
     def affordable(self) -> float:
         """Pixels of a split that there is time to look at, of both splits twice each."""
-        return math.inf if self.minutes == math.inf else max(VALIDATED, self.speed * 60 * self.minutes * SCORING / 5)
+        return math.inf if self.minutes == math.inf else max(VALIDATED, self.speed * 60 * self.minutes * SCORING / 10)
 
     def finish(self) -> dict:
         """Write the field, read it back, measure it, and store the report in its header."""

@@ -9,8 +9,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers.variants import VARIANT
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import binary_erosion, binary_fill_holes, label, map_coordinates, median_filter
 
+from mi_ntf.core import field_file
 from mi_ntf.data import capture as cap
 from mi_ntf.data import images, schema
 from mi_ntf.data.readers import load_dataset
@@ -143,3 +144,29 @@ def test_environment_is_the_script_s_and_its_sun_stands_where_it_says():
     si.wi = -mi.Vector3f(*(np.array([0.75, 0.62, 0.62]) / np.linalg.norm([0.75, 0.62, 0.62])).tolist())
     towards_sun = np.array(emitter.eval(si)).ravel()
     assert towards_sun[0] > 0.75 * stored[..., 0].max()  # bilinear lookup beside the brightest texel
+
+
+def test_skull_stands_where_its_field_does():
+    similarity = field_file.load(SCENES / "skull/field.safetensors")[0].similarity
+    center, radius = sphere_of(SCENES / "skull/scene.xml")
+    np.testing.assert_allclose(center, similarity.center, atol=1e-6)  # written with eight decimals
+    assert radius == pytest.approx(similarity.radius, abs=1e-6)
+
+
+def test_skull_has_no_holes_and_no_plaid():
+    """Under the sky its silhouette is one piece without gaps, and nothing in it is much darker or brighter than what is
+    around it, as the torn field of an earlier build was. The lamp leaves the side that is turned away dark."""
+    sky, lamp = (np.array(mi.render(mi.load_file(str(SCENES / "skull/scene.xml"), light=light, res="96"), spp=4))
+                 for light in ("env", "point"))
+    matter = sky[..., 3] > 0.5
+    pieces, count = label(matter)
+    assert (pieces == np.bincount(pieces.ravel())[1:].argmax() + 1).sum() > 0.99 * matter.sum(), count
+    assert (binary_fill_holes(matter) & ~matter).sum() == 0
+    inner = binary_erosion(matter, iterations=3)
+    grey = sky[..., :3].mean(-1)
+    around = median_filter(grey, 11)
+    # its folds are 0.6 of what is around them, its bright edges 1.5; plaid is 0.1 and 3
+    share = np.quantile(grey[inner] / around[inner], [0.01, 0.99])
+    assert share[0] > 0.4 and share[1] < 1.8, share
+    dark = lamp[..., :3].mean(-1)[inner] < 0.02 * np.quantile(lamp[..., :3].mean(-1)[inner], 0.9)
+    assert 0.1 < dark.mean() < 0.6, dark.mean()
