@@ -1,5 +1,6 @@
 """Whether photographs agree with each other: what is left between each of them and the field that all of them made."""
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -11,7 +12,11 @@ from .occupancy import Occupancy
 from .rays import Photographs
 
 PIXELS = 1000
-"""Pixels looked at of each photograph."""
+"""Pixels looked at of each photograph …"""
+FEWEST = 250
+"""… and at least, where there is little time."""
+KNOWN = 20.0
+"""dB of the median photograph from which on a field knows the object well enough to tell of the photographs."""
 BEHIND = 5.0
 """dB under the median, and three times the usual spread, from which on a photograph disagrees with the others."""
 FEWEST = 50
@@ -37,6 +42,11 @@ class Agreement:
         apart = self.shift - self.shift.median(0).values
         return float(apart.square().sum(1).mean().sqrt())
 
+    @property
+    def known(self) -> bool:
+        """Whether the field has learned enough to judge."""
+        return bool(self.psnr.nanmedian() > KNOWN)
+
     def outliers(self) -> list[int]:
         """Photographs that the others contradict."""
         middle = self.psnr.nanmedian()
@@ -46,13 +56,14 @@ class Agreement:
 
 @torch.no_grad()
 def survey(networks: Networks, occupancy: Occupancy, pool: Photographs, gains: torch.Tensor | None, step: float,
-           light: Light) -> Agreement:
-    """Compare some pixels of all photographs with the field; `gains` (views, 3): theirs."""
+           light: Light, most: float = math.inf) -> Agreement:
+    """Compare some pixels of all photographs with the field, `most` or so in all; `gains` (views, 3): theirs."""
     generator, psnr, shift = device.generator(8), [], []
+    each = int(max(FEWEST, min(PIXELS, most / pool.views)))
     for number in range(pool.views):
         pixels, *_ = pool.frame(number)
         matter = pixels[pool.pixels(pixels)[:, 3] > MATTER]
-        pixels = matter[torch.randperm(len(matter), generator=generator)[:PIXELS]]
+        pixels = matter[torch.randperm(len(matter), generator=generator)[:each]]
         if len(pixels) < FEWEST:
             psnr.append(torch.nan)
             shift.append(torch.zeros(2))

@@ -31,6 +31,9 @@ TURNED = 180
 def complaints(agreement: Agreement, splits: dict[str, Split]) -> list[str]:
     """A sentence for each thing that is wrong with the photographs."""
     found, names = [], splits["train"].names
+    if not agreement.known:
+        return ["warning: the field has hardly learned the photographs, whose poses and masks cannot be judged by it; "
+                "train for longer, or look at them with `mi-ntf inspect`"]
     if agreement.moved > MOVED:
         width = splits["train"].focal.mean()
         degrees = float(torch.rad2deg(torch.tensor(agreement.moved / width)))
@@ -46,10 +49,11 @@ def complaints(agreement: Agreement, splits: dict[str, Split]) -> list[str]:
     return found
 
 
-def photographs(run: Descent, stored: Networks, occupancy: Occupancy, report: dict) -> Agreement:
-    """What the finished field, as `stored`, tells of the photographs of the `run`: into the `report`; complains."""
+def photographs(run: Descent, stored: Networks, occupancy: Occupancy, report: dict, most: float) -> Agreement:
+    """What the finished field, as `stored`, tells of the photographs of the `run`, from `most` pixels or so: into the
+    `report`; complains."""
     gains = None if run.gains is None else run.gains.all().detach()
-    found = survey(stored, occupancy, run.photographs["train"], gains, run.config.step, run.light)
+    found = survey(stored, occupancy, run.photographs["train"], gains, run.config.step, run.light, most)
     for text in complaints(found, run.splits):
         run.note(text)
     report["notes"] = run.notes

@@ -33,6 +33,8 @@ FAULTS = 3
 """Rolled-back faults after which the next one ends the run."""
 VALIDATED = 1 << 17
 """Pixels of a validation in the course of the run."""
+SCORED = 1 << 14
+"""Pixels at least that a split of the finished field is scored by, in the shortest runs."""
 BETTER = 0.02
 """dB by which an earlier field must be better in validation to be taken in place of the last one."""
 
@@ -283,7 +285,7 @@ class _Loop(Descent):
 
     def affordable(self) -> float:
         """Pixels of a split that there is time to look at, of both splits twice each."""
-        return math.inf if self.minutes == math.inf else max(VALIDATED, self.speed * 60 * self.minutes * SCORING / 10)
+        return math.inf if self.minutes == math.inf else max(SCORED, self.speed * 60 * self.minutes * SCORING / 10)
 
     def finish(self) -> dict:
         """Write the field, read it back, measure it, and store the report in its header."""
@@ -305,7 +307,7 @@ class _Loop(Descent):
                 scores.pop("each")
                 report[name] = {k: round(v, 3 if k != "alpha_rmse" else 5) for k, v in scores.items()}
         report["transmittance"] = held_out.score(stored, occupancy, self.photographs["val"])
-        agreement = photographs(self, stored, occupancy, report)
+        agreement = photographs(self, stored, occupancy, report, self.affordable())
         field_file.save(self.out, Header(self.config.architecture, self.similarity, report), tensors)
         publish(self, stored, occupancy, agreement, report, self.trace, self.out)
         checkpoint.delete(self.checkpoint)
