@@ -1,5 +1,6 @@
 """What every recipe's stepper has: the photographs, the networks, and a guarded step of an optimiser."""
 
+import copy
 import functools
 import math
 import time
@@ -35,6 +36,8 @@ class Descent:
 
     HELD: tuple[str, ...] = ("step", "spent", "rate")
     """Attributes that decide how the run goes on."""
+    OWN: tuple[str, ...] = ()
+    """Those of the loop around the stepper."""
     GRIDS: tuple[tuple[str, tuple[str, ...]], ...] = ()
     """Attributes that hold tensors, and which."""
     optimizers: dict[str, torch.optim.Optimizer]
@@ -133,6 +136,29 @@ class Descent:
         parameters = self.parameters()
         for name, value in snapshot["tensors"].items():
             parameters[name].copy_(value)
+
+    def state(self) -> dict:
+        """A copy of all that decides the next step: a run that takes it up is the same run."""
+        return copy.deepcopy({
+            "held": {k: getattr(self, k) for k in (*self.HELD, *self.OWN)}, "random": self.generator.get_state(),
+            "tensors": {k: v.detach() for k, v in self.parameters().items()},
+            "optimizers": {k: o.state_dict() for k, o in self.optimizers.items()}, "watch": self.watch.seen,
+            "grids": {k: {name: getattr(getattr(self, k), name) for name in names if hasattr(getattr(self, k), name)}
+                      for k, names in self.GRIDS}})
+
+    def restore(self, state: dict) -> None:
+        """Take up a :meth:`state`."""
+        state = copy.deepcopy(state)
+        Descent.adopt(self, state)
+        for name, optimizer in self.optimizers.items():
+            optimizer.load_state_dict(state["optimizers"][name])
+        for name, values in state["grids"].items():
+            for key, value in values.items():
+                setattr(getattr(self, name), key, value)
+        for name, value in state["held"].items():
+            setattr(self, name, value)
+        self.watch.seen = state["watch"]
+        self.generator.set_state(state["random"].cpu())
 
     def _descend(self, name: str, loss: torch.Tensor, rate: float) -> float:
         optimizer = self.optimizers[name]

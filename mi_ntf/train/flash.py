@@ -20,6 +20,7 @@ import torch.nn.functional as F
 
 from ..core import fresnel, microfacet
 from . import ops
+from .baked import fetch
 from .marched import Marched, walk
 from .rays import Photographs
 
@@ -30,8 +31,11 @@ LEAST_COSINE = 0.03
 """Light that grazes the skin goes through as much of it as at this cosine."""
 DARK = 6.0
 """Optical depth from which on marched light counts as gone."""
-LIFT = 0.02
-"""Where shadow rays begin, above the skin, in radii of the unit sphere: out of its own matter."""
+LIFTS = (0.015, 0.025, 0.04, 0.06)
+"""Heights above the skin, in radii of the unit sphere, at the first of which that is out of matter shadow rays begin:
+early skins are thick, and coarse voxels make all of them so."""
+CLEAR = 1.0
+"""σ under which a place is out of matter."""
 
 
 class Flash:
@@ -97,6 +101,15 @@ class Flash:
     @torch.no_grad()
     def lit(self, view: torch.Tensor, x: torch.Tensor, normal: torch.Tensor) -> torch.Tensor:
         """V (n,): what reaches opaque skins at `x` (n, 3) of mean `normal` (n, 3), out of their own matter."""
-        if not self.solid:
+        if not self.solid or not self.marched.known:
             return torch.ones(len(x))
-        return self.reaching(view, x + LIFT * F.normalize(normal, dim=1))
+        return self.reaching(view, above(self.marched, x, F.normalize(normal, dim=1)))
+
+
+def above(marched: Marched, x: torch.Tensor, normal: torch.Tensor) -> torch.Tensor:
+    """Where shadow rays begin (n, 3) over points of skin at `x` (n, 3) with unit `normal` (n, 3)."""
+    places = x + torch.tensor(LIFTS)[:, None, None] * normal
+    sigma = fetch(marched.log_sigma, places.reshape(-1, 3))[0].view(len(LIFTS), -1).exp()
+    inside = (sigma > CLEAR).to(torch.uint8)
+    first = inside.cumprod(0).sum(0).clamp(max=len(LIFTS) - 1).long()
+    return places[first, torch.arange(len(x))]

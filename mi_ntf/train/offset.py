@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 
 from .baked import Baked
-from .flash import LIFT, Flash
+from .flash import Flash, above
 from .marched import Marched, walk
 from .rays import Photographs, Rays
 
@@ -62,7 +62,7 @@ def observe(pool: Photographs, rays: Rays, baked: Baked, marched: Marched) -> Ob
         inside = (local[:, 2] < 0) & (column >= 0) & (column < pool.width) & (row >= 0) & (row < pool.height)
         inside &= (toward * normal).sum(1) > SEEN
         some = inside.nonzero()[:, 0]
-        _, depth = walk(marched, x[some] + LIFT * normal[some], toward[some], 2.0, distance[some])
+        _, depth = walk(marched, above(marched, x[some], normal[some]), toward[some], 2.0, distance[some])
         pixels = pool.pixels((number * pool.height + row[some]) * pool.width + column[some])
         color = pixels[:, :3]
         good = (depth < 0.5) & (pixels[:, 3] > 0.99) & (color.amin(1) > 1e-3)

@@ -1,6 +1,5 @@
 """The training loop: photographs in, one field file out."""
 
-import copy
 import dataclasses
 import hashlib
 import json
@@ -86,7 +85,6 @@ class _Loop(Descent):
     """One training run around a stepper, which a subclass adds: its loop, its validation, its files."""
 
     OWN = ("history", "validated", "best", "kept", "faults", "trace")
-    """Attributes that, with the stepper's, generator, networks, optimisers and loss averages, decide how it goes on."""
 
     def __init__(self, dataset: Path, out: Path, config: TrainConfig | HierarchicalConfig, preset: str, *, minutes,
                  steps, seed, tensorboard=None, given=None, reading=None, estimate=False):
@@ -225,29 +223,6 @@ class _Loop(Descent):
             if not bool(value.isfinite().all()):
                 raise Fault(f"{name} is not finite at step {self.step}")
         self.good = self.state()
-
-    def state(self) -> dict:
-        """A copy of all that decides the next step: a run that takes it up is the same run."""
-        return copy.deepcopy({
-            "held": {k: getattr(self, k) for k in (*self.HELD, *self.OWN)}, "random": self.generator.get_state(),
-            "tensors": {k: v.detach() for k, v in self.parameters().items()},
-            "optimizers": {k: o.state_dict() for k, o in self.optimizers.items()}, "watch": self.watch.seen,
-            "grids": {k: {name: getattr(getattr(self, k), name) for name in names if hasattr(getattr(self, k), name)}
-                      for k, names in self.GRIDS}})
-
-    def restore(self, state: dict) -> None:
-        """Take up a :meth:`state`."""
-        state = copy.deepcopy(state)
-        Descent.adopt(self, state)
-        for name, optimizer in self.optimizers.items():
-            optimizer.load_state_dict(state["optimizers"][name])
-        for name, values in state["grids"].items():
-            for key, value in values.items():
-                setattr(getattr(self, name), key, value)
-        for name, value in state["held"].items():
-            setattr(self, name, value)
-        self.watch.seen = state["watch"]
-        self.generator.set_state(state["random"].cpu())
 
     def roll_back(self, fault: Fault) -> str:
         """Go back to the last good state with half the learning rates; says so. The generator goes on, so that the same
