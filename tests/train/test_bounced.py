@@ -1,5 +1,7 @@
 """Light that bounces between parts of the object, as the trainer sees it: against closed forms and the renderer."""
 
+import copy
+
 import numpy as np
 import pytest
 import torch
@@ -118,6 +120,30 @@ def test_far_points_and_other_faces_get_nothing_or_their_own(light):
     nowhere = torch.tensor([[0.0, 0.9, 0.0]])
     assert not light(torch.tensor([0]), nowhere, torch.tensor([[0.0, 1, 0]]), generator).any()
     assert light.light.shape[0] == 2 and not light.light[:, -1].any() and (light.light >= 0).all()
+
+
+def test_the_room_sends_light_back_where_it_is_open(light):
+    """Over what one patch gets of another: a share of the flash's own irradiance at the middle, where other patches do
+    not stand before it; its derivative by the share's logarithm is itself."""
+    assert light.open.shape == (light.light.shape[1],) and light.open[-1] == 1
+    assert (light.open >= 0).all() and (light.open <= 1).all()
+    room = torch.log(torch.tensor([0.1, 0.2, 0.05])).requires_grad_()
+    within = copy.copy(light)
+    within.room = room
+    for away in (False, True):
+        n = np.array([-1.0 if away else 1.0, 0, 0])
+        x = np.array([PLACES[0], 0, 0]) + RADIUS * n
+        many, normals = (torch.as_tensor(np.tile(v, (2000, 1)), dtype=torch.float32) for v in (x, n))
+        view = torch.zeros(2000).long()
+        both = [b(view, many, normals, torch.Generator().manual_seed(0)) for b in (within, light)]
+        added = (both[0] - both[1]).mean(0)
+        # A sphere of radius r at the distance d before a patch takes (r/d)² of its sky; nothing is before the far side.
+        open_ = 1 - (0 if away else (RADIUS / (2 * PLACES[1] - RADIUS)) ** 2)
+        expected = open_ * POWER[0] / float(FLASH[0].square().sum()) * room.exp()
+        torch.testing.assert_close(added, expected, rtol=0.06, atol=0)
+        added.sum().backward()
+        torch.testing.assert_close(room.grad, added.detach(), rtol=1e-4, atol=0)
+        room.grad = None
 
 
 def test_albedo_learns_of_the_bounced_light(spheres, light):

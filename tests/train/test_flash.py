@@ -11,7 +11,7 @@ from train import shots  # noqa: E402
 from mi_ntf.core import fresnel, microfacet  # noqa: E402
 from mi_ntf.core import ops as numpy_ops  # noqa: E402
 from mi_ntf.train import flash, rays, render  # noqa: E402
-from mi_ntf.train.marched import Marched  # noqa: E402
+from mi_ntf.train.marched import Marched, walk  # noqa: E402
 
 ANGLES = [(0, 0), (0, 50), (40, -40), (40, 20), (65, 10), (20, 75), (-60, 60)]
 """Degrees of viewer and light from the normal, in one plane."""
@@ -246,6 +246,41 @@ def test_a_skin_is_lit_from_outside_of_its_own_matter():
     assert (found[cos < -0.5] < 0.01).all(), found[cos < -0.5].max()
     assert float(lamp.reaching(view, x - 0.015 * normal)[cos > 0.45].mean()) < 0.5
     assert (shots.flash(LAMPS, ball(6.0), solid=False).lit(view, x, normal) == 1).all()
+
+
+@pytest.mark.parametrize("thick", [0.002, 0.01, 0.03])
+def test_thick_skins_do_not_shade_themselves(thick):
+    """ln σ of early fields rises slowly: from 0 to 4 over some 0.01 to 0.1 here. What the camera sees of such a ball,
+    at the optical depth 0.7, is lit all the same where light falls in steeply, and dark on the other side."""
+    k = 128
+    axis = (torch.arange(k) + 0.5) * (2 / k) - 1
+    z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
+    radius = (torch.stack([x, y, z], -1) - torch.as_tensor(CENTRE).float()).norm(dim=-1)
+    marched = Marched()
+    marched.log_sigma = ((RADIUS - radius) / thick).clamp(-12, 4)[None, None]
+    normal = directions(500, 12).float()
+    o = torch.as_tensor(CENTRE).float() + 2 * normal
+    t, _ = walk(marched, o, -normal, 0.7)
+    at = o - t[:, None] * normal
+    lamp, view = shots.flash(LAMPS, marched), torch.zeros(500).long()
+    cos = (normal * lamp.toward(view, at)[0]).sum(1)
+    found = lamp.lit(view, at, normal)
+    # What is left above the place where the ray begins: σ over its logarithm's slope, of the highest lift if need be.
+    rest = max(flash.CLEAR * thick, 0.7 * np.exp(-flash.LIFTS[-1] / thick)) / 0.6
+    assert float(found[cos > 0.6].min()) > np.exp(-1.1 * rest) > 0.83 and float(found[cos < -0.6].max()) < 0.03
+    places = flash.above(marched, at, normal)
+    height = ((places - at) * normal).sum(1)
+    np.testing.assert_allclose(places, at + height[:, None] * normal, atol=1e-6)
+    levels = torch.tensor(flash.LIFTS)
+    nearest = (height[:, None] - levels).abs().min(1)
+    assert float(nearest.values.max()) < 1e-5
+    # The first that is out of matter: the one before is in it.
+    depth = ((RADIUS - (at - torch.as_tensor(CENTRE).float()).norm(dim=1))[:, None] - levels) / thick
+    clear = depth < np.log(flash.CLEAR)
+    wanted = torch.where(clear.any(1), clear.to(torch.uint8).argmax(1), len(levels) - 1)
+    # ln σ between voxels of 1/64 is not that of the radius.
+    assert float((nearest.indices == wanted).float().mean()) > 0.8
+    assert float((nearest.indices - wanted).abs().max()) <= 1
 
 
 def test_points_in_smoke_are_lit_one_by_one():
