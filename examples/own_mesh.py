@@ -1,6 +1,6 @@
 """From a mesh scene of your own to its relit field: the four commands, with settings small enough to try.
 
-    python examples/own_mesh.py [--out out/own_mesh] [--views 40] [--size 96] [--minutes 3]
+    python examples/own_mesh.py [--out out/own_mesh] [--views 40] [--size 96] [--minutes 3 | --steps N]
 
 Give `--scene` a Mitsuba scene made of your meshes; without it a small one of two boxes is written.
 """
@@ -40,14 +40,15 @@ def run(*words: object) -> None:
 
 
 def main(out: Path = Path("out/own_mesh"), scene: Path | None = None, views: int = 40, size: int = 96, spp: int = 32,
-         minutes: float = 3.0) -> None:
+         minutes: float = 3.0, steps: int | None = None) -> None:
     """Photograph, train, swap, render."""
     out.mkdir(parents=True, exist_ok=True)
     if scene is None:
         scene = out / "mesh.xml"
         scene.write_text(BOXES)
     run("capture", scene, out / "photographs", "--views", views, "--size", size, "--test-views", 2, "--spp", spp)
-    run("train", out / "photographs", "-o", out / "field.safetensors", "--minutes", minutes)
+    run("train", out / "photographs", "-o", out / "field.safetensors",
+        *(("--minutes", minutes) if steps is None else ("--steps", steps)))
     run("swap", scene, out / "field.safetensors", "-o", out / "scene.xml")
     run("render", "-m", "llvm_ad_rgb", "-o", out / "relit.exr", out / "scene.xml")
 

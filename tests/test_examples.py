@@ -76,7 +76,7 @@ def test_volpath_reference_agrees(blob_scene):
 
 def test_own_mesh_from_photographs_to_a_lit_image(tmp_path):
     pytest.importorskip("torch")
-    _run("own_mesh.py", "--out", tmp_path, "--views", 8, "--size", 32, "--spp", 4, "--minutes", 0.25)
+    _run("own_mesh.py", "--out", tmp_path, "--views", 8, "--size", 32, "--spp", 4, "--steps", 80)
     image = read_image(tmp_path / "relit.exr")
     assert image.shape == (96, 96, 4)
     assert 0.03 < image[..., 3].mean() < 0.9 and image[..., :3].mean() > 1e-3  # an object, lit, before a background
