@@ -163,7 +163,7 @@ class Swap:
     """Scene to write."""
 
     def run(self) -> None:
-        from mi_ntf.render.swap import swap
+        from mi_ntf.swap import swap
 
         swap(self.scene, self.field_file, self.output)
 
@@ -215,7 +215,7 @@ class Explain:
 
     def run(self) -> None:
         parameters = _definitions(self.define)
-        from mi_ntf.render.explain import explain, print_table
+        from mi_ntf.render.commands.explain import explain, print_table
 
         _report(explain(self.scene, parameters, self.measure), self.json, print_table)
 
@@ -253,7 +253,7 @@ class Bake:
     """Print JSON in place of a table."""
 
     def run(self) -> None:
-        from mi_ntf.render.bake import bake
+        from mi_ntf.render.commands.bake import bake
 
         _report(bake(self.scene, self.output, _definitions(self.define)), self.json, _print_pairs)
 

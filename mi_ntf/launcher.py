@@ -5,7 +5,6 @@ parse, instantiate, render without developing, let the film write the file.
 """
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -123,10 +122,3 @@ def _apply_settings(args: argparse.Namespace) -> None:
     if args.wavefront > 1:
         dr.set_flag(dr.JitFlag.SymbolicCalls, False)
     dr.set_flag(dr.JitFlag.PrintIR, args.print_ir)
-
-
-if __name__ == "__main__":
-    from mi_ntf.cli import main as cli_main
-
-    # The C++ bridge lands here when the environment has no shared libpython.
-    sys.exit(cli_main(["render", *sys.argv[1:]]))

@@ -101,7 +101,7 @@ bool load_libpython(const Environment &env) {
 void become_launcher(const Environment &env) {
     std::ifstream file("/proc/self/cmdline", std::ios::binary);
     std::string text((std::istreambuf_iterator<char>(file)), {});
-    std::vector<std::string> words = { env.python.string(), "-m", "mi_ntf.launcher" };
+    std::vector<std::string> words = { env.python.string(), "-m", "mi_ntf", "render" };
     size_t begin = text.find('\0') + 1;                      // skip the program's name
     for (size_t end; (end = text.find('\0', begin)) != std::string::npos; begin = end + 1)
         words.push_back(text.substr(begin, end - begin));

@@ -13,7 +13,7 @@ namespace mi_ntf {
  *
  * `site_packages` is the folder that holds the `mitsuba` package. The caller must make sure
  * that only one thread is in here at a time. Where the environment has no shared libpython,
- * the process turns into `python -m mi_ntf.launcher` with the same arguments and this call
+ * the process turns into `python -m mi_ntf render` with the same arguments and this call
  * does not return. Throws std::runtime_error if neither way is open.
  */
 void start_python(const std::filesystem::path &site_packages);

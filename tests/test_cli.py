@@ -31,9 +31,10 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list:
     stand_in("mi_ntf.data.capture", capture=note())
     stand_in("mi_ntf.data.inspect", inspect=note(table), print_table=lambda values: print("table", values["psnr"]))
     stand_in("mi_ntf.train", train=note(table))
-    stand_in("mi_ntf.render.swap", swap=note())
+    stand_in("mi_ntf.swap", swap=note())
     stand_in("mi_ntf.evaluate.compare", compare=note(table), print_table=lambda values: print("table", values["psnr"]))
-    stand_in("mi_ntf.render.explain", explain=note(table), print_table=lambda values: print("table", values["psnr"]))
+    stand_in("mi_ntf.render.commands.explain", explain=note(table),
+             print_table=lambda values: print("table", values["psnr"]))
     stand_in("mi_ntf.core.field_file", describe=note(table))
     return seen
 

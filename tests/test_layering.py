@@ -4,6 +4,7 @@ Training never imports Mitsuba or Dr.Jit, rendering never imports PyTorch.
 """
 
 import ast
+import graphlib
 from pathlib import Path
 
 import pytest
@@ -33,6 +34,9 @@ FORBIDDEN = {
     "evaluate": set(),
 }
 """Third parties that a folder must not import, not even inside a function."""
+
+ROOMS = ("user_cache", "cost", "scene", "lights", "maps", "transport", "plugins", "commands")
+"""Of `render`: each may import those before it."""
 
 TOP_LEVEL_FORBIDDEN = TORCH
 """The same for the modules at the top of the package (command line, bridge, doctor)."""
@@ -72,6 +76,35 @@ def test_imports_follow_the_picture(file: Path):
         inner = rest[0] if top == "mi_ntf" and rest else None
         if folder and inner in MAY_IMPORT:
             assert inner in MAY_IMPORT[folder], f"{file} imports {name}"
+
+
+def module_of(name: str) -> str | None:
+    """The module of the package that an imported dotted name is, or lies in; None for others."""
+    parts = name.split(".")
+    while parts and parts[0] == "mi_ntf":
+        path = PACKAGE.parent.joinpath(*parts)
+        if path.with_suffix(".py").is_file() or (path / "__init__.py").is_file():
+            return ".".join(parts)
+        parts.pop()
+    return None
+
+
+@pytest.mark.parametrize("file", sorted((PACKAGE / "render").rglob("*/*.py")), ids=lambda f: "/".join(f.parts[-2:]))
+def test_rooms_of_the_renderer_import_those_before_them(file: Path):
+    own = ROOMS.index(file.relative_to(PACKAGE / "render").parts[0])
+    for name in imports_of(file):
+        top, *rest = name.split(".")
+        if top == "mi_ntf" and rest[0] == "render":
+            assert rest[1] in ROOMS[: own + 1], f"{file} imports {name}"
+
+
+def test_no_module_imports_itself_by_way_of_others():
+    """Not even inside a function."""
+    graph = {}
+    for file in FILES:
+        name = ".".join(file.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__")
+        graph[name] = {module_of(other) for other in imports_of(file)} - {None, name}
+    list(graphlib.TopologicalSorter(graph).static_order())  # raises CycleError, which names the modules
 
 
 def test_relative_imports_are_resolved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -20,6 +20,15 @@ CONVERGED = 1e-3
 0.9, what is left out is nine times that."""
 MOST_BOUNCES = 64
 """Ends what hardly loses light, as a closed white room: of albedo 0.9, 1e-3 of it is left after these."""
+CHORDS = 1 << 16
+"""Random lines through a field's sphere that look for its skin; rays from what they find look into its folds."""
+STEPS = 256
+"""Steps of all these rays across a sphere, at most: thinner sheets than 1/128 of its radius are seldom opaque."""
+FEW = 4
+"""Rays from a patch, squared, that look for further patches."""
+SIDE = 12
+"""Rays from a patch, squared, for its light: where a tenth of them meets something, the bounced light is right within a
+quarter, and pictures show the mean of some patches."""
 
 
 def face(normals: np.ndarray) -> np.ndarray:

@@ -16,15 +16,17 @@ from rich.console import Console
 from rich.table import Table
 
 from ..core import files
-from ..render import calibrate, cost, register
-from ..render.measure import maps_made_anew
+from ..render import register
+from ..render.commands import calibration
+from ..render.cost import model
+from ..render.cost.measurement import maps_made_anew
 from . import bench_image, bench_paper, bench_product
 from .bench_measure import FULL, QUICK, Row, Sizes
 
 
 def bench(quick: bool = False, out: Path | None = None, say: Callable[[str], None] = lambda text: None) -> dict:
     """Measure everything; ``{"machine": …, "rows": […]}``, JSON-ready. Also keeps the machine's constants for `auto`
-    (:mod:`mi_ntf.render.cost`).
+    (:mod:`mi_ntf.render.cost.model`).
 
     quick  tiny sizes: shows that everything runs
     out    folder for ``bench.json`` and ``bench.png``; None: write nothing
@@ -54,7 +56,7 @@ def bench(quick: bool = False, out: Path | None = None, say: Callable[[str], Non
 def _sections(sizes: Sizes) -> dict[str, Callable[[], list[Row]]]:
     scene = bench_image.under_sky(sizes.image)
     medium = bench_image.medium_of(scene)
-    calibrate.calibrate(medium)
+    calibration.calibrate(medium)
     return {
         "the paper's networks": lambda: bench_paper.rows(scene, medium, sizes),
         "map lookup": lambda: bench_product.lookup_rows(medium, sizes),
@@ -67,7 +69,7 @@ def _sections(sizes: Sizes) -> dict[str, Callable[[], list[Row]]]:
 
 def machine() -> dict:
     """What the figures were measured on."""
-    return {"processor": cost.processor(), "cores": os.cpu_count(), "load": round(os.getloadavg()[0], 2),
+    return {"processor": model.processor(), "cores": os.cpu_count(), "load": round(os.getloadavg()[0], 2),
             "variant": mi.variant(), "mitsuba": mi.__version__}
 
 

@@ -20,7 +20,7 @@ from ..infer import march, ops, shade
 from ..infer.bundle import Strand
 from ..infer.network import NetworkField
 from ..infer.profile import DepthProfile
-from ..render.calibrate import seconds, table_of
+from ..render.commands.calibration import seconds, table_of
 from .bench_measure import Row, Sizes, row
 from .transmittance import directions
 
@@ -159,12 +159,12 @@ def _view_rays(sensor, frame, side: int):
 def shading_costs(medium, points, sizes: Sizes) -> dict[str, float]:
     """``shade/volume`` and ``shade/map``: seconds a point and light to look up and to shade. What the tables hold does
     not matter, so they are filled from the shipped grid."""
-    from ..render import visibility
+    from ..render.maps import building
 
     count = sizes.slow_lights
     table = table_of(directions(count))
-    options = visibility.Options(2 / IMAGE_SAMPLES, sizes.map)
-    built = {name: visibility.build(f"transmittance_{name}", medium, table, options) for name in ("volume", "map")}
+    options = building.Options(2 / IMAGE_SAMPLES, sizes.map)
+    built = {name: building.build(f"transmittance_{name}", medium, table, options) for name in ("volume", "map")}
     found = seconds({f"shade/{n}": (lambda v=v: shade.reflect(points, table, v)) for n, v in built.items()},
                     sizes.repeats)
     return {n: v / max(dr.width(points.x[0]) * count, 1) for n, v in found.items()}

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..infer import shade
-from ..render.calibrate import seconds, table_of
+from ..render.commands.calibration import seconds, table_of
 from . import bench_image, transmittance
 from .bench_measure import Row, Sizes, row
 
@@ -64,7 +64,7 @@ def collocated_rows(sizes: Sizes) -> list[Row]:
 def lookup_rows(medium, sizes: Sizes) -> list[Row]:
     """Nanoseconds a point and light of the shading loop with the map, less the loop without, by kinds of lights and
     maps; beside four bare gathers."""
-    from ..render import visibility
+    from ..render.maps import building
 
     count, width = 10 * sizes.slow_lights, max(1 << 10, sizes.queries // 4)
     points, d = _inside(medium, width), transmittance.directions(count)
@@ -73,8 +73,8 @@ def lookup_rows(medium, sizes: Sizes) -> list[Row]:
     tables[" of two logistics"] = tables[""]
     work = {"gathers": lambda: shade.reflect(points, tables[""], Gathers(count, sizes.map))}
     for name, table in tables.items():
-        options = visibility.Options(2 / 384, sizes.map, map_components=2 if "two" in name else 1)
-        tmap = visibility.build("transmittance_map", medium, table, options)
+        options = building.Options(2 / 384, sizes.map, map_components=2 if "two" in name else 1)
+        tmap = building.build("transmittance_map", medium, table, options)
         work |= {f"map{name}": lambda table=table, tmap=tmap: shade.reflect(points, table, tmap),
                  f"none{name}": lambda table=table: shade.reflect(points, table, _Everything())}
     found = seconds(work, max(sizes.repeats, 3))

@@ -45,7 +45,7 @@ def with_lights(scene, count: int):
 
 def study(path: Path, size: int, spp: int, count: int) -> dict[str, float]:
     """Relative RMSE per variant, and ``ns``, nanoseconds a query."""
-    from ..render import effects
+    from ..render.scene.media import find_media
 
     scene = with_lights(mi.load_file(str(path), res=str(size)), count)
     images = {}
@@ -54,7 +54,7 @@ def study(path: Path, size: int, spp: int, count: int) -> dict[str, float]:
         images[name] = np.array(mi.render(scene, integrator=integrator, spp=spp))[..., :3]
     truth = images.pop("raymarch")
     result = {k: float(np.sqrt(((v - truth) ** 2).mean() / (truth**2).mean())) for k, v in images.items()}
-    return result | {"ns": query_time(effects.find_media(scene)[0])}
+    return result | {"ns": query_time(find_media(scene)[0])}
 
 
 def query_time(medium, count: int = 1 << 20) -> float:

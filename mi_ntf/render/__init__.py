@@ -9,60 +9,6 @@ nothing.
 The stock ``mitsuba`` program does this by itself through the bridge.
 """
 
-from pathlib import Path
+from .plugins.registration import load_scene, register
 
-import mitsuba as mi
-
-from ..core.errors import MiNtfError
-from ..infer.backend import module
-from .properties import is_medium
-
-_classes: dict[str, dict] = {}
-_watching = False
-
-
-def register() -> None:
-    """Make the plugins known to the current variant, and to every variant that is set later. May be called again.
-
-    Raises MiNtfError in a variant that they cannot run in (none set, scalar, spectral, …).
-    """
-    global _watching
-    variant = mi.variant() or "(none set)"
-    module(variant)
-    if variant not in _classes:
-        from .emitter import emitter_class
-        from .integrator import integrator_class
-        from .medium import medium_class
-        from .phase import phase_class
-
-        # Kept alive for good: Mitsuba may still call a constructor after another one took its name.
-        medium, integrator = medium_class(phase_class()), integrator_class()
-        _classes[variant] = {
-            "nrf": lambda props: (medium if is_medium(props) else integrator)(props),
-            "emitter": emitter_class(),
-        }
-    classes = _classes[variant]
-    mi.register_integrator("nrf", classes["nrf"])
-    mi.register_emitter("ntf", classes["emitter"])
-    if not _watching:
-        _watching = True
-        mi.detail.add_variant_callback(_on_variant)
-
-
-def load_scene(path: Path, parameters: dict[str, str]):
-    """The scene of an XML file, `parameters` for its $names, whose integrator is ``nrf``; the variant is
-    ``llvm_ad_rgb`` where none is set. Raises MiNtfError if the integrator is another."""
-    if mi.variant() is None:
-        mi.set_variant("llvm_ad_rgb")
-    register()
-    scene = mi.load_file(str(path), **parameters)
-    integrator = scene.integrator()
-    if not hasattr(integrator, "map_resolution"):
-        raise MiNtfError(f'{path}: its integrator is {integrator.class_name()}, expected <integrator type="nrf">')
-    return scene
-
-
-def _on_variant(_old: str, new: str) -> None:
-    """Registrations hold for one variant: repeat them for the new one, where the plugins can run in it."""
-    if new in ("llvm_ad_rgb", "cuda_ad_rgb"):
-        register()
+__all__ = ["load_scene", "register"]

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import torch
 
 from . import device
-from .evaluate import Light, decibels, render_all, srgb
 from .networks import Networks
 from .occupancy import Occupancy
 from .rays import Photographs
+from .scoring import Light, decibels, render_all, srgb
 
 PIXELS = 1000
 """Pixels looked at of each photograph …"""

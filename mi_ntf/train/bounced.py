@@ -10,10 +10,10 @@ import torch
 
 from ..core import radiosity
 from .flash import Flash
-from .marched import Marched, walk
 from .networks import Networks
 from .rays import Rays
-from .render import diffuse_albedo
+from .transmittance_targets import TransmittanceTargets, walk
+from .volume import diffuse_albedo
 
 SEEN = 1 << 16
 """Camera rays that look for the skin; rays from what they find look into its folds."""
@@ -52,7 +52,7 @@ class Bounced:
         return self.light[view, patch] + self.open[patch, None] * arriving * self.room.exp()
 
     @torch.no_grad()
-    def update(self, networks: Networks, marched: Marched, rays: Rays, seed: int) -> None:
+    def update(self, networks: Networks, marched: TransmittanceTargets, rays: Rays, seed: int) -> None:
         """Find the patches of the field that some SEEN camera `rays` see, what they see of each other, and what of all
         flashes they send on."""
         rng = np.random.default_rng(seed)
@@ -75,7 +75,7 @@ class Bounced:
         self.open = _tensor(np.append((hits.reshape(count, -1) < 0).mean(1), 1.0))
         self.light = torch.as_tensor(np.ascontiguousarray(light, np.float32))
 
-    def _direct(self, marched: Marched, x: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    def _direct(self, marched: TransmittanceTargets, x: np.ndarray, normal: np.ndarray) -> np.ndarray:
         """(views, patches, 3): irradiance by the flashes alone."""
         outside = _tensor(radiosity.above(x, normal))
         normal = _tensor(normal)
@@ -95,7 +95,7 @@ def _rays(x: np.ndarray, normal: np.ndarray, side: int, rng: np.random.Generator
     return [_tensor(v) for v in radiosity.rays(x, normal, side, rng)]
 
 
-def _skin(networks: Networks, marched: Marched, o: torch.Tensor, d: torch.Tensor):
+def _skin(networks: Networks, marched: TransmittanceTargets, o: torch.Tensor, d: torch.Tensor):
     """``(ray, x, normal)``, arrays: which rays meet skin that faces them, where (k, 3), and its normals (k, 3)."""
     t, _ = walk(marched, o, d, radiosity.DEPTH)
     ray = t.isfinite().nonzero()[:, 0]

@@ -8,24 +8,21 @@ field's phase function ρ (c_i + c_o) sends back from the whole skin is
 
 with V the share of the flash's light that reaches the skin from outside, of opaque things that of one march a ray, from
 above the mean point that the ray sees. With flash and lens in one place c_o = c_i and V is 1:
-:mod:`mi_ntf.train.render` has that case without all this. Smoke has no skin: its points are marched to themselves, each
+:mod:`mi_ntf.train.volume` has that case without all this. Smoke has no skin: its points are marched to themselves, each
 of them.
 """
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import torch
 import torch.nn.functional as F
 
 from ..core import fresnel, microfacet
 from . import ops
-from .baked import fetch
-from .marched import Marched, walk
+from .normal_targets import fetch
+from .optical import Optical
 from .rays import Photographs
-
-if TYPE_CHECKING:
-    from .render import Optical
+from .transmittance_targets import TransmittanceTargets, walk
 
 LEAST_COSINE = 0.03
 """Light that grazes the skin goes through as much of it as at this cosine."""
@@ -45,7 +42,7 @@ class Flash:
     coordinates · `marched`: the density that throws shadows; none before it is known.
     """
 
-    def __init__(self, photographs: Sequence[Photographs], solid: bool, marched: Marched):
+    def __init__(self, photographs: Sequence[Photographs], solid: bool, marched: TransmittanceTargets):
         self.camera = torch.cat([p.origin for p in photographs]).float()
         self.rotation = torch.cat([p.rotation for p in photographs]).float()
         self.place = torch.cat([p.flash for p in photographs]).float()
@@ -74,7 +71,7 @@ class Flash:
         _, depth = walk(self.marched, x, direction, DARK, distance[:, 0])
         return torch.exp(-depth)
 
-    def send(self, seen: "Optical", reflectance: tuple, d: torch.Tensor, x: torch.Tensor, view: torch.Tensor,
+    def send(self, seen: Optical, reflectance: tuple, d: torch.Tensor, x: torch.Tensor, view: torch.Tensor,
              light: torch.Tensor, rim: bool) -> torch.Tensor:
         """Radiance (n, 3) that samples at `x` (n, 3) of rays along `d` send to the camera.
 
@@ -106,7 +103,7 @@ class Flash:
         return self.reaching(view, above(self.marched, x, F.normalize(normal, dim=1)))
 
 
-def above(marched: Marched, x: torch.Tensor, normal: torch.Tensor) -> torch.Tensor:
+def above(marched: TransmittanceTargets, x: torch.Tensor, normal: torch.Tensor) -> torch.Tensor:
     """Where shadow rays begin (n, 3) over points of skin at `x` (n, 3) with unit `normal` (n, 3)."""
     places = x + torch.tensor(LIFTS)[:, None, None] * normal
     sigma = fetch(marched.log_sigma, places.reshape(-1, 3))[0].view(len(LIFTS), -1).exp()

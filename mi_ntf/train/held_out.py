@@ -4,10 +4,10 @@ import torch
 
 from . import device
 from .losses import tau
-from .marched import Marched, chords, uniform_directions
 from .networks import Networks, crossings
 from .occupancy import Occupancy
 from .rays import Photographs
+from .transmittance_targets import TransmittanceTargets, chords, uniform_directions
 
 STEPS = 2048
 
@@ -17,9 +17,9 @@ def score(networks: Networks, occupancy: Occupancy, photographs: Photographs, co
           chunk: int = 512) -> dict[str, float]:
     """``rms`` and ``bias`` of τ_nt against the field's own marched τ, on about `count` pairs of a shading point of the
     (held-out) `photographs` and a light in a random direction; `occupancy`: of
-    :func:`mi_ntf.train.evaluate.occupied`. Empty where no ray sees matter."""
+    :func:`mi_ntf.train.scoring.occupied`. Empty where no ray sees matter."""
     generator = device.generator(4)
-    marched = Marched()
+    marched = TransmittanceTargets()
     marched.update(networks, occupancy)
     errors = [torch.zeros(0)]
     for _ in range(0, count, chunk):

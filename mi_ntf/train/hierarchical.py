@@ -13,11 +13,11 @@ import torch
 from ..core.errors import MiNtfError
 from . import device, losses, networks, occupancy, parallel
 from .config import HierarchicalConfig
-from .descent import FIELD, Descent, total
-from .marched import CUT, chords, random_chords
 from .networks import Networks, density_from_log
 from .rays import Rays
-from .render import Image, render, scatter_sum
+from .recipe import FIELD, Recipe, total
+from .transmittance_targets import CUT, chords, random_chords
+from .volume import Image, render, scatter_sum
 
 
 def stratified(rays: Rays, count: int, generator: torch.Generator):
@@ -79,7 +79,7 @@ def view(coarse: Networks, fine: Networks, rays: Rays, counts: tuple[int, int], 
     return View(first, second, t, tau)
 
 
-class Hierarchical(Descent):
+class Hierarchical(Recipe):
     """The paper's step: patches of some photographs train the field, they and random rays its transmittance."""
 
     config: HierarchicalConfig

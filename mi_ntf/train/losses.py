@@ -8,12 +8,12 @@ import torch.nn.functional as F
 from ..core import mixture, spheres
 from ..core.architecture import MAX_LOG_DENSITY
 from . import ops
-from .baked import Baked
-from .marched import Marched, chords, random_chords, uniform_directions
 from .networks import Networks, crossings
+from .normal_targets import NormalTargets
 from .occupancy import LOG_EMPTY
 from .rays import Rays
-from .render import Image, scatter_sum
+from .transmittance_targets import TransmittanceTargets, chords, random_chords, uniform_directions
+from .volume import Image, scatter_sum
 
 DARK = 0.05
 """Brightness, in units of the photographs' bright parts, below which differences count absolutely."""
@@ -30,7 +30,7 @@ def color(predicted: torch.Tensor, target: torch.Tensor, exposure: float,
     return (trust * (p - t) ** 2 / (p.detach() + DARK)).mean()
 
 
-def normals(image: Image, d: torch.Tensor, baked: Baked):
+def normals(image: Image, d: torch.Tensor, baked: NormalTargets):
     """``(toward, facing)``: distance to the density's own normals; normals that point away from the camera
     (Verbin et al. 2022, eqs. 10, 11). `d` (n, 3): the rays. Weights are detached: normals do not thin the matter."""
     w = image.weight.detach()
@@ -124,7 +124,7 @@ class Targets:
         return error[:, :16].mean() + error[:, 16:32].mean() + error[:, 32].mean()
 
 
-def targets(marched: Marched, o: torch.Tensor, d: torch.Tensor, generator: torch.Generator) -> Targets:
+def targets(marched: TransmittanceTargets, o: torch.Tensor, d: torch.Tensor, generator: torch.Generator) -> Targets:
     """March the rays through the baked density."""
     m, h = chords(o, d)
     depth = marched.march(m, d, h, STEPS)
@@ -153,7 +153,7 @@ def visibility(networks: Networks, rays: Targets) -> torch.Tensor:
     return rays.error(found.view(rays.t.shape))
 
 
-def training_rays(marched: Marched, rays: Rays, count: int, augment: bool, generator: torch.Generator):
+def training_rays(marched: TransmittanceTargets, rays: Rays, count: int, augment: bool, generator: torch.Generator):
     """``(o, d)`` of about `count` rays to learn transmittance on, towards the light.
 
     With augmentation (method.md, section 5, "AG") a half are random chords and a half leave shading points in random
@@ -174,7 +174,7 @@ def training_rays(marched: Marched, rays: Rays, count: int, augment: bool, gener
     return torch.cat([o, x]), torch.cat([d, uniform_directions(len(x), generator)])
 
 
-def transmittance_color(networks: Networks, marched: Marched, image: Image, rays: Rays, exposure: float,
+def transmittance_color(networks: Networks, marched: TransmittanceTargets, image: Image, rays: Rays, exposure: float,
                         count: int, gain: torch.Tensor | float = 1.0) -> torch.Tensor:
     """‖I_nt − I‖² of the first `count` rays: pixels lit by τ_nt instead of the marched light (method.md, section 5),
     times `gain` (count, 3)."""

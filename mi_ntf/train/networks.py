@@ -57,7 +57,8 @@ class Networks:
         """``(hit (n,), mixture (n, K, 3))`` of rays through `o` along unit directions `d` towards the light.
 
         `profile` (n, k): optical depths from equidistant points of the chords, far ends first, to the light-side ends
-        (``Baked.march``), read by the encoding ``depth``. The last axis is (w, a, b), see :mod:`mi_ntf.core.mixture`.
+        (``TransmittanceTargets.march``), read by the encoding ``depth``. The last axis is (w, a, b), see
+        :mod:`mi_ntf.core.mixture`.
         """
         net = self.architecture.transmittance
         hit, m, h = spheres.chord(ops, o.unbind(1), d.unbind(1))

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import torch
 
-from .baked import Baked
 from .flash import Flash, above
-from .marched import Marched, walk
+from .normal_targets import NormalTargets
 from .rays import Photographs, Rays
+from .transmittance_targets import TransmittanceTargets, walk
 
 POINTS = 3000
 FEWEST = 100
@@ -43,7 +43,7 @@ class Observed:
 
 
 @torch.no_grad()
-def observe(pool: Photographs, rays: Rays, baked: Baked, marched: Marched) -> Observed:
+def observe(pool: Photographs, rays: Rays, baked: NormalTargets, marched: TransmittanceTargets) -> Observed:
     """What the photographs show of the points that some camera `rays` meet."""
     t, _ = walk(marched, rays.o, rays.d, 0.7)
     met = t.isfinite().nonzero()[:POINTS, 0]

@@ -9,14 +9,14 @@ from ..data.page import Page
 from ..data.schema import Split
 from . import device
 from .agreement import MOVED, Agreement, survey
-from .descent import Descent
-from .evaluate import Light, render_all, srgb
 from .flash import Flash
-from .marched import Marched
 from .networks import Networks
 from .occupancy import Occupancy
 from .photometry import fitted
 from .rays import Photographs, Rays
+from .recipe import Recipe
+from .scoring import Light, render_all, srgb
+from .transmittance_targets import TransmittanceTargets
 
 SHOWN = 3
 """Test photographs on the page …"""
@@ -49,7 +49,7 @@ def complaints(agreement: Agreement, splits: dict[str, Split]) -> list[str]:
     return found
 
 
-def photographs(run: Descent, stored: Networks, occupancy: Occupancy, report: dict, most: float) -> Agreement:
+def photographs(run: Recipe, stored: Networks, occupancy: Occupancy, report: dict, most: float) -> Agreement:
     """What the finished field, as `stored`, tells of the photographs of the `run`, from `most` pixels or so: into the
     `report`; complains."""
     gains = None if run.gains is None else run.gains.all().detach()
@@ -65,7 +65,7 @@ def photographs(run: Descent, stored: Networks, occupancy: Occupancy, report: di
     return found
 
 
-def publish(run: Descent, stored: Networks, occupancy: Occupancy, agreement: Agreement, report: dict,
+def publish(run: Recipe, stored: Networks, occupancy: Occupancy, agreement: Agreement, report: dict,
             trace: list[list[float]], out: Path) -> None:
     """Write the page beside the field `out`; `trace`: steps and running means of the loss."""
     page = Report(out.name, stored, occupancy, run.config.step, run.light)
@@ -166,8 +166,8 @@ class Report:
     def _render(self, rays: Rays, light: Light, passes: int = 2):
         return render_all(self.networks, rays, self.occupancy, self.step, device.generator(1), light, passes)
 
-    def _marched(self) -> Marched:
-        marched = Marched()
+    def _marched(self) -> TransmittanceTargets:
+        marched = TransmittanceTargets()
         marched.update(self.networks, self.occupancy)
         return marched
 

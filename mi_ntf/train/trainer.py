@@ -14,13 +14,13 @@ from ..core import field_file, files
 from ..core.architecture import Header
 from ..core.errors import MiNtfError
 from ..data.schema import fingerprint
-from . import checkpoint, device, evaluate, held_out, networks, parallel
+from . import checkpoint, device, held_out, networks, parallel, scoring
 from .config import HierarchicalConfig, TrainConfig, configured, transmittance_alone
-from .descent import SCORING, Descent
+from .fast import Fast
 from .hierarchical import Hierarchical
 from .monitor import Display, Fault, Log
+from .recipe import SCORING, Recipe
 from .report import photographs, publish
-from .stepper import Stepper
 
 KEEP = 128
 """Steps between two copies of the run's state in memory, to which a fault rolls back."""
@@ -81,7 +81,7 @@ def train(dataset: Path, out: Path, *, preset: str = "fast", minutes: float | No
         return run.finish() if parallel.first() else {}
 
 
-class _Loop(Descent):
+class _Loop(Recipe):
     """One training run around a stepper, which a subclass adds: its loop, its validation, its files."""
 
     OWN = ("history", "validated", "best", "kept", "faults", "trace")
@@ -183,7 +183,7 @@ class _Loop(Descent):
         """PSNR of some validation views with the current occupancy. Remembers the field if it is the best yet."""
         pool, start = self.photographs["val"], time.monotonic()
         views = min(4, pool.views)
-        scores = evaluate.score(self.nets, self.occupied(), pool, self.config.step, self.light, VALIDATED, views, 1)
+        scores = scoring.score(self.nets, self.occupied(), pool, self.config.step, self.light, VALIDATED, views, 1)
         exact = scores["srgb"]
         self.speed = min(VALIDATED, views * pool.height * pool.width) / max(time.monotonic() - start, 1e-6)
         entry = {"step": self.step, "psnr": round(exact, 4)}
@@ -199,9 +199,9 @@ class _Loop(Descent):
         pool = self.photographs["val"]
         pixels, *shape = pool.frame(0, max(1, round(max(pool.height, pool.width) / 256)))
         seen = pool[pixels]
-        color, _, normal, _ = evaluate.render_all(self.nets, seen, self.occupied(), self.config.step,
+        color, _, normal, _ = scoring.render_all(self.nets, seen, self.occupied(), self.config.step,
                                                   device.generator(2), self.light)
-        parts = evaluate.srgb(seen.target[:, :3]), evaluate.srgb(color), (normal + 1) / 2
+        parts = scoring.srgb(seen.target[:, :3]), scoring.srgb(color), (normal + 1) / 2
         return torch.cat([p.view(*shape, 3) for p in parts], 1).clamp(0, 1)
 
     def choose(self) -> str:
@@ -274,10 +274,10 @@ class _Loop(Descent):
         header = Header(self.config.architecture, self.similarity, report)
         field_file.save(self.out, header, tensors)
         stored = networks.from_tensors(self.config.architecture, field_file.load(self.out)[1])
-        occupancy = evaluate.occupied(stored)
+        occupancy = scoring.occupied(stored)
         with Display(parallel.first(), "score") as display:
             for i, name in enumerate(("val", "test")):
-                scores = evaluate.score(stored, occupancy, self.photographs[name], self.config.step, self.light,
+                scores = scoring.score(stored, occupancy, self.photographs[name], self.config.step, self.light,
                                         self.affordable(), tell=lambda done, i=i: display.update((i + done) / 2))
                 scores.pop("each")
                 report[name] = {k: round(v, 3 if k != "alpha_rmse" else 5) for k, v in scores.items()}
@@ -289,7 +289,7 @@ class _Loop(Descent):
         return report
 
 
-class _Run(_Loop, Stepper):
+class _Run(_Loop, Fast):
     """A run of the project's own recipe."""
 
 

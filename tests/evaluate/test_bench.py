@@ -10,7 +10,7 @@ from helpers import fields, hard_cases
 from helpers.variants import VARIANT
 
 from mi_ntf.evaluate import bench, bench_figure, bench_image, bench_measure, bench_paper
-from mi_ntf.render import cost
+from mi_ntf.render.cost import model
 
 
 @pytest.fixture(autouse=True)
@@ -32,7 +32,7 @@ def test_every_line_runs(tmp_path, capsys):
         assert np.isfinite(r["measured"]) and r["unit"], r["what"]
         assert r["met"] is not None or not r["asked"]
         assert ("random" in r["weights"]) == ("volume" in r["what"])
-    constants = cost.measured()
+    constants = model.measured()
     assert constants and min(asdict(constants).values()) > 0
     assert "without meaning" in text and "extrapolated" in text
 

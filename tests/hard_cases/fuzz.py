@@ -232,7 +232,7 @@ def properties(folder: Path):
     from helpers import scenes
 
     import mi_ntf.render
-    from mi_ntf.render import properties
+    from mi_ntf.render.plugins import properties
 
     mi.set_variant(VARIANT)
     mi.set_log_level(mi.LogLevel.Error)
@@ -279,23 +279,23 @@ def maps(folder: Path):
     from helpers.maps import OPTIONS, build, find_medium, table, texels
 
     import mi_ntf.render
-    from mi_ntf.render import bake
+    from mi_ntf.render.maps import map_file
 
     os.environ |= {"XDG_CACHE_HOME": str(folder / "cache"), "MI_NTF_MAP_CACHE": "on"}
     mi.set_variant(VARIANT)
     mi.set_log_level(mi.LogLevel.Error)
     mi_ntf.render.register()
     medium = find_medium(scenes.write_blobs(folder, log_density=3.0))
-    bake.write(folder / "maps.exr", medium, table(), OPTIONS, [build(medium)])
+    map_file.write(folder / "maps.exr", medium, table(), OPTIONS, [build(medium)])
     (cached,) = (folder / "cache").rglob("*.map")
     baked = folder / "maps.exr"
-    return medium, baked, bake.read(baked, medium, table(), OPTIONS, 2), cached, texels(medium)
+    return medium, baked, map_file.read(baked, medium, table(), OPTIONS, 2), cached, texels(medium)
 
 
 def maps_case(rng, folder: Path, base):
     from helpers.maps import OPTIONS, table, texels
 
-    from mi_ntf.render import bake, map_cache
+    from mi_ntf.render.maps import map_cache, map_file
 
     medium, baked, expected, cached, kept = base
     if rng.random() < 0.4:
@@ -316,7 +316,7 @@ def maps_case(rng, folder: Path, base):
         rewrite(baked, path, lambda about: mutate.tree(rng, about))
 
     def read():
-        assert np.array_equal(bake.read(path, medium, table(), OPTIONS, 2), expected), "another map"
+        assert np.array_equal(map_file.read(path, medium, table(), OPTIONS, 2), expected), "another map"
 
     return "baked", read
 
@@ -325,12 +325,12 @@ def rewrite(source: Path, path: Path, change) -> None:
     """Write the map file `source` again, `change` made to what it says of each light."""
     import OpenEXR
 
-    from mi_ntf.render import bake
+    from mi_ntf.render.maps import map_file
 
     parts = []
     for part in OpenEXR.File(str(source)).parts:
         header = {k: v for k, v in part.header.items() if k not in ("channels", "dataWindow")}
-        header[bake.ATTRIBUTE] = json.dumps(change(json.loads(header[bake.ATTRIBUTE])))
+        header[map_file.ATTRIBUTE] = json.dumps(change(json.loads(header[map_file.ATTRIBUTE])))
         parts.append(OpenEXR.Part(header, {name: c.pixels.copy() for name, c in part.channels.items()}))
     OpenEXR.File(parts).write(str(path))
 

@@ -25,7 +25,7 @@ from helpers import random_scenes, ztest
 from helpers.variants import VARIANT
 
 from mi_ntf.core.errors import MiNtfError
-from mi_ntf.render import field
+from mi_ntf.render.scene import loaded
 
 WARM_UP = 20
 """Scenes after which memory may no longer grow: fields and caches have been seen by then. Read as often."""
@@ -77,7 +77,7 @@ def refusal(error: BaseException) -> str | None:
 
 def memory() -> tuple[float, float]:
     """MiB that this process holds: resident, and Dr.Jit's, without what caches keep of scenes that are gone."""
-    field._load.cache_clear()
+    loaded._load.cache_clear()
     gc.collect()
     gc.collect()
     dr.sync_thread()

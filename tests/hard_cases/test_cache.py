@@ -21,7 +21,10 @@ from helpers.variants import VARIANT
 import mi_ntf.render
 from mi_ntf import cli
 from mi_ntf.infer import profile
-from mi_ntf.render import cost, field, map_cache, user_cache
+from mi_ntf.render import user_cache
+from mi_ntf.render.cost import model
+from mi_ntf.render.maps import map_cache
+from mi_ntf.render.scene import loaded
 
 
 @pytest.fixture(autouse=True)
@@ -122,8 +125,8 @@ def test_prices_that_cannot_be_kept_are_one_warning(cache, warnings, monkeypatch
     possible = what == "a file in place of maps"
     with little_room(100 if what == "a full disk" else resource.RLIM_INFINITY):
         for _ in range(2):
-            cost.remember(cost.Constants(march=3.0))
-    assert cost.constants() == cost.Constants(march=3.0 if possible else cost.Constants().march)
+            model.remember(model.Constants(march=3.0))
+    assert model.constants() == model.Constants(march=3.0 if possible else model.Constants().march)
     assert [bool(re.search(reason, text)) for text in warnings] == ([] if possible else [True])
     if cache.parent.is_dir():
         assert {p.name for p in cache.parent.iterdir()} == ({"maps", "cost.json"} if possible else set())
@@ -291,7 +294,7 @@ def test_a_field_trained_over_while_it_is_loaded(tmp_path, cache):
     scenes.write_blobs(tmp_path, log_density=-1.0)  # the same name, size and, within a tick of the clock, time
     before = texels(old)
     map_cache.forget()
-    field._load.cache_clear()
+    loaded._load.cache_clear()
     new = find_medium(path)
     after = texels(new)
     np.testing.assert_array_equal(before, without_cache(old))
@@ -303,11 +306,11 @@ def test_a_field_trained_over_while_it_is_loaded(tmp_path, cache):
 def test_a_field_written_within_one_tick_of_the_clock_is_read_anew(tmp_path):
     path = scenes.write_blobs(tmp_path, log_density=3.0)
     stat = path.stat()
-    old = field.load(str(path), 32)
+    old = loaded.load(str(path), 32)
     scenes.write_blobs(tmp_path, log_density=-1.0)
     os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
     assert path.stat().st_size == stat.st_size
-    assert field.load(str(path), 32).digest != old.digest
+    assert loaded.load(str(path), 32).digest != old.digest
 
 
 def test_the_same_networks_in_another_file_share_maps(path, tmp_path, cache, medium):

@@ -11,7 +11,7 @@ from helpers.variants import VARIANT
 
 import mi_ntf.render
 from mi_ntf.core.errors import MiNtfError
-from mi_ntf.render import environment, light_rows, lights, sun
+from mi_ntf.render.lights import environment, light_rows, scene_lights, sun
 
 
 @pytest.fixture(autouse=True)
@@ -193,7 +193,7 @@ def test_sunsky_sun_of_unknown_size_is_an_error(monkeypatch):
 
 def test_timed_sunsky_is_refused(blobs):
     with pytest.raises(MiNtfError, match=r"timed_sunsky emitter .sky.: .*use sunsky at one moment"):
-        lights.Lights(scenes.scene(blobs, scenes.nrf(), {"sky": {"type": "timed_sunsky"}}, size=4))
+        scene_lights.Lights(scenes.scene(blobs, scenes.nrf(), {"sky": {"type": "timed_sunsky"}}, size=4))
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])

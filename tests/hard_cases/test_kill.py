@@ -19,12 +19,12 @@ from helpers import maps, scenes
 from helpers.variants import VARIANT
 
 import mi_ntf.render
-from mi_ntf import cli
+from mi_ntf import cli, swap
 from mi_ntf.core import field_file
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.data import capture as capture_module
 from mi_ntf.data import schema
-from mi_ntf.render import bake, swap
+from mi_ntf.render.maps import map_file
 
 KILLS = 3
 """Kills of each command, at moments spread over the time that it takes undisturbed."""
@@ -107,7 +107,7 @@ def save_checkpoint(path, field):
 def write_maps(path, field):
     medium = maps.find_medium(field)
     made = maps.build(medium)
-    return lambda: bake.write(path, medium, maps.table(), maps.OPTIONS, [made])
+    return lambda: map_file.write(path, medium, maps.table(), maps.OPTIONS, [made])
 
 
 def write_photograph(path, field):

@@ -10,7 +10,7 @@ from helpers.variants import VARIANT
 
 import mi_ntf.render
 from mi_ntf.core.errors import MiNtfError
-from mi_ntf.render import lights
+from mi_ntf.render.lights import scene_lights
 
 CENTER, RADIUS = np.array(scenes.SIMILARITY.center), scenes.SIMILARITY.radius
 METHODS = ["raymarch", "transmittance_map", "neural_transmittance", "transmittance_volume", "visibility_mlp", "none"]
@@ -108,7 +108,7 @@ def test_blinding_lights_stay_finite(blobs, kind, light_samples):
 def rows_and_samples(description: dict, p: np.ndarray):
     """Irradiance (3, n) at the scene points (3, n): of the table's row, and by Mitsuba's own sampling."""
     loaded = mi.load_dict(description)
-    row = lights.rows([(loaded, description["type"])], 1)
+    row = scene_lights.rows([(loaded, description["type"])], 1)
     it = dr.zeros(mi.Interaction3f, p.shape[1])
     it.p = mi.Point3f(*p.astype(np.float32))
     _, wanted = loaded.sample_direction(it, mi.Point2f(0.5), True)

@@ -13,7 +13,7 @@ from helpers.variants import VARIANT
 
 import mi_ntf.render
 from mi_ntf.core.errors import MiNtfError
-from mi_ntf.render import bake
+from mi_ntf.render.maps import map_file
 
 
 @pytest.fixture(scope="module")
@@ -24,12 +24,12 @@ def baked(tmp_path_factory):
     folder = tmp_path_factory.mktemp("baked")
     medium, file = find_medium(scenes.write_blobs(folder, log_density=3.0)), folder / "maps.exr"
     options = dataclasses.replace(OPTIONS, cache=False)
-    bake.write(file, medium, table(), options, [build(medium, options=options)])
+    map_file.write(file, medium, table(), options, [build(medium, options=options)])
     return medium, file
 
 
 def read(baked, file):
-    return bake.read(file, baked[0], table(), OPTIONS, 2)
+    return map_file.read(file, baked[0], table(), OPTIONS, 2)
 
 
 def rewrite(baked, tmp_path, change):
@@ -47,11 +47,11 @@ def rewrite(baked, tmp_path, change):
 
 def about(**changes):
     return lambda k, header, channels: header.update(
-        {bake.ATTRIBUTE: json.dumps(json.loads(header[bake.ATTRIBUTE]) | changes)})
+        {map_file.ATTRIBUTE: json.dumps(json.loads(header[map_file.ATTRIBUTE]) | changes)})
 
 
 def attribute(value):
-    return lambda k, header, channels: header.update({bake.ATTRIBUTE: value})
+    return lambda k, header, channels: header.update({map_file.ATTRIBUTE: value})
 
 
 def every_pixel(function):
@@ -59,7 +59,7 @@ def every_pixel(function):
 
 
 WRONG = {
-    "no attribute": (lambda k, header, channels: header.pop(bake.ATTRIBUTE) and None, "of another program"),
+    "no attribute": (lambda k, header, channels: header.pop(map_file.ATTRIBUTE) and None, "of another program"),
     "no JSON": (attribute("{"), "is no JSON object"),
     "a list": (attribute("[1, 2]"), "is no JSON object"),
     "a number": (attribute(3.0), "is no JSON object"),

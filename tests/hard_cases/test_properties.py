@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from mi_ntf.core.architecture import Similarity
 from mi_ntf.infer import shade
 from mi_ntf.infer.lights import LightTable
-from mi_ntf.render import light_rows
-from mi_ntf.render.frame import Frame
+from mi_ntf.render.lights import light_rows
+from mi_ntf.render.scene.frame import Frame
 
 EXAMPLES = settings(settings.get_profile("hard"))
 FEW = settings(EXAMPLES, max_examples=3)

@@ -10,7 +10,7 @@ from helpers.variants import VARIANT
 
 import mi_ntf.render
 from mi_ntf.core.errors import sentence
-from mi_ntf.render import properties
+from mi_ntf.render.plugins import properties
 
 SCENE = """<scene version="3.9.0"><integrator type="nrf">{integrator}</integrator>
   <emitter type="ntf">{emitter}<emitter type="point"/><ref id="m"/></emitter>
@@ -112,10 +112,10 @@ def test_misspelt_names(path, plugin):
 
 
 def test_tables_of_the_docstrings_list_every_name():
-    from mi_ntf.render.emitter import emitter_class
-    from mi_ntf.render.integrator import integrator_class
-    from mi_ntf.render.medium import medium_class
-    from mi_ntf.render.phase import phase_class
+    from mi_ntf.render.plugins.emitter import emitter_class
+    from mi_ntf.render.plugins.integrator import integrator_class
+    from mi_ntf.render.plugins.medium import medium_class
+    from mi_ntf.render.plugins.phase import phase_class
 
     classes = {"integrator": integrator_class(), "medium": medium_class(phase_class()), "emitter": emitter_class()}
     for plugin, names in PLUGINS.items():

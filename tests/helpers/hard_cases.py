@@ -13,7 +13,7 @@ from mi_ntf.infer.grid import GridField
 from mi_ntf.infer.lights import LightTable
 from mi_ntf.infer.network import MIN_DENSITY, NetworkField
 from mi_ntf.infer.visibility import outside
-from mi_ntf.render import visibility
+from mi_ntf.render.maps import building
 
 SCENES = Path(__file__).parents[2] / "scenes"
 PROPERTY = "hard case"
@@ -61,7 +61,7 @@ def transmittance(method: str, medium, light, x: np.ndarray) -> np.ndarray:
     """τ (n,) of one light at the points `x`, field coordinates, by a method of METHODS with the renderer's defaults."""
     name, options = METHODS[method]
     table = LightTable([light[0]], np.ones((1, 3)), [light[1]], 1.0, mi)
-    found = visibility.build(name, medium, table, visibility.Options(2 / 384, **options))
+    found = building.build(name, medium, table, building.Options(2 / 384, **options))
     wi, distance = seen_from(x, light)
     active = dr.full(mi.Bool, True, len(x))
     tau = outside.tau(found, arrays(x), arrays(wi), mi.Float(distance), mi.UInt32(0), active)

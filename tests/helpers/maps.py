@@ -7,9 +7,10 @@ import numpy as np
 
 from helpers import scenes
 from mi_ntf.infer.lights import LightTable
-from mi_ntf.render import effects, visibility
+from mi_ntf.render.maps import building
+from mi_ntf.render.scene.media import find_media
 
-OPTIONS = visibility.Options(2 / 96, 16, cache=True)
+OPTIONS = building.Options(2 / 96, 16, cache=True)
 WHERE = np.array([[0.48, 0.6, 0.64], [1.5, 1.0, 2.0], [0.1, 0.5, -0.1]])
 SIZE = 4 * 2 * 16**2
 """Bytes of one light's map."""
@@ -18,7 +19,7 @@ SIZE = 4 * 2 * 16**2
 def find_medium(path):
     """The medium of a scene around the field file `path`."""
     loaded = scenes.scene(path, {"type": "nrf"}, {"light": scenes.light("point")}, medium={"resolution": 48})
-    return effects.find_media(loaded)[0]
+    return find_media(loaded)[0]
 
 
 def table(count=3, move=0.0):
@@ -28,7 +29,7 @@ def table(count=3, move=0.0):
 
 def build(medium, lights=None, options=OPTIONS):
     """The map of `lights`."""
-    return visibility.build("transmittance_map", medium, lights or table(), options)
+    return building.build("transmittance_map", medium, lights or table(), options)
 
 
 def texels(medium, lights=None, options=OPTIONS):

@@ -19,7 +19,7 @@ from mi_ntf.infer import ops as infer_ops
 from mi_ntf.infer.grid import CELLS, GridField
 from mi_ntf.infer.lights import LightTable
 from mi_ntf.infer.network import NetworkField
-from mi_ntf.render import visibility
+from mi_ntf.render.maps import building
 
 METHODS = {
     "raymarch": ("raymarch", {}),
@@ -51,7 +51,7 @@ class Balls:
     central: bool = False
 
     def medium(self, brighter: float = 1.0):
-        """What :func:`mi_ntf.render.visibility.build` asks of a medium; density times `brighter`."""
+        """What :func:`mi_ntf.render.maps.building.build` asks of a medium; density times `brighter`."""
         return _balls(self, brighter)
 
 
@@ -174,7 +174,7 @@ def places(seed: int, table: LightTable, n: int = 256) -> np.ndarray:
 def build(name: str, medium, table: LightTable, resolution: int = RESOLUTION, step: float = STEP):
     """The method `name` of METHODS; None for ``none``."""
     method, extra = METHODS[name]
-    return visibility.build(method, medium, table, visibility.Options(step, map_resolution=resolution, **extra))
+    return building.build(method, medium, table, building.Options(step, map_resolution=resolution, **extra))
 
 
 def look(method, table: LightTable, x: np.ndarray, index=None) -> np.ndarray:

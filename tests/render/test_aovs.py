@@ -7,7 +7,7 @@ from helpers import fields, scenes
 
 from mi_ntf.core import field_file
 from mi_ntf.core.errors import MiNtfError
-from mi_ntf.render import aovs
+from mi_ntf.render.transport import aovs
 
 RADIUS, SIZE = 0.8, 16
 ALBEDO = (0.6, 0.5, 0.4)

@@ -13,12 +13,13 @@ from helpers import scenes
 from mi_ntf import cli
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.infer.lights import LightTable
-from mi_ntf.render import bake, effects, map_cache, visibility
-from mi_ntf.render import lights as lights_module
+from mi_ntf.render.lights import scene_lights as lights_module
+from mi_ntf.render.maps import building, map_cache, map_file
+from mi_ntf.render.scene.media import find_media
 
 WHERE = np.array([[0.48, 0.6, 0.64], [1.5, 1.0, 2.0], [0.1, 0.5, -0.1]])
 IS_POINT = np.array([False, True, True])
-OPTIONS = visibility.Options(2 / 128, 16)
+OPTIONS = building.Options(2 / 128, 16)
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +30,7 @@ def path(tmp_path_factory):
 @pytest.fixture
 def medium(path):
     loaded = scenes.scene(path, {"type": "nrf"}, {"light": scenes.light("point")}, medium={"resolution": 64})
-    return effects.find_media(loaded)[0]
+    return find_media(loaded)[0]
 
 
 def table(move=0.0):
@@ -37,7 +38,7 @@ def table(move=0.0):
 
 
 def build(medium, lights, options):
-    return visibility.build("transmittance_map", medium, lights, options)
+    return building.build("transmittance_map", medium, lights, options)
 
 
 @pytest.mark.parametrize("options", [OPTIONS, dataclasses.replace(OPTIONS, map_components=2)], ids=["one", "two"])
@@ -45,7 +46,7 @@ def test_file_gives_the_same_map(medium, tmp_path, options):
     """Every texel that a lookup reads, bit for bit; also where the lights are taken in parts."""
     file = tmp_path / "maps.exr"
     made = build(medium, table(), options)
-    bake.write(file, medium, table(), options, [made])
+    map_file.write(file, medium, table(), options, [made])
     parts = OpenEXR.File(str(file)).parts
     assert [set(p.channels) for p in parts] == [{"a", "b"} if made.width == 2 else set("w0 a0 b0 w1 a1 b1".split())] * 3
     assert not list(tmp_path.glob("*.part*"))
@@ -63,7 +64,7 @@ def test_file_gives_the_same_map(medium, tmp_path, options):
 
 def test_file_of_something_else_is_refused(medium, tmp_path):
     file = tmp_path / "maps.exr"
-    bake.write(file, medium, table(), OPTIONS, [build(medium, table(), OPTIONS)])
+    map_file.write(file, medium, table(), OPTIONS, [build(medium, table(), OPTIONS)])
     named = dataclasses.replace(OPTIONS, map_file=str(file))
     with pytest.raises(MiNtfError, match=r"maps.exr, light 0: where is \[0.48.*, the scene's is \[0.5"):
         build(medium, table(0.02), named)
@@ -87,7 +88,7 @@ def test_lights_come_in_parts_that_fit(medium):
 
     def parts(kib, media=1, method="transmittance_map", **other):
         options = dataclasses.replace(OPTIONS, map_memory=kib / 1024, **other)
-        return visibility.parts(method, [medium] * media, lights, options)
+        return building.parts(method, [medium] * media, lights, options)
 
     assert parts(1 << 20) == [(0, 10)]
     assert parts(8) == [(0, 4), (4, 8), (8, 10)]
@@ -227,10 +228,10 @@ def test_scene_names_its_map_file(path, tmp_path):
         return scenes.scene(path, nrf, lights, size=16, spp=2, medium={"resolution": 64})
 
     plain = scene()
-    (medium,) = effects.find_media(plain)
-    options = visibility.options(plain.integrator())
+    (medium,) = find_media(plain)
+    options = building.options(plain.integrator())
     rows = lights_module.Lights(plain, [medium], 0, 512).table(medium.frame)
-    bake.write(tmp_path / "maps.exr", medium, rows, options, [build(medium, rows, options)])
+    map_file.write(tmp_path / "maps.exr", medium, rows, options, [build(medium, rows, options)])
     np.testing.assert_array_equal(scenes.render(scene(map_file=str(tmp_path / "maps.exr"))), scenes.render(plain))
     lights["sun"]["direction"] = [0, -1, 0]
     with pytest.raises(Exception) as caught:

@@ -10,7 +10,7 @@ import scipy.stats
 from helpers import scenes, ztest
 from helpers.scenes import nrf
 
-from mi_ntf.render.camera import Camera
+from mi_ntf.render.scene.camera import Camera
 
 LIGHT = {"light": scenes.light("point")}
 SPECTRUM_TO_LUMINANCE = np.array([0.212671, 0.715160, 0.072169])
@@ -39,7 +39,7 @@ def test_pixel_formats_of_a_box_filter(blobs, pixel_format, visibility):
 @pytest.mark.parametrize("border", [False, True])
 def test_reconstruction_equals_the_films_own(blobs, rfilter, border, monkeypatch):
     """The same samples, put by Mitsuba's ImageBlock; in several chunks."""
-    monkeypatch.setattr("mi_ntf.render.integrator.CHUNK", 500)
+    monkeypatch.setattr("mi_ntf.render.plugins.integrator.CHUNK", 500)
     options = {"rfilter": {"type": rfilter}, "sample_border": border, "pixel_format": "rgba"}
     loaded = scenes.scene(blobs, nrf("none", samples=64), LIGHT, size=16, spp=4, film_options=options)
     ours = scenes.render(loaded)
@@ -50,7 +50,7 @@ def test_reconstruction_equals_the_films_own(blobs, rfilter, border, monkeypatch
         self.block.put(position, values)
         put.append(first)
 
-    monkeypatch.setattr("mi_ntf.render.camera.Reconstruction.add", by_mitsuba)
+    monkeypatch.setattr("mi_ntf.render.scene.camera.Reconstruction.add", by_mitsuba)
     theirs = scenes.render(loaded)
     assert len(put) > 2
     np.testing.assert_allclose(ours, theirs, rtol=2e-5, atol=2e-6)  # orders of float32 sums

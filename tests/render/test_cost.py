@@ -11,11 +11,12 @@ from helpers.variants import VARIANT
 import mi_ntf.render
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.infer.visibility import METHODS
-from mi_ntf.render import calibrate, cost
+from mi_ntf.render.commands import calibration
+from mi_ntf.render.cost import model
 
 # Of research/transmittance.md, section 5, "knot": 576 ns a texel, 1.6 ns a step, 4.5 ns a lookup.
-KNOT = cost.Constants(texel=576 / 384, march=1.6, lookup=4.5)
-WORK = cost.Work(rays=65536, points=300_000, lights=50, method="raymarch", texels=128**2, samples=384)
+KNOT = model.Constants(texel=576 / 384, march=1.6, lookup=4.5)
+WORK = model.Work(rays=65536, points=300_000, lights=50, method="raymarch", texels=128**2, samples=384)
 
 
 @pytest.fixture(autouse=True)
@@ -26,40 +27,40 @@ def cache(variant, monkeypatch, tmp_path):
 
 
 def test_break_even_by_hand():
-    march = cost.light_steps(384) * 1.6
-    assert cost.break_even(WORK, KNOT) == pytest.approx(0.785398 * 16384 * 576 / (0.5 * (march - 4.5)))
+    march = model.light_steps(384) * 1.6
+    assert model.break_even(WORK, KNOT) == pytest.approx(0.785398 * 16384 * 576 / (0.5 * (march - 4.5)))
     # Four times the texels, four times the points; any number of lights.
-    assert cost.break_even(replace(WORK, texels=256**2), KNOT) == pytest.approx(4 * cost.break_even(WORK, KNOT))
-    assert cost.break_even(replace(WORK, lights=1), KNOT) == cost.break_even(WORK, KNOT)
+    assert model.break_even(replace(WORK, texels=256**2), KNOT) == pytest.approx(4 * model.break_even(WORK, KNOT))
+    assert model.break_even(replace(WORK, lights=1), KNOT) == model.break_even(WORK, KNOT)
 
 
 def test_volumes_hold_one_and_a_half_entries_a_sample():
     volume = replace(WORK, method="transmittance_volume")
     entries = 0.785398 * 128**2 * 1.5 * 384
-    assert cost.seconds(volume, KNOT)["maps or volumes"] == pytest.approx(1e-9 * 50 * entries * KNOT.cell, rel=1e-5)
+    assert model.seconds(volume, KNOT)["maps or volumes"] == pytest.approx(1e-9 * 50 * entries * KNOT.cell, rel=1e-5)
 
 
 def test_steps_of_a_light_march():
     """Steps of a quarter of 1/192, growing by a fifth of the distance, at last 1/80 long: counted for 384 samples."""
-    assert cost.light_steps(384) == 93
-    assert cost.light_steps(96) < cost.light_steps(384) < cost.light_steps(1536)
+    assert model.light_steps(384) == 93
+    assert model.light_steps(96) < model.light_steps(384) < model.light_steps(1536)
 
 
 def test_auto_changes_sides_at_the_break_even():
-    least = cost.break_even(WORK, KNOT)
-    assert cost.choose(replace(WORK, points=1.01 * least), KNOT)[0] == "transmittance_map"
-    method, reason = cost.choose(replace(WORK, points=0.99 * least), KNOT)
+    least = model.break_even(WORK, KNOT)
+    assert model.choose(replace(WORK, points=1.01 * least), KNOT)[0] == "transmittance_map"
+    method, reason = model.choose(replace(WORK, points=0.99 * least), KNOT)
     assert method == "raymarch" and "shading points, maps pay from" in reason
 
 
 def test_maps_pay_at_once_where_each_step_is_a_query():
     """The paper's regime: a march of network queries against one query of the ray network (P* of some hundred)."""
     slow = replace(KNOT, density=5700, ray=5700)
-    assert cost.break_even(replace(WORK, network=True, source="network"), slow) < 1000
+    assert model.break_even(replace(WORK, network=True, source="network"), slow) < 1000
 
 
 def test_maps_never_pay_where_a_lookup_costs_more_than_a_march():
-    assert cost.choose(replace(WORK, points=1e12), replace(KNOT, lookup=1000.0)) == (
+    assert model.choose(replace(WORK, points=1e12), replace(KNOT, lookup=1000.0)) == (
         "raymarch",
         "about 1e+12 shading points, maps pay from no number",
     )
@@ -67,53 +68,53 @@ def test_maps_never_pay_where_a_lookup_costs_more_than_a_march():
 
 def test_the_chosen_method_is_the_cheaper_one():
     """The rule and the stages' predictions are one model: at P* both cost the same."""
-    at = replace(WORK, points=cost.break_even(WORK, KNOT))
-    march, tmap = (sum(cost.seconds(replace(at, method=m), KNOT).values()) for m in ("raymarch", "transmittance_map"))
+    at = replace(WORK, points=model.break_even(WORK, KNOT))
+    march, tmap = (sum(model.seconds(replace(at, method=m), KNOT).values()) for m in ("raymarch", "transmittance_map"))
     assert march == pytest.approx(tmap, rel=1e-6)
 
 
 @pytest.mark.parametrize("method", [m for m in METHODS if m != "auto"])
 def test_every_method_has_a_price(method):
-    stages = cost.seconds(replace(WORK, method=method), cost.Constants())
+    stages = model.seconds(replace(WORK, method=method), model.Constants())
     assert min(stages.values()) >= 0 and stages["lights"] > 0
 
 
 def test_constants_are_kept_for_the_machine(cache):
-    assert cost.measured() is None and cost.constants() == cost.Constants()
-    cost.remember(KNOT)
-    assert cost.measured() == KNOT and cost.constants() == KNOT
+    assert model.measured() is None and model.constants() == model.Constants()
+    model.remember(KNOT)
+    assert model.measured() == KNOT and model.constants() == KNOT
     ((key, values),) = json.loads(cache.read_text()).items()
     assert VARIANT in key and values == asdict(KNOT)
     cache.write_text(json.dumps({"another machine": values}))
-    assert cost.measured() is None
-    cost.remember(KNOT)
+    assert model.measured() is None
+    model.remember(KNOT)
     assert set(json.loads(cache.read_text())) == {key, "another machine"}
 
 
 @pytest.mark.parametrize("content", ["", "[1]", '{"%s": {"march": 1}}', '{"%s": 3}'])
 def test_a_damaged_cache_counts_as_none(cache, content):
     cache.parent.mkdir()
-    cache.write_text(content.replace("%s", cost.machine()))
-    assert cost.constants() == cost.Constants()
+    cache.write_text(content.replace("%s", model.machine()))
+    assert model.constants() == model.Constants()
 
 
 @pytest.mark.parametrize("prices", [
     {"march": 0}, {"march": -1.0}, {"march": float("nan")}, {"march": float("inf")}, {"march": True}, {"march": "2"},
     {"march": None}, {"march": [1]}, {"march": 10**400}, {"more": 1.0}])
 def test_prices_that_make_no_sense_count_as_none(cache, prices):
-    cost.remember(cost.Constants(march=3.0))
-    assert cost.constants().march == 3.0
-    cache.write_text(json.dumps({cost.machine(): asdict(cost.Constants()) | prices}))
-    assert cost.measured() is None and cost.constants() == cost.Constants()
+    model.remember(model.Constants(march=3.0))
+    assert model.constants().march == 3.0
+    cache.write_text(json.dumps({model.machine(): asdict(model.Constants()) | prices}))
+    assert model.measured() is None and model.constants() == model.Constants()
 
 
 @pytest.mark.parametrize("content", [b"", b"\xff\xfe", b"[" * 100_000, b"9" * 10_000, b"{\"a\"", bytes(100)])
 def test_prices_that_are_no_json(cache, content):
     cache.parent.mkdir()
     cache.write_bytes(content)
-    assert cost.constants() == cost.Constants()
-    cost.remember(cost.Constants(march=3.0))
-    assert cost.constants().march == 3.0
+    assert model.constants() == model.Constants()
+    model.remember(model.Constants(march=3.0))
+    assert model.constants().march == 3.0
 
 
 class Driver:
@@ -132,7 +133,7 @@ class Driver:
 
 def test_prices_on_a_gpu_are_kept_by_its_name(cache, monkeypatch):
     """Two cards beside the same processor have prices of their own; no driver, or a broken one, is no error."""
-    monkeypatch.setattr(cost.mi, "variant", lambda: "cuda_ad_rgb")
+    monkeypatch.setattr(model.mi, "variant", lambda: "cuda_ad_rgb")
 
     def machine(driver):
         def load(name):
@@ -140,29 +141,29 @@ def test_prices_on_a_gpu_are_kept_by_its_name(cache, monkeypatch):
                 raise OSError("libcuda.so.1: cannot open shared object file")
             return driver
 
-        monkeypatch.setattr(cost.ctypes, "CDLL", load)
-        return cost.machine()
+        monkeypatch.setattr(model.ctypes, "CDLL", load)
+        return model.machine()
 
-    assert "NVIDIA Imaginary 9000" in machine(Driver()) and cost.processor() not in machine(Driver())
+    assert "NVIDIA Imaginary 9000" in machine(Driver()) and model.processor() not in machine(Driver())
     assert machine(Driver()) != machine(Driver(name="NVIDIA Imaginary 9001"))
-    cost.remember(cost.Constants(march=0.1))
+    model.remember(model.Constants(march=0.1))
     machine(Driver())
-    assert cost.measured() is None
+    assert model.measured() is None
     faulty = [None, object(), Driver(init=100), Driver(get=101), Driver(named=1), Driver(name="")]
     assert {machine(d) for d in faulty} == {machine(None)} and "CUDA device" in machine(None)
 
 
 def test_a_cache_that_cannot_be_written_is_no_fault(cache):
     cache.parent.write_text("a file where the folder belongs")
-    cost.remember(KNOT)
-    assert cost.measured() is None
+    model.remember(KNOT)
+    assert model.measured() is None
 
 
 def test_rendering_does_not_calibrate(tmp_path, cache, monkeypatch):
     def refuse(*args):
         raise MiNtfError("calibrated in a plain render")
 
-    monkeypatch.setattr(calibrate, "calibrate", refuse)
+    monkeypatch.setattr(calibration, "calibrate", refuse)
     scene = scenes.scene(scenes.write_blobs(tmp_path), {"type": "nrf"}, {"light": scenes.light("point")}, size=4, spp=1)
     assert scenes.render(scene).max() > 0
     assert not cache.exists()
@@ -170,12 +171,12 @@ def test_rendering_does_not_calibrate(tmp_path, cache, monkeypatch):
 
 def test_medians_alternate_and_leave_the_first_run_out():
     calls = []
-    found = calibrate.seconds({"a": lambda: calls.append("a"), "b": lambda: calls.append("b")}, 2)
+    found = calibration.seconds({"a": lambda: calls.append("a"), "b": lambda: calls.append("b")}, 2)
     assert calls == ["a", "b", "a", "b", "a", "b"] and set(found) == {"a", "b"}
 
 
 def test_rays_of_the_calibration_meet_the_object(tmp_path):
     scene = scenes.scene(scenes.write_blobs(tmp_path), {"type": "nrf"}, {"light": scenes.light("point")}, size=4)
     medium = next(s.interior_medium() for s in scene.shapes())
-    points = calibrate._points(medium)
+    points = calibration._points(medium)
     assert (mi.Float(medium.field.grid.density(points.x)) > 0.1).numpy().mean() > 0.99

@@ -10,7 +10,10 @@ from helpers.scenes import nrf
 from mi_ntf.core import field_file, fresnel, microfacet
 from mi_ntf.infer import march, shade
 from mi_ntf.infer.visibility import raymarch
-from mi_ntf.render import composition, effects, visibility, walk
+from mi_ntf.render.maps import building
+from mi_ntf.render.scene import effects
+from mi_ntf.render.scene.media import find_media
+from mi_ntf.render.transport import composition, walk
 
 EYE = [scenes.SIMILARITY.center[0] + 1.2, scenes.SIMILARITY.center[1] + 1.5, scenes.SIMILARITY.center[2] + 5]
 """The pinhole of `scenes.scene`."""
@@ -54,7 +57,7 @@ def test_light_at_the_camera_needs_no_visibility(blobs, monkeypatch):
     with monkeypatch.context() as general:
         general.setattr(effects, "_at_camera", lambda *_: False)
         marched, count = scenes.render(scene), operations(scene)
-    forbid(monkeypatch, visibility, "build")
+    forbid(monkeypatch, building, "build")
     forbid(monkeypatch, raymarch, "optical_depth")
     reused = scenes.render(scene)
     assert described(scene).collocated and "not needed" in described(scene).reason
@@ -119,14 +122,14 @@ def test_fresnel_effect_is_that_of_fields_trained_with_it(tmp_path, monkeypatch)
 def test_gloss_is_the_highest_lobe_in_matter(tmp_path):
     path = scenes.write_blobs(tmp_path, specular=0.3, roughness=0.5)
     scene = scenes.scene(path, nrf(), {})
-    (medium,) = effects.find_media(scene)
+    (medium,) = find_media(scene)
     assert medium.field.grid.gloss == pytest.approx(0.3 / (4 * 0.5**4), rel=1e-3)
 
 
 @pytest.mark.parametrize("visibility_name", ["raymarch", "transmittance_map"])
 def test_dark_lights_light_nothing(blobs, monkeypatch, visibility_name):
     """A light of no power: opacity only, no map, no shading."""
-    forbid(monkeypatch, visibility, "build")
+    forbid(monkeypatch, building, "build")
     forbid(monkeypatch, shade, "reflect")
     image = scenes.render(scenes.scene(blobs, nrf(visibility_name), lamp(intensity=0.0), size=16))
     assert (image[..., :3] == 0).all() and image[..., 3].max() > 0.99
@@ -137,7 +140,7 @@ def test_empty_field_is_not_marched(tmp_path, monkeypatch):
     header, tensors = fields.empty()
     field_file.save(path, header, tensors, np.float32)
     forbid(monkeypatch, march, "camera_samples")
-    forbid(monkeypatch, visibility, "build")
+    forbid(monkeypatch, building, "build")
     ball = {"type": "sphere", "bsdf": {"type": "null"}, "interior": {"type": "nrf", "filename": str(path)}}
     scene = scenes.scene(None, nrf(), lamp(), size=8, shapes={"ball": ball})
     assert (scenes.render(scene) == 0).all()

@@ -8,8 +8,9 @@ import pytest
 from helpers.programs import run_program
 
 from mi_ntf.core.errors import MiNtfError
-from mi_ntf.render import cost, load_scene, measure
-from mi_ntf.render.explain import explain, print_table
+from mi_ntf.render import load_scene
+from mi_ntf.render.commands.explain import explain, print_table
+from mi_ntf.render.cost import measurement, model
 
 SCENE = Path(__file__).parents[2] / "scenes" / "statue" / "scene.xml"
 
@@ -52,7 +53,7 @@ def test_auto_chooses_by_the_number_of_shading_points():
 def test_auto_follows_the_measured_machine():
     """Where a lookup costs more than a march, maps never pay."""
     explain(SCENE, {"light": "env", "res": "256", "spp": "64"})  # registers the plugins
-    cost.remember(cost.Constants(lookup=1e6))
+    model.remember(model.Constants(lookup=1e6))
     report = explain(SCENE, {"light": "env", "res": "256", "spp": "64"})
     assert report["visibility"] == "raymarch" and report["constants"] == "measured on this machine"
     assert "maps pay from no number" in report["effects"]["visibility"]["why"]
@@ -110,24 +111,24 @@ def test_measured_beside_predicted(tmp_path, capsys):
     # The guess of the shading points is made for objects like this one.
     assert 0.5 < real["points"] / report["points"] < 2
     assert 0.5 < real["peak_bytes"] / sum(report["memory_bytes"].values()) < 2
-    assert cost.measured() is not None and report["constants"] == "measured on this machine"
+    assert model.measured() is not None and report["constants"] == "measured on this machine"
     print_table(report)
     assert "measured" in capsys.readouterr().out
 
 
 def test_the_patches_of_bounced_light_are_a_stage_of_their_own(monkeypatch):
     """Their kernels are none of the camera's, though they march and sum lights as those do; they count each time."""
-    found, kernels, by_stage = [], [], measure.by_stage
+    found, kernels, by_stage = [], [], measurement.by_stage
 
     def counted(history):
         texts = [k["ir"].getvalue() for k in history if k.get("ir") is not None]
-        kernels.append({label: sum(f"loop: {label}\n" in t for t in texts) for label in measure.LOOPS})
+        kernels.append({label: sum(f"loop: {label}\n" in t for t in texts) for label in measurement.LOOPS})
         return by_stage(history)
 
-    monkeypatch.setattr(measure, "by_stage", counted)
+    monkeypatch.setattr(measurement, "by_stage", counted)
     for depth in ("2", "6"):
         scene = load_scene(SCENE, {"light": "point", "visibility": "raymarch", "res": "16", "spp": "1", "depth": depth})
-        found.append(measure.measure(scene, scene.integrator(), 1))
+        found.append(measurement.measure(scene, scene.integrator(), 1))
     single, all_ = found
     assert set(all_["stages"]) - set(single["stages"]) == {"bounces"}
     assert all_["points"] == single["points"] > 0
@@ -141,7 +142,7 @@ def test_patches_are_counted_before_they_are_found():
     integrator = scene.integrator()
     mi.render(scene, integrator=integrator)
     medium, patches = integrator.patches.media[0], integrator.patches.hits.shape[0]
-    assert cost.patches(medium.field.grid) == pytest.approx(patches, rel=0.2)
+    assert model.patches(medium.field.grid) == pytest.approx(patches, rel=0.2)
 
 
 def test_stages_by_the_loops_of_kernels():
@@ -155,7 +156,7 @@ def test_stages_by_the_loops_of_kernels():
     history = [kernel("ray profile", 8, 100), kernel("camera march", 4, 50), kernel("", 1, 50), kernel("lights", 2, 70),
                {"stage": "bounces", "execution_time": 16},
                kernel("camera march", 4, 50), kernel("lights", 2, 30)]  # fmt: skip
-    found = measure.by_stage(history)
+    found = measurement.by_stage(history)
     assert found["points"] == 100
     assert found["stages"] == pytest.approx(
         {"maps or volumes": 8e-3, "camera march": 8e-3, "reflectance": 1e-3, "lights": 4e-3, "bounces": 16e-3})

@@ -11,7 +11,7 @@ from helpers.scenes import nrf
 
 from mi_ntf.core import field_file
 from mi_ntf.core.architecture import FAST, Encoding, Header
-from mi_ntf.render import field
+from mi_ntf.render.scene import loaded
 
 # test_lights.py compares every emitter, in larger blocks; those of the long run (`make hard-cases`) take two minutes.
 LIGHTS = ("directional", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("point", "env")))
@@ -192,7 +192,7 @@ def test_seeds_spp_and_chunks(blobs, monkeypatch):
     assert np.abs(first - scenes.render(loaded, 4)).max() > 1e-3
     error = [np.abs(scenes.render(loaded, 1, spp=n) - scenes.render(loaded, 2, spp=512)).mean() for n in (4, 64)]
     assert error[1] < error[0] / 2.5  # sixteen times the samples: a quarter of the error
-    monkeypatch.setattr("mi_ntf.render.integrator.CHUNK", 1000)
+    monkeypatch.setattr("mi_ntf.render.plugins.integrator.CHUNK", 1000)
     assert scenes.render(loaded, 3).mean() == pytest.approx(first.mean(), rel=0.02)
 
 
@@ -210,7 +210,7 @@ def test_crop_window(blobs):
 
 
 def test_timeout_ends_early(blobs, monkeypatch):
-    monkeypatch.setattr("mi_ntf.render.integrator.CHUNK", 256)
+    monkeypatch.setattr("mi_ntf.render.plugins.integrator.CHUNK", 256)
     loaded = scenes.scene(blobs, nrf(timeout=1e-3), {"light": scenes.light("env")}, size=64)
     start = time.monotonic()
     image = scenes.render(loaded)
@@ -263,9 +263,9 @@ def test_voxels_follow_the_finest_planes(planes, voxels):
     """Two a texel, 192 at least, 512 at most."""
     kind = "planes" if planes else "frequency"
     network = dataclasses.replace(FAST.density, encoding=Encoding(kind, planes, 1 if planes else 0))
-    assert field.voxels(Header(dataclasses.replace(FAST, density=network))) == voxels
+    assert loaded.voxels(Header(dataclasses.replace(FAST, density=network))) == voxels
 
 
 def test_a_scene_may_name_the_voxels(blobs):
     for given, found in ((None, 256), (16, 16)):
-        assert field.load(str(blobs), given).grid.resolution == found
+        assert loaded.load(str(blobs), given).grid.resolution == found

@@ -9,8 +9,8 @@ from helpers import emitters, scenes, ztest
 
 from mi_ntf.core.architecture import Similarity
 from mi_ntf.infer import shade
-from mi_ntf.render import emitter_samples, lights
-from mi_ntf.render.frame import Frame
+from mi_ntf.render.lights import emitter_samples, scene_lights
+from mi_ntf.render.scene.frame import Frame
 
 SEEDS = 4
 MIDDLE = list(scenes.SIMILARITY.center)
@@ -98,7 +98,7 @@ def test_resampled_lights_are_unbiased_and_quieter(kinds, rng, monkeypatch):
     """Against the sum over all rows, unshadowed: means of 2000 draws at 64 points; and the noise of plain sampling."""
     made = [mi.load_dict(emitter(kind)) for kind in kinds]
     n, copies = 64, 2000
-    rows = lights.rows(list(zip(made, kinds, strict=True)), 8192)
+    rows = scene_lights.rows(list(zip(made, kinds, strict=True)), 8192)
     state = rng.bit_generator.state
     truth = np.array(shade.reflect(points(n, 1, rng), rows.table(identity()), None))
     spread = {}
@@ -131,7 +131,7 @@ def test_rows_of_single_lights_are_mitsubas_in_any_placement(kind, rng):
     x = rng.uniform(-0.9, 0.9, (3, 400))
     field_x = tuple(mi.Float(c.astype(np.float32)) for c in x)
     loaded = mi.load_dict(emitter(kind))
-    table = lights.rows([(loaded, kind)], 1).table(frame)
+    table = scene_lights.rows([(loaded, kind)], 1).table(frame)
     wi, irradiance, distance = table.sample(dr.zeros(mi.UInt32, 400), field_x, True)
     d, weight, dist = towards(loaded, np.array(frame.point_to_world(field_x)))
     np.testing.assert_allclose(np.array(frame.direction_to_world(wi)), d, atol=2e-6)
@@ -158,7 +158,7 @@ def test_environment_rows_shine_from_where_mitsuba_shines(kind):
     if kind == "sunsky":
         description["sun_aperture"] = 0.5358
     loaded = mi.load_dict(description)
-    rows = lights.rows([(loaded, "envmap" if kind == "texel" else kind)], 512)
+    rows = scene_lights.rows([(loaded, "envmap" if kind == "texel" else kind)], 512)
     side = 512
     u = (np.arange(side) + 0.5) / side
     u, v = (mi.Float(c.ravel().astype(np.float32)) for c in np.meshgrid(u, u))

@@ -11,7 +11,7 @@ from helpers import scenes
 
 import mi_ntf.render
 from mi_ntf.core import fresnel, microfacet, ops
-from mi_ntf.render import field
+from mi_ntf.render.scene import loaded
 
 
 @pytest.fixture(params=[(0.3, 0.4, False), (0.8, 0.1, False), (0.4, 0.06, True)], ids=["glossy", "rough", "fresnel"])
@@ -93,14 +93,14 @@ def test_a_medium_that_is_gone_lets_go_of_its_field(medium):
     other = mi.load_dict({"type": "nrf", "filename": path, "resolution": 24})
     grid = weakref.ref(other.field.grid)
     del other
-    field._load.cache_clear()
+    loaded._load.cache_clear()
     gc.collect()
     assert grid() is None
 
 
 def test_alone_it_says_what_to_do(variant):
     """A phase function that no medium attached to itself refuses to be evaluated."""
-    from mi_ntf.render.phase import phase_class
+    from mi_ntf.render.plugins.phase import phase_class
 
     alone = phase_class()(mi.Properties("nrf"))
     with pytest.raises(Exception, match="the nrf medium creates its own"):

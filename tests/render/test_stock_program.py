@@ -125,7 +125,7 @@ def test_a_switch_shows_the_frames(folder, tmp_path, program):
     path = folder / "frames.xml"
     path.write_text(SCENE.format(**NRF).replace("blobs.safetensors", "nowhere.safetensors"))
     done = run_program(*program, path, cwd=tmp_path, MI_NTF_DEBUG="1")
-    assert done.returncode == 1 and "Traceback" in done.stderr and "render/medium.py" in done.stderr
+    assert done.returncode == 1 and "Traceback" in done.stderr and "plugins/medium.py" in done.stderr
 
 
 def test_from_python_an_error_stays_an_exception(folder, variant):

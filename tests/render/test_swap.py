@@ -10,7 +10,7 @@ from helpers.variants import VARIANT
 from mi_ntf.core import field_file
 from mi_ntf.core.architecture import Architecture, Encoding, Header, Network, Similarity
 from mi_ntf.core.errors import MiNtfError
-from mi_ntf.render.swap import swap
+from mi_ntf.swap import swap
 
 MESH = """<scene version="3.9.0">
     <default name="spp" value="64"/>

@@ -6,8 +6,8 @@ from train import two_spheres
 
 from mi_ntf.data.schema import Split
 from mi_ntf.train.flash import Flash
-from mi_ntf.train.marched import Marched
 from mi_ntf.train.rays import Photographs
+from mi_ntf.train.transmittance_targets import TransmittanceTargets
 
 
 def facing(place) -> np.ndarray:
@@ -46,7 +46,7 @@ def photographs(images: np.ndarray, first: int = 0, **given) -> Photographs:
     return Photographs(split(images, **given), first)
 
 
-def flash(place: torch.Tensor, marched: Marched, solid: bool = True) -> Flash:
+def flash(place: torch.Tensor, marched: TransmittanceTargets, solid: bool = True) -> Flash:
     """Lights at `place` (views, 3), whatever the cameras."""
     found = Flash([photographs(np.zeros((len(place), 1, 1, 4), np.float32))], solid, marched)
     found.place = place

@@ -9,7 +9,7 @@ from train import shots  # noqa: E402
 
 from mi_ntf.data import schema  # noqa: E402
 from mi_ntf.data.images import levels  # noqa: E402
-from mi_ntf.train import agreement, evaluate, report  # noqa: E402
+from mi_ntf.train import agreement, report, scoring  # noqa: E402
 
 VIEWS, SIDE, FOCAL, BALL = 9, 40, 45.0, 0.95
 C2W = shots.around(VIEWS, 3.0, seed=6)
@@ -51,7 +51,7 @@ def field(monkeypatch):
 def survey(images: np.ndarray, gains: torch.Tensor | None = None) -> tuple[agreement.Agreement, list[str]]:
     """What is found, and what is said of it."""
     split = shots.split(images, FOCAL, C2W, names=NAMES)
-    found = agreement.survey(None, None, shots.Photographs(split), gains, 0.01, evaluate.Light())
+    found = agreement.survey(None, None, shots.Photographs(split), gains, 0.01, scoring.Light())
     assert found.psnr.shape == (VIEWS,) and found.shift.shape == (VIEWS, 2)
     return found, report.complaints(found, {"train": split})
 

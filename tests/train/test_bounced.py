@@ -9,9 +9,9 @@ from helpers import fields
 from train import shots
 
 from mi_ntf.core import radiosity
-from mi_ntf.train import bounced, networks, rays, render
-from mi_ntf.train.marched import Marched, walk
+from mi_ntf.train import bounced, networks, rays, volume
 from mi_ntf.train.occupancy import from_networks
+from mi_ntf.train.transmittance_targets import TransmittanceTargets, walk
 
 PLACES = (-0.45, 0.45)
 RADIUS = 0.3
@@ -25,7 +25,7 @@ def spheres():
     header, tensors = fields.blobs([(x, 0, 0) for x in PLACES], [RADIUS] * 2, log_density=5.5, edge=30,
                                    albedo=(0.8, 0.5, 0.2), specular=1e-5, roughness=0.9)  # fmt: skip
     nets = networks.from_tensors(header.architecture, {k: np.float32(v) for k, v in tensors.items()})
-    marched = Marched()
+    marched = TransmittanceTargets()
     marched.update(nets, from_networks(nets, 64, 0.1, torch.Generator().manual_seed(0)))
     return nets, marched
 
@@ -153,13 +153,13 @@ def test_albedo_learns_of_the_bounced_light(spheres, light):
     samples = (torch.arange(200).repeat_interleave(64), torch.linspace(2, 4, 64).repeat(200),
                torch.full((12800,), 2 / 64))
     generator = torch.Generator().manual_seed(0)
-    without = render.render(nets, some, samples)
-    whole = render.render(nets, some, samples, light, generator)
+    without = volume.render(nets, some, samples)
+    whole = volume.render(nets, some, samples, light, generator)
     torch.testing.assert_close(whole.color, without.color + whole.bounced)
     assert float(whole.bounced.max()) > 0.01 and without.bounced == 0.0
     albedo = torch.tensor([[0.5, 0.5, 0.5]], requires_grad=True)
     one = torch.ones(1)
-    sent = render.diffuse_albedo((None, albedo, 0.9 * one, 0.0 * one), False)
+    sent = volume.diffuse_albedo((None, albedo, 0.9 * one, 0.0 * one), False)
     sent.sum().backward()
     assert sent.tolist()[0] == pytest.approx([0.5] * 3) and albedo.grad.tolist()[0] == pytest.approx([1] * 3)
 

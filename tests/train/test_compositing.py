@@ -14,12 +14,13 @@ from train import shots  # noqa: E402
 from mi_ntf.core import fresnel, microfacet  # noqa: E402
 from mi_ntf.core import ops as numpy_ops  # noqa: E402
 from mi_ntf.core.architecture import Encoding, Network  # noqa: E402
-from mi_ntf.train import evaluate, held_out, losses, networks, render  # noqa: E402
-from mi_ntf.train.baked import Baked  # noqa: E402
+from mi_ntf.train import held_out, losses, networks, scoring, volume  # noqa: E402
 from mi_ntf.train.config import PRESETS  # noqa: E402
-from mi_ntf.train.marched import Marched, chords, uniform_directions  # noqa: E402
+from mi_ntf.train.normal_targets import NormalTargets  # noqa: E402
 from mi_ntf.train.occupancy import Occupancy, widest  # noqa: E402
+from mi_ntf.train.optical import Optical  # noqa: E402
 from mi_ntf.train.rays import Rays, sphere_span  # noqa: E402
+from mi_ntf.train.transmittance_targets import TransmittanceTargets, chords, uniform_directions  # noqa: E402
 
 SIGMA = 3.0
 ALBEDO, LIGHT = 0.5, 7.0
@@ -57,7 +58,7 @@ def test_packed_weights_equal_a_double_loop():
     counts, step = [3, 0, 5, 1], 0.05
     ray = np.repeat(np.arange(4), counts)
     sigma = rng.uniform(0, 40, len(ray)).astype(np.float32)
-    w, v = render.Optical.of(torch.tensor(sigma), torch.tensor(ray), step).weights()
+    w, v = Optical.of(torch.tensor(sigma), torch.tensor(ray), step).weights()
     for r in range(4):
         front = 1.0
         for j in np.nonzero(ray == r)[0]:
@@ -76,14 +77,14 @@ def test_uniform_ball_has_the_closed_form():
     step = 1 / 400
     generator = torch.Generator().manual_seed(0)
     cells = grid.visible(batch, step, generator)
-    image = render.render(Slab(), batch, render.unspent(Slab(), batch, cells, step, generator))
+    image = volume.render(Slab(), batch, volume.unspent(Slab(), batch, cells, step, generator))
     h = ((batch.t1 - batch.t0) / 2).numpy().astype(float)
     # A jittered first and last cell each miss or add up to one cell: 2σ·step = 1.5 % of the depth at that end.
     np.testing.assert_allclose(image.alpha, 1 - np.exp(-2 * SIGMA * h), rtol=0.004)
     for i, t0 in enumerate(batch.t0.numpy().astype(float)):
         t = t0 + (np.arange(4000) + 0.5) * (2 * h[i] / 4000)
         integral = np.sum(np.exp(-2 * SIGMA * (t - t0)) * SIGMA / t**2) * (2 * h[i] / 4000)
-        expected = render.SURFACE * integral * ALBEDO / np.pi * LIGHT
+        expected = volume.SURFACE * integral * ALBEDO / np.pi * LIGHT
         np.testing.assert_allclose(image.color[i], expected, rtol=0.02)
 
 
@@ -103,7 +104,7 @@ def test_rays_end_where_they_are_spent_and_steep_cells_are_split():
     batch = rays(5)
     o, d = torch.tensor([[0.0, k, 0.0] for k in range(5)]), torch.tensor([[1.0, 0.0, 0.0]] * 5)
     batch = dataclasses.replace(batch, o=o, d=d)
-    order, places, widths = render.unspent(Rows(), batch, (ray, near), step, torch.Generator().manual_seed(0))
+    order, places, widths = volume.unspent(Rows(), batch, (ray, near), step, torch.Generator().manual_seed(0))
     # Row 3's one cell has neighbours in the rows beside it.
     expected = [1] * 60, [], [1] * 99 + [4], [4], [4] + [1] * 8 + [4] * 6
     for k, parts in enumerate(expected):
@@ -124,9 +125,9 @@ def test_the_most_of_the_neighbours(shape):
 def test_an_opaque_plane_looks_like_its_surface():
     """The reason of SURFACE: v sums to 1/2 behind an opaque front, however coarse the cells are."""
     for step in (0.2, 0.01):
-        w, v = render.Optical.of(torch.full((400,), 600.0), torch.zeros(400, dtype=torch.long), step).weights()
+        w, v = Optical.of(torch.full((400,), 600.0), torch.zeros(400, dtype=torch.long), step).weights()
         assert abs(float(w.sum()) - 1) < 1e-6
-        assert abs(render.SURFACE * float(v.sum()) - 1) < 1e-6
+        assert abs(volume.SURFACE * float(v.sum()) - 1) < 1e-6
 
 
 def test_a_ray_outside_the_occupied_cells_is_dropped_and_others_are_tightened():
@@ -145,12 +146,12 @@ def test_a_field_without_matter_is_black():
     grid = Occupancy(torch.zeros((32,) * 3, dtype=torch.bool))
     index, kept = grid.tighten(rays(5))
     assert len(index) == len(kept) == 0
-    found = evaluate.render_all(Slab(), rays(5), grid, 0.01, torch.Generator().manual_seed(0))
+    found = scoring.render_all(Slab(), rays(5), grid, 0.01, torch.Generator().manual_seed(0))
     assert [v.shape for v in found] == [(5, 3), (5,), (5, 3), (5, 3)] and not any(v.any() for v in found)
 
 
 def ball(cells=48, radius=0.5, sigma=40.0):
-    baked = Baked(cells)
+    baked = NormalTargets(cells)
 
     class Field:
         def density(self, x):
@@ -175,7 +176,7 @@ def marched_ball(sigma=40.0):
         def log_density(self, x):
             return torch.where(x.norm(dim=1) < 0.5, math.log(sigma), -12.0)
 
-    marched = Marched()
+    marched = TransmittanceTargets()
     marched.update(Field(), Occupancy(torch.ones((64,) * 3, dtype=torch.bool)))
     return marched
 
@@ -221,7 +222,7 @@ def test_transmittance_loss_leaves_the_field_alone(kind):
     loss = losses.transmittance(nets, targets) + losses.visibility(nets, targets)
     batch = rays()
     samples = torch.arange(4).repeat_interleave(5), torch.linspace(2.8, 3.2, 5).repeat(4), torch.full((20,), 0.1)
-    image = render.render(nets, batch, samples)
+    image = volume.render(nets, batch, samples)
     (loss + losses.transmittance_color(nets, marched, image, batch, 1.0, 4)).backward()
     for name, value in nets.tensors.items():
         if name.startswith(("transmittance", "visibility")):
@@ -240,7 +241,7 @@ def test_lobes_wait_for_normals(rim):
     for lobes in (True, False):
         nets = networks.initial(arch, 1.0, torch.Generator().manual_seed(0))
         nets.tensors["reflectance.layers.1.bias"].data[:3] = -rays().d[0]  # seen from the front
-        image = render.render(nets, rays(), samples, lobes=lobes)
+        image = volume.render(nets, rays(), samples, lobes=lobes)
         image.color.square().sum().backward()
         grads.append(nets.tensors["reflectance.layers.1.weight"].grad.abs().sum(1))
         pictures.append(image.color.detach())
@@ -256,7 +257,7 @@ def test_evenness_sees_slopes_along_the_surface_alone():
 
     def image(normal):
         n = 500
-        return render.Image(color=None, alpha=None, x=torch.zeros(n, 3), shaded=None, index=None, weight=torch.ones(n),
+        return volume.Image(color=None, alpha=None, x=torch.zeros(n, 3), shaded=None, index=None, weight=torch.ones(n),
                             gloss=None, normal=torch.tensor(normal).expand(n, 3), albedo=None, radiance=None, raw=None,
                             bounced=0.0)
 
@@ -279,21 +280,21 @@ def test_psnr_of_a_known_error(monkeypatch):
     def constant(networks, rays, *_):
         return torch.full((len(rays), 3), 0.5), torch.full((len(rays),), 0.75), None, None
 
-    monkeypatch.setattr(evaluate, "render_all", constant)
+    monkeypatch.setattr(scoring, "render_all", constant)
     told = []
-    found = evaluate.score(None, None, pool, 0.01, views=1, tell=told.append)
+    found = scoring.score(None, None, pool, 0.01, views=1, tell=told.append)
     assert found["linear"] == pytest.approx(20.0, abs=1e-3)
     # sRGB of 0.5 and 0.6: 0.73536 and 0.79774 → −20 lg 0.06238
     assert found["srgb"] == found["object"] == found["each"][0] == pytest.approx(24.10, abs=0.01)
     assert found["alpha_rmse"] == pytest.approx(0.25) and told == [1.0]
-    found = evaluate.score(None, None, pool, 0.01)
+    found = scoring.score(None, None, pool, 0.01)
     assert found["each"] == pytest.approx([24.10, 24.10 + 10 * math.log10(4 / 3)], abs=0.01)
     assert found["srgb"] == pytest.approx(np.mean(found["each"])) and found["linear"] == pytest.approx(20.625, abs=1e-3)
     assert found["object"] == pytest.approx((24.10 + 120) / 2, abs=0.01)  # no error counts as 1e-12
     assert found["alpha_rmse"] == pytest.approx(math.sqrt((0.25**2 + (0.25**2 + 3 * 0.75**2) / 4) / 2))
     # Three pixels of each at most, the same ones in every call; with gains of their own, constants are met exactly.
-    assert evaluate.score(None, None, pool, 0.01, most=6) == evaluate.score(None, None, pool, 0.01, most=6)
-    fit = evaluate.score(None, None, pool, 0.01, evaluate.Light(fit=True), views=1)
+    assert scoring.score(None, None, pool, 0.01, most=6) == scoring.score(None, None, pool, 0.01, most=6)
+    fit = scoring.score(None, None, pool, 0.01, scoring.Light(fit=True), views=1)
     assert fit["srgb"] == pytest.approx(120, abs=20)  # float32
 
 
@@ -306,7 +307,7 @@ def test_training_shades_by_the_phase_function_seen_from_the_light(rim):
     weights = fresnel.weights(numpy_ops, w, w, n, roughness, specular, True) if rim else (1 - specular, specular)
     rows = [torch.as_tensor(np.stack(v, 1)) for v in (n, [0.6 + 0 * cos] * 3, w)]
     reflectance = *rows[:2], *map(torch.as_tensor, (roughness, specular))
-    actual = render.shade(reflectance, -rows[2], torch.full((20,), 2.0), torch.full((20, 3), 4.0), rim)
+    actual = volume.shade(reflectance, -rows[2], torch.full((20,), 2.0), torch.full((20, 3), 4.0), rim)
     expected = weights[0] * 0.6 * diffuse + weights[1] * gloss
     np.testing.assert_allclose(actual[:, 1], expected, rtol=1e-9)  # float64 rounding of sines
 
@@ -327,7 +328,7 @@ def test_held_out_score_of_a_network_that_knows_no_shadow():
     # A lens so long that all of its pixels see the same point.
     pool = shots.photographs(np.ones((1, 5, 10, 4), np.float32), focal=1e6, c2w=shots.facing((0, 0, -3.0))[None])
     field = Field()
-    found = held_out.score(field, evaluate.occupied(field), pool)
+    found = held_out.score(field, scoring.occupied(field), pool)
     # 4096 pairs of deviation 0.3, and voxels of 1/128 that smear the surface
     assert found["bias"] == pytest.approx(1 - (1 - math.log(2)) / 2, abs=0.03)
     assert found["bias"] < found["rms"] < 1
@@ -336,7 +337,7 @@ def test_held_out_score_of_a_network_that_knows_no_shadow():
 def test_rough_lobes_cost_more():
     """Σ w ((fading + 60 α⁴) s + (−5 − ln s)²/10) per ray, the square where s lies below e^−5; s above the least."""
     gloss = torch.tensor([1.0, 0.5, 1.0]), torch.tensor([0.2, 0.4, math.exp(-7)])
-    image = render.Image(color=None, alpha=None, x=None, shaded=None, index=None,
+    image = volume.Image(color=None, alpha=None, x=None, shaded=None, index=None,
                          weight=torch.tensor([0.5, 0.25, 0.25]),
                          normal=None, albedo=None, gloss=gloss, radiance=None, raw=None, bounced=0.0)
     wanted = 0.5 * 0.2 * 60.5 + 0.25 * 0.4 * (0.5 + 60 / 256) + 0.25 * (math.exp(-7) * 60.5 + 0.4)

@@ -10,8 +10,9 @@ from train import shots  # noqa: E402
 
 from mi_ntf.core import fresnel, microfacet  # noqa: E402
 from mi_ntf.core import ops as numpy_ops  # noqa: E402
-from mi_ntf.train import flash, rays, render  # noqa: E402
-from mi_ntf.train.marched import Marched, walk  # noqa: E402
+from mi_ntf.train import flash, rays, volume  # noqa: E402
+from mi_ntf.train.optical import Optical  # noqa: E402
+from mi_ntf.train.transmittance_targets import TransmittanceTargets, walk  # noqa: E402
 
 ANGLES = [(0, 0), (0, 50), (40, -40), (40, 20), (65, 10), (20, 75), (-60, 60)]
 """Degrees of viewer and light from the normal, in one plane."""
@@ -35,11 +36,11 @@ def test_light_at_the_camera_is_the_collocated_formula(rim):
     u = torch.rand(n, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     d, t, light = directions(n), 2 + 2 * u[:, 0], torch.tensor([[30.0, 20.0, 10.0]]).double().expand(n, 3)
     camera = torch.tensor([[0.4, -0.3, 3.0]]).double()
-    x, seen = camera + t[:, None] * d, render.Optical(0.01 + 3 * u[:, 1], 5 * u[:, 2])
+    x, seen = camera + t[:, None] * d, Optical(0.01 + 3 * u[:, 1], 5 * u[:, 2])
     reflectance = directions(n, 3), *materials(n)
-    found = shots.flash(camera, Marched()).send(seen, reflectance, d, x, torch.zeros(n).long(), light, rim)
+    found = shots.flash(camera, TransmittanceTargets()).send(seen, reflectance, d, x, torch.zeros(n).long(), light, rim)
     _, v = seen.weights()
-    expected = v[:, None] * render.shade(reflectance, d, t, light, rim)
+    expected = v[:, None] * volume.shade(reflectance, d, t, light, rim)
     assert 0.4 < float((expected > 0).any(1).double().mean()) < 0.6, "what faces the camera, and what does not"
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-15)
 
@@ -86,8 +87,8 @@ def test_an_opaque_skin_lit_from_aside_is_its_surface(roughness, specular, rim):
             t = 4 + width * (torch.arange(cells) + 0.5)
             batch = rays.Rays(o, d, torch.tensor([3.0]), torch.tensor([5.0]), torch.zeros(1, 4), power[None],
                               torch.zeros(1).long())
-            image = render.render(Skin(roughness, specular, rim), batch, (torch.zeros(cells).long(), t, torch.full(
-                (cells,), width)), flash=shots.flash(place, Marched()))
+            image = volume.render(Skin(roughness, specular, rim), batch, (torch.zeros(cells).long(), t, torch.full(
+                (cells,), width)), flash=shots.flash(place, TransmittanceTargets()))
             expected = surface(wi, wo, roughness, specular, rim) * power.numpy() / 9
             # Light that comes back from down to 0.02 sees other angles and distances: sharp lobes most.
             np.testing.assert_allclose(image.color[0], expected, rtol=0.03, err_msg=f"{viewer}, {light}, {cells}")
@@ -108,12 +109,12 @@ def test_a_thin_skin_is_the_integral_over_its_depth(rim):
         # Cells of unequal depths.
         places = np.sort(np.random.default_rng(0).uniform(0, 0.8, 30))
         places = np.concatenate([[0], places, [0.8]]) / wo[2]
-        seen = render.Optical(*(torch.as_tensor(v) for v in (np.diff(places), places[:-1])))
+        seen = Optical(*(torch.as_tensor(v) for v in (np.diff(places), places[:-1])))
         one = torch.ones(31).double()
         row = {"n": n, "wo": wo, "wi": wi}
         row = {k: torch.as_tensor(v).expand(31, 3) for k, v in row.items()}
         reflectance = row["n"], albedo * one[:, None].expand(31, 3), roughness * one, specular * one
-        found = shots.flash(torch.as_tensor(2 * wi[None]), Marched()).send(
+        found = shots.flash(torch.as_tensor(2 * wi[None]), TransmittanceTargets()).send(
             seen, reflectance, -row["wo"], torch.zeros(31, 3).double(), torch.zeros(31).long(),
             5 * one[:, None].expand(31, 3), rim)
         np.testing.assert_allclose(found.sum(0), expected, rtol=1e-6)  # of the quadrature
@@ -123,8 +124,8 @@ def test_nothing_is_sent_from_below():
     """Light under the horizon, and skins that are seen from behind."""
     n = 300
     d, normal = directions(n, 5), directions(n, 6)
-    lamp = shots.flash(directions(1, 7) * 3, Marched())
-    seen = render.Optical(torch.full((n,), 0.5).double(), torch.zeros(n).double())
+    lamp = shots.flash(directions(1, 7) * 3, TransmittanceTargets())
+    seen = Optical(torch.full((n,), 0.5).double(), torch.zeros(n).double())
     wi, _ = lamp.toward(torch.zeros(n).long(), torch.zeros(n, 3).double())
     found = lamp.send(seen, (normal, *materials(n)), d, torch.zeros(n, 3).double(), torch.zeros(n).long(),
                       torch.ones(n, 3).double(), False)
@@ -138,11 +139,11 @@ def test_gradients():
     n = 50
     normal = F.normalize(directions(n, 8) + torch.tensor([0.0, 0, 2]), dim=1).requires_grad_()
     depth, front = (torch.full((n,), v, dtype=torch.float64, requires_grad=True) for v in (0.3, 0.4))
-    lamp = shots.flash(torch.tensor([[1.0, 0.5, 3.0]]).double(), Marched())
+    lamp = shots.flash(torch.tensor([[1.0, 0.5, 3.0]]).double(), TransmittanceTargets())
     wi, distance = lamp.toward(torch.zeros(n).long(), torch.zeros(n, 3).double())
     albedo, one = torch.full((n, 3), 0.6, dtype=torch.float64), torch.ones(n).double()
     d = torch.tensor([[0.0, 0, -1]]).double().expand(n, 3)
-    sent = lamp.send(render.Optical(depth, front), (normal, albedo, one, 0 * one), d, torch.zeros(n, 3).double(),
+    sent = lamp.send(Optical(depth, front), (normal, albedo, one, 0 * one), d, torch.zeros(n, 3).double(),
                      torch.zeros(n).long(), 7 * one[:, None].expand(n, 3), False)
     sent[:, 0].sum().backward()
     cos_i, cos_o = ((normal.detach() * v).sum(1) for v in (wi, -d))
@@ -155,7 +156,7 @@ def test_gradients():
     np.testing.assert_allclose(front.grad, -size * r * weight, rtol=1e-6)
     # A highlight: brighter towards the half vector.
     normal = F.normalize(wi - d + 0.1 * directions(n, 9), dim=1).requires_grad_()
-    lamp.send(render.Optical(depth, front), (normal, 0 * albedo, 0.5 * one, one), d,
+    lamp.send(Optical(depth, front), (normal, 0 * albedo, 0.5 * one, one), d,
               torch.zeros(n, 3).double(), torch.zeros(n).long(), one[:, None].expand(n, 3), False).sum().backward()
     half = F.normalize(wi - d, dim=1)
     across = half - (half * normal.detach()).sum(1, keepdim=True) * normal.detach()
@@ -171,7 +172,7 @@ def test_places_are_right_up_and_forward_of_the_lenses():
     given = {"center": center, "radius": radius}
     first = shots.photographs(blank[:3], c2w=c2w[:3], offset=offset, **given)
     second = shots.photographs(blank[3:], c2w=c2w[3:], first=3, **given)
-    lamp = flash.Flash([first, second], True, Marched())
+    lamp = flash.Flash([first, second], True, TransmittanceTargets())
     truth = ((c2w @ (0.3, -0.2, -0.5, 1.0))[:, :3] - center) / radius
     lenses = (c2w[:, :3, 3] - center) / radius
     np.testing.assert_allclose(lamp.place, np.concatenate([truth[:3], lenses[3:]]), atol=1e-6)
@@ -192,13 +193,13 @@ LAMPS = torch.tensor([[0.5, 0.3, 3.0], [-0.4, 0.0, -0.5]])
 """One far away, one within the unit sphere."""
 
 
-def ball(log_sigma: float) -> Marched:
+def ball(log_sigma: float) -> TransmittanceTargets:
     """A ball of that density, in a grid [z, y, x] as it is baked."""
     k = 128
     axis = (np.arange(k) + 0.5) * (2 / k) - 1
     z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
     inside = ((np.stack([x, y, z], -1) - CENTRE) ** 2).sum(-1) < RADIUS**2
-    found = Marched()
+    found = TransmittanceTargets()
     found.log_sigma = torch.as_tensor(np.where(inside, log_sigma, -12.0)[None, None], dtype=torch.float32)
     found.reach = 1.0
     return found
@@ -230,7 +231,7 @@ def test_shadow_and_light_are_where_an_opaque_ball_puts_them():
         assert shadow.sum() > 100 and light.sum() > 1000
         assert (found[shadow] < 0.01).all(), found[shadow].max()
         assert (found[light] > 0.999).all(), found[light].min()
-    unknown = shots.flash(LAMPS, Marched())
+    unknown = shots.flash(LAMPS, TransmittanceTargets())
     assert (unknown.reaching(torch.zeros(9).long(), torch.zeros(9, 3)) == 1).all()
 
 
@@ -256,7 +257,7 @@ def test_thick_skins_do_not_shade_themselves(thick):
     axis = (torch.arange(k) + 0.5) * (2 / k) - 1
     z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
     radius = (torch.stack([x, y, z], -1) - torch.as_tensor(CENTRE).float()).norm(dim=-1)
-    marched = Marched()
+    marched = TransmittanceTargets()
     marched.log_sigma = ((RADIUS - radius) / thick).clamp(-12, 4)[None, None]
     normal = directions(500, 12).float()
     o = torch.as_tensor(CENTRE).float() + 2 * normal
@@ -296,7 +297,7 @@ def test_points_in_smoke_are_lit_one_by_one():
     np.testing.assert_allclose(lamp.reaching(view, tx), np.exp(-sigma * length), rtol=0.06)
     normal, d = directions(n, 10).float(), directions(n, 11).float()
     albedo, roughness, specular = (v.float() for v in materials(n))
-    seen = render.Optical(torch.full((n,), 0.2), torch.full((n,), 0.7))
+    seen = Optical(torch.full((n,), 0.2), torch.full((n,), 0.7))
     light = torch.full((n, 3), 6.0)
     found = lamp.send(seen, (normal, albedo, roughness, specular), d, tx, view, light, False)
     away = LAMPS[view].numpy() - x

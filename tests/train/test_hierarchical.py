@@ -13,7 +13,7 @@ from train import two_spheres  # noqa: E402
 from mi_ntf.core import field_file  # noqa: E402
 from mi_ntf.core.architecture import FAST, PAPER, VISIBILITY, Architecture, Encoding, Network  # noqa: E402
 from mi_ntf.core.errors import MiNtfError  # noqa: E402
-from mi_ntf.train import config, evaluate, hierarchical, losses, train, trainer  # noqa: E402
+from mi_ntf.train import config, hierarchical, losses, scoring, train, trainer  # noqa: E402
 from mi_ntf.train.rays import Rays, sphere_span  # noqa: E402
 
 NETWORK = Network(Encoding("frequency", octaves=3), (32, 32))
@@ -148,7 +148,7 @@ def test_a_short_run_learns_and_is_written(photographs, tmp_path, monkeypatch):
         return value
 
     monkeypatch.setattr(trainer._HierarchicalRun, "advance", recorded)
-    monkeypatch.setattr(evaluate, "CELLS", 32)  # of 128³: seconds
+    monkeypatch.setattr(scoring, "CELLS", 32)  # of 128³: seconds
     report = train(photographs, tmp_path / "f", preset="paper", steps=120)
     terms = ("coarse colour", "colour", "transmittance", "lit colour", "random transmittance", "random lit colour")
     assert set(history[0]) == set(terms)

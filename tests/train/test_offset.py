@@ -10,10 +10,10 @@ from train import shots  # noqa: E402
 
 from mi_ntf.data import schema  # noqa: E402
 from mi_ntf.train import offset  # noqa: E402
-from mi_ntf.train.baked import Baked  # noqa: E402
 from mi_ntf.train.flash import Flash  # noqa: E402
-from mi_ntf.train.marched import Marched  # noqa: E402
+from mi_ntf.train.normal_targets import NormalTargets  # noqa: E402
 from mi_ntf.train.occupancy import Occupancy  # noqa: E402
+from mi_ntf.train.transmittance_targets import TransmittanceTargets  # noqa: E402
 
 VIEWS, RADIUS, DISTANCE = 30, 0.6, 3.2
 C2W = shots.around(VIEWS, DISTANCE, seed=1)
@@ -23,7 +23,7 @@ def flashes() -> Flash:
     """The lights as training knows them: at the lenses, and some of held-back photographs after them."""
     blank = np.zeros((VIEWS, 1, 1, 4), np.uint8)
     return Flash([shots.photographs(blank, c2w=C2W), shots.photographs(blank[:2], c2w=C2W[:2], first=VIEWS)], True,
-                 Marched())
+                 TransmittanceTargets())
 
 
 def observed(place: tuple[float, float, float], points: int = 500, outliers: float = 0.15) -> offset.Observed:
@@ -101,7 +101,7 @@ def test_what_photographs_show_of_points():
     picture = (picture * hit[..., None]).astype(np.float32)
     picture[:, :20, :20, :3] = 0  # dark, as shadows are
     pool = shots.photographs(picture, focal=focal, c2w=c2w)
-    baked, marched = Baked(96), Marched()
+    baked, marched = NormalTargets(96), TransmittanceTargets()
     grid = Occupancy(torch.ones((64,) * 3, dtype=torch.bool))
     baked.update(Ball(), grid)
     marched.update(Ball(), grid)
@@ -134,7 +134,7 @@ def test_what_photographs_show_of_points():
 def test_levels_at_their_upper_end_are_not_used():
     pool = shots.photographs(np.full((3, 9, 9, 4), 255, np.uint8), c2w=np.stack([shots.facing(p) for p in (
         (0, 0, 3.0), (0.5, 0, 3.0), (0, 0.5, 3.0))]))
-    baked, marched = Baked(64), Marched()
+    baked, marched = NormalTargets(64), TransmittanceTargets()
     grid = Occupancy(torch.ones((64,) * 3, dtype=torch.bool))
     baked.update(Ball(), grid)
     marched.update(Ball(), grid)

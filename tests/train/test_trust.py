@@ -11,7 +11,7 @@ from train import two_spheres  # noqa: E402
 
 from mi_ntf.core import field_file  # noqa: E402
 from mi_ntf.core.errors import MiNtfError  # noqa: E402
-from mi_ntf.train import config, descent, monitor, stepper, train, trainer  # noqa: E402
+from mi_ntf.train import config, fast, monitor, recipe, train, trainer  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -181,9 +181,9 @@ def test_skins_get_steeper_once_around_the_surface(photographs, tmp_path, monkey
     before = run.nets.log_density(x).detach()
     run.refresh()
     assert run.steep
-    expected = stepper.SURFACE_LEVEL + run.config.steepen * (before - stepper.SURFACE_LEVEL)
+    expected = fast.SURFACE_LEVEL + run.config.steepen * (before - fast.SURFACE_LEVEL)
     torch.testing.assert_close(run.nets.log_density(x).detach(), expected, rtol=1e-4, atol=1e-4)
     run.refresh()
     torch.testing.assert_close(run.nets.log_density(x).detach(), expected, rtol=1e-4, atol=1e-4)
-    monkeypatch.setattr(descent, "SOLID", 1.0)
+    monkeypatch.setattr(recipe, "SOLID", 1.0)
     assert start().steep

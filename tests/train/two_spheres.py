@@ -16,22 +16,22 @@ DISTANCE = 3.2
 def coarsen(monkeypatch) -> None:
     """The preset `fast` on grids whose upkeep takes no longer than its steps: for runs of some steps that need not
     learn."""
-    from mi_ntf.train import config, evaluate
+    from mi_ntf.train import config, scoring
 
     monkeypatch.setitem(config.PRESETS, "fast", dataclasses.replace(config.PRESETS["fast"], cells=48, bake=64))
-    monkeypatch.setattr(evaluate, "CELLS", 32)
+    monkeypatch.setattr(scoring, "CELLS", 32)
 
 
 def glance(monkeypatch) -> None:
     """Finished fields are compared with 500 pixels of the photographs: for runs whose scores do not matter."""
-    from mi_ntf.train import evaluate
+    from mi_ntf.train import scoring
 
-    whole = evaluate.score
+    whole = scoring.score
 
     def score(networks, occupancy, photographs, step, light, most, views=None, passes=1, tell=None):
         return whole(networks, occupancy, photographs, step, light, 500 if views is None else most, views, passes)
 
-    monkeypatch.setattr(evaluate, "score", score)
+    monkeypatch.setattr(scoring, "score", score)
 
 
 def camera(direction: np.ndarray) -> np.ndarray:

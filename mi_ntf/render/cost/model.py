@@ -1,0 +1,252 @@
+"""What the stages of a render cost, predicted from a few constants of the machine, and which method is cheapest then.
+
+Constants are measured by :mod:`mi_ntf.render.commands.calibration`, which `mi-ntf explain --measure` and `mi-ntf
+bench` run; a render reads them from the user's cache, or takes those of two cores of 2024.
+"""
+
+import ctypes
+import json
+import math
+import platform
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ... import __version__
+from ...core import radiosity
+from ...infer.grid import CELLS
+from ...infer.visibility.raymarch import default_steps
+from ...infer.visibility.transmittance_volume import ENTRIES
+from .. import user_cache
+
+CACHE = "cost.json"
+"""Where constants are kept, in the user's cache."""
+
+FACING = 0.5
+"""Share of (point, light) pairs whose light falls on the front, the others ask for no visibility."""
+FILLED = math.pi / 4
+"""Share of a map's texels whose rays meet the object."""
+
+
+COVERAGE = 0.35
+"""Share of the camera rays that hit the object."""
+POINTS_A_HIT = 15
+"""Shading points of a camera ray that hits, at 384 samples across the diameter."""
+NOT_SKIPPED = 0.05
+"""Share of the samples across the diameter at which a camera ray's march asks the field."""
+
+
+@dataclass(frozen=True)
+class Constants:
+    """Nanoseconds on all cores together.
+
+    camera    a camera ray, per sample that would lie across the unit sphere's diameter (most are skipped)
+    reflect   reflectance at a shading point
+    shade     a point and light, its visibility left out
+    march     a step of a light's march, empty space included
+    texel     a ray of a map marched from the field, per sample across the diameter
+    lookup    a point and light, from the map
+    cell      an entry of a transmittance volume
+    fetch     a point and light, from the volume
+    between   a ray between patches of the skin
+    density, ray, mlp   a query of the density, the transmittance and the visibility network
+    """
+
+    camera: float = 0.5
+    reflect: float = 40.0
+    shade: float = 2.0
+    march: float = 2.0
+    texel: float = 1.0
+    lookup: float = 5.0
+    cell: float = 2.0
+    fetch: float = 15.0
+    between: float = 1000.0
+    density: float = 60.0
+    ray: float = 600.0
+    mlp: float = 1500.0
+
+
+@dataclass(frozen=True)
+class Work:
+    """The size of a render.
+
+    rays, points  camera rays, shading points
+    lights        of the table, and drawn ones a point
+    texels        of a map: m²; `components`: logistics in each
+    samples       cells across the unit sphere's diameter
+    source        of maps: ``field`` or ``network``
+    network       the field is its networks, not its grid, of `voxels`³
+    patches       that light bounces between, 0 where it does not by radiosity
+    """
+
+    rays: float
+    points: float
+    lights: int
+    method: str
+    texels: int
+    samples: int
+    source: str = "field"
+    components: int = 1
+    network: bool = False
+    voxels: int = 192
+    patches: int = 0
+
+
+def light_steps(samples: int) -> int:
+    """Steps of a light's march from a point over the mean chord, 1 unit-sphere radius."""
+    shortest, longest, growth = default_steps(2 / samples)
+    t, count = 0.0, 0
+    while t < 1:
+        t += min(max(growth * t, shortest), longest)
+        count += 1
+    return count
+
+
+def per_ray(work: Work, c: Constants) -> float:
+    """ns of one ray of a map: q of research/transmittance.md, section 5."""
+    if work.source == "network":
+        return c.ray
+    return work.samples * (c.texel + (c.density if work.network else 0))
+
+
+def per_pair(work: Work, c: Constants) -> float:
+    """ns of one point and light by the method that `work` names, once it is built."""
+    step = c.march + (c.density if work.network else 0)
+    return {"raymarch": light_steps(work.samples) * step, "transmittance_map": c.lookup * work.components,
+            "transmittance_volume": c.fetch, "neural_transmittance": c.ray, "visibility_mlp": c.mlp,
+            "none": 0.0}[work.method]
+
+
+def break_even(work: Work, c: Constants) -> float:
+    """P*, the shading points from which on maps are cheaper than marches, whatever the number of lights:
+
+        P* = (π/4) m² q / (f (n c_s − c_l))
+
+    with q a texel's cost, n c_s a march's, c_l a lookup's, f the share of lights that a point faces."""
+    march = per_pair(_with(work, "raymarch"), c)
+    lookup = per_pair(_with(work, "transmittance_map"), c)
+    return FILLED * work.texels * per_ray(work, c) / (FACING * (march - lookup)) if march > lookup else math.inf
+
+
+def choose(work: Work, c: Constants | None = None) -> tuple[str, str]:
+    """``(method, reason)`` of ``visibility=auto``: ``transmittance_map`` from P* shading points on, else ``raymarch``.
+    ``work.method`` is not read."""
+    least = break_even(work, c or constants())
+    method = "transmittance_map" if work.points >= least else "raymarch"
+    limit = f"{least:.2g} on" if math.isfinite(least) else "no number"
+    return method, f"about {work.points:.2g} shading points, maps pay from {limit}"
+
+
+def work(integrator, medium, method: str, rays: int, lights: int = 1) -> Work:
+    """What it comes to that an ``nrf`` integrator traces `rays` camera rays through `medium` under `lights` lights.
+    Shading points are guessed: an opaque object in the picture."""
+    network = integrator.map_source == "network"
+    return Work(
+        rays=rays, points=rays * COVERAGE * POINTS_A_HIT * integrator.samples / 384, lights=lights, method=method,
+        texels=integrator.map_resolution**2, samples=integrator.samples, source=integrator.map_source,
+        components=medium.field.network.components if network else integrator.map_components,
+        network=medium.representation == "network", voxels=medium.field.grid.resolution,
+    )
+
+
+def patches(grid) -> int:
+    """About how many patches (:class:`mi_ntf.render.transport.bounced.Patches`) the skin in `grid` has: cells between
+    matter and empty space. Those are smaller than patches' cells, which may have a patch for several faces."""
+    matter = np.pad(np.array(grid.clearance).reshape((CELLS,) * 3) == 0, 1)
+    inner = matter.copy()
+    for axis in range(3):
+        inner &= np.roll(matter, 1, axis) & np.roll(matter, -1, axis)
+    return int(matter.sum() - inner.sum())
+
+
+def seconds(work: Work, c: Constants) -> dict[str, float]:
+    """Predicted wall seconds of each stage, compilation left out; ``bounces`` where they are by radiosity."""
+    query = c.density if work.network else 0
+    pairs = work.points * work.lights
+    tables = {"transmittance_map": FILLED * work.texels * per_ray(work, c),
+              "transmittance_volume": FILLED * work.texels * ENTRIES * work.samples * (c.cell + query)}
+    lit = c.shade + FACING * per_pair(work, c)
+    stages = {
+        "maps or volumes": 1e-9 * work.lights * tables.get(work.method, 0.0),
+        "camera march": 1e-9 * work.rays * work.samples * (c.camera + NOT_SKIPPED * query),
+        "reflectance": 1e-9 * work.points * (c.reflect + query),
+        "lights": 1e-9 * pairs * lit,
+    }
+    if work.patches:
+        rays = radiosity.CHORDS + work.patches * (radiosity.FEW**2 + radiosity.SIDE**2)
+        ray = c.between + radiosity.STEPS * NOT_SKIPPED * query
+        stages["bounces"] = 1e-9 * (rays * ray + work.patches * work.lights * lit)
+    return stages
+
+
+def memory(work: Work, chunk: int) -> dict[str, int]:
+    """Bytes held at a time beside maps, `chunk` camera rays in flight."""
+    # Chunks are strips of pixels: those across the object hold more points than others.
+    share = work.points / max(work.rays, 1) * (2 if work.rays > chunk else 1)
+    camera, between = min(chunk, work.rays), work.patches * radiosity.SIDE**2
+    return {
+        "field grid": 4 * work.voxels**3 + 32 * min(work.voxels, 128) ** 3,
+        # Some 24 floats a shading point, 12 a ray between patches, in arrays that Dr.Jit rounds up to powers of two.
+        "rays in flight": round(max(camera * max(share, 1) * 128, between * 72)),
+    }
+
+
+def _with(work: Work, method: str) -> Work:
+    return Work(**(asdict(work) | {"method": method}))
+
+
+def machine() -> str:
+    """What constants hold for: this version and variant, and what computes: processor and threads, or graphics card."""
+    hardware = graphics_card() if mi.variant().startswith("cuda") else f"{processor()} · {dr.thread_count()} threads"
+    return f"{__version__} · {hardware} · {mi.variant()}"
+
+
+def graphics_card() -> str:
+    """The name of the CUDA device that Dr.Jit computes on, the first that the driver shows; neutral where none is."""
+    name = ctypes.create_string_buffer(256)
+    device = ctypes.c_int()
+    try:
+        driver = ctypes.CDLL("libcuda.so.1")
+        found = (driver.cuInit(0) or driver.cuDeviceGet(ctypes.byref(device), 0)
+                 or driver.cuDeviceGetName(name, len(name), device)) == 0
+    except (OSError, AttributeError):  # no driver, or no such function in it
+        found = False
+    return name.value.decode(errors="replace").strip() if found and name.value else "CUDA device"
+
+
+def processor() -> str:
+    """The processor's name."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.is_file() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
+
+
+def constants() -> Constants:
+    """This machine's, as measured; the defaults where nothing was measured or the cache cannot be read."""
+    return measured() or Constants()
+
+
+def measured() -> Constants | None:
+    """This machine's constants, None where they are not in the cache."""
+    found = _read().get(machine())
+    if not isinstance(found, dict) or {f.name for f in fields(Constants)} != set(found):
+        return None
+    prices = all(type(v) in (int, float) and 0 < v < 1e12 for v in found.values())  # up to minutes
+    return Constants(**found) if prices else None
+
+
+def remember(found: Constants) -> None:
+    """Keep `found` for this machine. A cache that cannot be written is no fault of the caller's work."""
+    user_cache.write(CACHE, json.dumps(_read() | {machine(): asdict(found)}, indent=1))
+
+
+def _read() -> dict:
+    try:
+        found = json.loads(user_cache.read(CACHE) or b"{}")
+    except (ValueError, RecursionError):  # no JSON, no text, or nested without end
+        return {}
+    return found if isinstance(found, dict) else {}

@@ -1,0 +1,105 @@
+"""Lights drawn at random for each shading point, by Mitsuba's own emitter sampling."""
+
+import drjit as dr
+import mitsuba as mi
+
+from ...infer import scatter
+from ..scene.frame import Frame
+
+CANDIDATES = 8
+"""Candidates of a resampled light: seven more draws are cheap beside one visibility."""
+SHARE = 1 / (3 * CANDIDATES)
+"""Of each colour of a candidate in their mean."""
+SAMPLES = 2
+"""Resampled lights a point for each emitter with an extent, where all discrete lights are summed."""
+STRIDE = 3242174889, 2447445414
+"""Powers of the inverse plastic number, times 2³²: the additive sequence R2 that fills a square most evenly."""
+
+
+class EmitterSamples:
+    """Random lights with the interface of :class:`mi_ntf.infer.lights.LightTable`: any emitter, unbiased, noisy.
+
+    emitters  list of Mitsuba emitters
+    weights   their chances of being drawn (any scale)
+    points    :class:`mi_ntf.infer.shade.Points` that will ask, in the field coordinates of `frame`
+    seed      opaque unsigned integer
+    count     lights per point, each from an emitter drawn by weight; 0: of every emitter SAMPLES lights, or 1 where
+              it has no extent
+    least     at least so many, of all emitters together or of each with an extent
+
+    A light is the one that resampling keeps of CANDIDATES draws, with chances in proportion to the light that each
+    would scatter to the viewer, were nothing in the way (Talbot et al. 2005): of the many that could, the few worth a
+    visibility. It is weighted so that the mean over all draws is the sum over all emitters.
+    """
+
+    def __init__(self, emitters: list, weights: list[float], frame: Frame, points, seed, count: int = 0,
+                 least: int = 0):
+        self.frame, self.points = frame, points
+        self._emitters = mi.EmitterPtr(emitters)
+        self._choice = mi.DiscreteDistribution(weights) if count and len(emitters) > 1 else None
+        rows = [(0, CANDIDATES)] * (count and max(count, least)) or [
+            (i, 1) if mi.has_flag(e.flags(), mi.EmitterFlags.DeltaPosition) else (i, CANDIDATES)
+            for i, e in enumerate(emitters)
+            for _ in range(1 if mi.has_flag(e.flags(), mi.EmitterFlags.DeltaPosition) else max(SAMPLES, least))
+        ]
+        self.count = len(rows)
+        of_emitter = [sum(row[0] == i for row in rows) for i in range(len(emitters))]
+        self._emitter, self._candidates, self._share = (
+            mi.UInt32([i for i, _ in rows]),
+            mi.UInt32([n for _, n in rows]),
+            mi.Float([1 / of_emitter[i] for i, _ in rows]),
+        )
+        self._lane = dr.arange(mi.UInt32, dr.width(points.x[0]))
+        self._shift = mi.sample_tea_32(self._lane, seed)
+        self._seed = mi.UInt32(seed)
+        dr.make_opaque(self._emitter, self._candidates, self._share, self._seed)
+        dr.eval(self._lane, self._shift)
+
+    def sample(self, index, x, active):
+        """As LightTable.sample; irradiance: the estimate's."""
+        it = dr.zeros(mi.Interaction3f, dr.width(x[0]))
+        it.p = self.frame.point_to_world(x)
+        with dr.suspend_grad():
+            kept, weight = self._resample(index, it, active)
+        ds, irradiance = self._draw(index, kept, it, active)
+        irradiance *= weight
+        return self.frame.direction_to_field(ds.d), tuple(irradiance), ds.dist / self.frame.length
+
+    def _resample(self, index, it, active):
+        """The candidate kept for light `index`, and the weight of its irradiance in the estimate."""
+        candidates = dr.gather(mi.UInt32, self._candidates, index, active)
+        share = dr.gather(mi.Float, self._share, index, active)
+        p = self.points
+
+        def body(k, kept, of_kept, total):
+            ds, irradiance = self._draw(index, k, it, active)
+            value, _ = scatter.evaluate(self.frame.direction_to_field(ds.d), p.wo, p.reflectance)
+            # Light may be negative. Scaled, so that the sum of the brightest that floats hold is still one.
+            target = dr.abs(sum(SHARE * e * v for e, v in zip(irradiance, value, strict=True)))
+            total = total + target
+            u = mi.sample_tea_float32(self._lane ^ self._seed, index * CANDIDATES + k)
+            keep = u * total < target
+            return k + 1, dr.select(keep, k, kept), dr.select(keep, target, of_kept), total
+
+        zero = dr.zeros(mi.UInt32, dr.width(it.p))
+        _, kept, of_kept, total = dr.while_loop(
+            state=(zero, zero, dr.zeros(mi.Float, dr.width(it.p)), dr.zeros(mi.Float, dr.width(it.p))),
+            cond=lambda k, kept, of_kept, total: active & (k < candidates),
+            body=body,
+            label="light candidates",
+        )
+        return kept, dr.select(of_kept > 0, share * total / (of_kept * candidates), 0)
+
+    def _draw(self, index, k, it, active):
+        """Candidate `k` of light `index`: Mitsuba's sample, and its irradiance over its density."""
+        n = index * CANDIDATES + k
+        # Evenly spread over a point's candidates, each uniform by itself: 24 bits of a float's mantissa.
+        u = [mi.Float((shift + n * stride) >> 8) * 2**-24 for shift, stride in zip(self._shift, STRIDE, strict=True)]
+        emitter, weight = dr.gather(mi.UInt32, self._emitter, index, active), 1
+        if self._choice is not None:
+            emitter, u[0], pmf = self._choice.sample_reuse_pmf(u[0], active)
+            weight = dr.rcp(pmf)
+        chosen = dr.gather(mi.EmitterPtr, self._emitters, emitter, active)
+        ds, irradiance = chosen.sample_direction(it, mi.Point2f(*u), active)
+        ds.d = dr.normalize(ds.d)  # an environment's has the length of its to_world
+        return ds, dr.select(ds.pdf > 0, irradiance * weight, 0)

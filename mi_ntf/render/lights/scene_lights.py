@@ -1,0 +1,168 @@
+"""The scene's emitters as lights of the field: which are rows of a table, which are drawn by Mitsuba's sampling."""
+
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import mitsuba as mi
+import numpy as np
+
+from ...infer.lights import LightTable
+from ..scene.frame import Frame
+from . import light_checks, light_gradients, light_rows
+from .emitter_samples import EmitterSamples
+
+KINDS = {
+    "PointLight": "point",
+    "SpotLight": "spot",
+    "DirectionalEmitter": "directional",
+    "EnvironmentMapEmitter": "envmap",
+    "ConstantBackgroundEmitter": "constant",
+    "SunskyEmitter": "sunsky",
+    "TimedSunskyEmitter": "timed_sunsky",
+    "AreaLight": "area",
+    "DirectionalArea": "directionalarea",
+    "Projector": "projector",
+}
+"""Mitsuba's class name → plugin name."""
+SINGLE = ("point", "spot", "directional")
+"""Those that become one row of a table."""
+SKIES = ("envmap", "constant", "sunsky")
+"""Those that become many."""
+
+
+@dataclass(frozen=True)
+class Discrete:
+    """An emitter of a finite set of lights: itself, its kind, its rows, and the cells of an environment."""
+
+    emitter: object
+    kind: str
+    rows: light_rows.Rows
+    cells: object = None
+
+    @classmethod
+    def of(cls, emitter, kind: str, environment_lights: int) -> "Discrete":
+        """`environment_lights`: most rows of an environment, which has those without power, too."""
+        if kind in SKIES:
+            return cls(emitter, kind, *light_rows.sky(emitter, kind, environment_lights))
+        return cls(emitter, kind, light_rows.delta(emitter, kind))
+
+
+class Lights:
+    """The emitters of a scene, sorted once per render.
+
+    media               the scene's ``nrf`` media: what an ``ntf`` emitter with one of them wraps is taken without its
+                        shadow, which the integrator casts itself
+    light_samples       0: every discrete light at every point, environments by texels, and a few samples of each
+                        emitter that is no finite set of lights; n: n samples a point of all emitters together
+    environment_lights  most directional lights that stand for an environment
+
+    kinds    plugin name of each emitter
+    sampled  emitters that are drawn at random
+    discrete the others, each with its rows (:class:`Discrete`)
+    rows     all of those in scene coordinates
+
+    Raises MiNtfError where an emitter has numbers that are none, or cannot be drawn.
+    """
+
+    def __init__(self, scene, media=(), light_samples: int = 0, environment_lights: int = 512):
+        self._wrapped: list = []
+        emitters = [self._unwrap(e, scene, media) for e in scene.emitters()]
+        self.kinds = [kind(e) for e in emitters]
+        self.light_samples = light_samples
+        for e, k in zip(emitters, self.kinds, strict=True):
+            light_checks.check(e, k, light_samples > 0 or not is_discrete(e))
+        discrete = [(e, k) for e, k in zip(emitters, self.kinds, strict=True) if not light_samples and is_discrete(e)]
+        self.discrete = [Discrete.of(e, k, environment_lights) for e, k in discrete]
+        # What is dark now may be the parameter that is to become light.
+        dark = light_gradients.attached([e for e, _ in discrete])
+        self.rows = light_rows.join([d.rows for d in self.discrete], dark)
+        pairs = [(e, w) for e, w in zip(emitters, scene.emitters(), strict=True) if light_samples or not is_discrete(e)]
+        self.sampled = [e for e, _ in pairs if _shines(e)]
+        self._weights = [outer.sampling_weight() for e, outer in pairs if _shines(e)]
+
+    def _unwrap(self, emitter, scene, media):
+        """What an ``ntf`` emitter wraps, where its medium is one of `media`; any other emitter itself."""
+        bare, inner = emitter, emitter
+        while hasattr(inner, "attached"):
+            outer, inner = inner, inner.attached()
+            # Nobody else tells a nested environment how large the scene is, and where its shadow rays end.
+            inner.set_scene(scene)
+            if any(_same(outer.medium, m) for m in media):
+                self._wrapped.append(outer)
+                bare = inner if bare is outer else bare
+        return bare
+
+    @contextmanager
+    def bare(self):
+        """Inside, ``scene.sample_emitter_direction`` and its kin see the light of ``ntf`` emitters without the shadows
+        that the integrator casts."""
+        for emitter in self._wrapped:
+            emitter.bare = True
+        try:
+            yield
+        finally:
+            for emitter in self._wrapped:
+                emitter.bare = False
+
+    def table(self, frame: Frame) -> LightTable:
+        """The discrete lights, in the field coordinates of `frame`."""
+        table = self.rows.table(frame)
+        light_gradients.attach(table, self.rows, self.discrete, frame)
+        return table
+
+    def sources(self, table: LightTable, frame: Frame, points, seed, draws: int = 0) -> list:
+        """What to sum over at `points` (in the coordinates of `frame`): pairs of a source, which has ``count`` and
+        ``sample``, and whether its index is a row of `table`, which is what maps are made for. `draws`: least number
+        of lights drawn."""
+        result = [(table, True)] if table.count else []
+        if self.sampled:
+            drawn = EmitterSamples(self.sampled, self._weights, frame, points, seed, self.light_samples, draws)
+            result.append((drawn, False))
+        return result
+
+
+def method_for_drawn(method: str) -> str:
+    """The visibility method of drawn lights where `method` serves the table's: maps and volumes are made of rows."""
+    return "raymarch" if method in ("transmittance_map", "transmittance_volume") else method
+
+
+def kind(emitter) -> str:
+    """Plugin name of an emitter, ``ntf`` that of what it wraps; the class name where Mitsuba has a new one."""
+    inner = getattr(emitter, "inner", None)
+    return kind(inner) if inner is not None else KINDS.get(emitter.class_name(), emitter.class_name())
+
+
+def is_discrete(emitter) -> bool:
+    """Whether the light is a finite set of points and directions: a spot without texture; an environment by texels."""
+    return emitter.class_name() in KINDS and kind(emitter) in (*SINGLE, *SKIES) and not _is_textured_spot(emitter)
+
+
+def _is_textured_spot(emitter) -> bool:
+    return kind(emitter) == "spot" and mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
+
+
+def _shines(emitter) -> bool:
+    """False with a warning for what Mitsuba's own emitter sampling never finds."""
+    if kind(emitter) == "directionalarea":
+        mi.Log(
+            mi.LogLevel.Warn,
+            f"directionalarea emitter ({emitter.id()}) lights no field: only Mitsuba's particle tracers see its light",
+        )
+        return False
+    return True
+
+
+def _same(medium, other) -> bool:
+    """One medium, or two of one field in one place."""
+    if medium is other:
+        return True
+    if medium is None or medium.path != other.path:
+        return False
+    a, b = medium.frame, other.frame
+    near = np.allclose(a.origin, b.origin, atol=1e-4 * a.length) and np.isclose(a.length, b.length, rtol=1e-4)
+    return bool(near and np.allclose(a.world_to_field_numpy(np.eye(3), True), b.world_to_field_numpy(np.eye(3), True)))
+
+
+def rows(emitters: list, environment_lights: int) -> light_rows.Rows:
+    """Discrete `emitters`, each with its kind, as rows in scene coordinates. Lights without power are dropped."""
+    return light_rows.join([Discrete.of(e, k, environment_lights).rows for e, k in emitters])

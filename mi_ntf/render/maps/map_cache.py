@@ -1,0 +1,141 @@
+"""Transmittance maps that are made once: kept in memory over frames, on disk over runs.
+
+A map's key is everything that its texels depend on: the field's content, grid and marching step, the lights' places,
+resolution, source and number of logistics, the program text that makes them and the libraries that run it. Files lie
+in ``maps`` of the user's cache (:mod:`mi_ntf.render.user_cache`), each under a hash of its content: one that is not
+what was written counts as none. The environment variable ``MI_NTF_MAP_CACHE`` switches: ``on`` (default), ``memory``
+(no files), ``off``.
+"""
+
+import hashlib
+import os
+from collections import OrderedDict
+from contextlib import suppress
+from functools import lru_cache
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...core.errors import MiNtfError
+from .. import user_cache
+
+LARGEST_FILE = 256 << 20
+FOLDER_LIMIT = 2 << 30
+"""Bytes: larger maps are not written; the files used longest ago go when the folder is full."""
+SEAL = hashlib.sha256().digest_size
+"""Bytes at the start of a file that depend on all others and on its name; float32 numbers follow."""
+
+_maps: OrderedDict[str, object] = OrderedDict()
+
+
+def mode() -> str:
+    """``on``, ``memory`` or ``off``."""
+    value = os.environ.get("MI_NTF_MAP_CACHE", "on")
+    if value not in ("on", "memory", "off"):
+        raise MiNtfError(f'environment variable MI_NTF_MAP_CACHE is "{value}", expected on, memory or off')
+    return value
+
+
+@lru_cache(maxsize=1)
+def _program() -> str:
+    """Hash of the modules that texels come from: no map outlives a change of theirs."""
+    package = Path(__file__).parents[1]
+    digest = hashlib.sha256()
+    for file in sorted([*(package / "core").rglob("*.py"), *(package / "infer").rglob("*.py")]):
+        digest.update(file.read_bytes())
+    return digest.hexdigest()
+
+
+def _libraries() -> tuple:
+    """Versions of what runs the program in the current variant."""
+    compiler = dr.detail.cuda_version if mi.variant().startswith("cuda") else dr.detail.llvm_version
+    return mi.__version__, dr.__version__, np.__version__, compiler()
+
+
+def key(medium, table, options, width: int, step: float) -> str:
+    """Name of the map of `table`'s lights; `width`: numbers a texel; `step`: of the march that makes it, field
+    units."""
+    grid = medium.field.grid
+    facts = (
+        _program(), _libraries(), medium.field.digest, medium.representation, grid.resolution, options.step, step,
+        options.map_resolution, options.map_source, options.map_components, width, mi.variant(),
+    )
+    digest = hashlib.sha256(repr(facts).encode())
+    for part in (table.where, table.is_point, grid.hull):
+        digest.update(np.ascontiguousarray(part))
+    return digest.hexdigest()
+
+
+def cached(name: str, make, count: int, limit: float):
+    """The map called `name`, of `count` numbers: from memory, else ``make(values)`` of those in its file, else
+    ``make()``, which is then kept on disk.
+
+    `limit`: bytes that maps in memory may take, this one and its making included; a map that takes more is not kept
+    there.
+    """
+    where = mode()
+    if where == "off":
+        return make()
+    if name in _maps:
+        _maps.move_to_end(name)
+        return _maps[name]
+    _make_room(limit - 4 * count)
+    values = _read(name, count) if where == "on" else None
+    result = make() if values is None else make(values)
+    if where == "on" and values is None and 4 * count <= LARGEST_FILE:
+        _write(name, result.values.numpy())
+    if 4 * count <= limit:
+        _maps[name] = result
+    return result
+
+
+def forget() -> None:
+    """Drop what is kept in memory."""
+    _maps.clear()
+
+
+def _make_room(limit: float) -> None:
+    """Drop the maps used longest ago until the others take `limit` bytes at most."""
+    while _maps and sum(4 * len(m.values) for m in _maps.values()) > limit:
+        _maps.popitem(last=False)
+
+
+def _file(name: str) -> str:
+    return f"maps/{name}.map"
+
+
+def _seal(name: str, values: np.ndarray) -> bytes:
+    digest = hashlib.sha256(name.encode())
+    digest.update(values)
+    return digest.digest()
+
+
+def _read(name: str, count: int):
+    content = user_cache.read(_file(name), SEAL + 4 * count)
+    if content is None:
+        return None
+    values = np.frombuffer(content, "<f4", offset=SEAL)
+    if content[:SEAL] != _seal(name, values):
+        return None
+    with suppress(OSError):
+        os.utime(user_cache.folder() / _file(name))
+    return values
+
+
+def _write(name: str, values: np.ndarray) -> None:
+    values = np.ascontiguousarray(values, "<f4")
+    if np.isfinite(values).all() and user_cache.write(_file(name), _seal(name, values), values):
+        with suppress(OSError):  # of other processes that tidy up as well
+            _tidy(user_cache.folder() / "maps")
+
+
+def _tidy(where: Path) -> None:
+    """Remove the files used longest ago until the folder is within its limit."""
+    files = sorted(((f.stat().st_mtime, f.stat().st_size, f) for f in where.iterdir()), reverse=True)
+    total = 0
+    for _, size, file in files:
+        total += size
+        if total > FOLDER_LIMIT:
+            file.unlink(missing_ok=True)

@@ -1,0 +1,151 @@
+"""The ``ntf`` emitter."""
+
+import drjit as dr
+import mitsuba as mi
+
+from ...core.errors import MiNtfError
+from ...infer.visibility import METHODS, outside
+from ..lights import environment, light_checks, scene_lights
+from ..maps.building import Options, build
+from . import properties
+
+STEP = 2 / 384
+NEVER = 1e18
+"""Density that emitter sampling claims for every direction, 1/sr: beside it, the power heuristic gives light that a
+BSDF-sampled ray finds no weight. Its square is still a float32."""
+
+
+def emitter_class() -> type:
+    """The plugin class for the current variant."""
+
+    class NTFEmitter(mi.Emitter):
+        """A light seen through a field (``ntf``).
+
+        =============== ======= ====================================================================================
+        parameter       type    meaning
+        =============== ======= ====================================================================================
+        (nested)        emitter the light: any emitter, another ``ntf`` for a second field; ``area`` where this emitter
+                                stands inside the shape that shines
+        (nested)        medium  the ``nrf`` medium in its way, nested or by ``<ref>``
+        visibility      string  ``raymarch``, ``neural_transmittance``, ``visibility_mlp``, ``none``; of lights that are
+                                one point or direction also ``transmittance_map``, ``transmittance_volume``; ``auto`` is
+                                ``neural_transmittance`` (default: auto)
+        sampling_weight float   as of any emitter: share of the samples drawn from all (default: 1)
+        =============== ======= ====================================================================================
+
+        Whatever samples this emitter receives the nested light's radiance times the field's transmittance from the lit
+        point to the light, so that a field casts its shadow on ordinary surfaces under stock ``path``, ``direct`` and
+        ``prb``. Light reaches surfaces by emitter sampling alone, which knows the lit point; BSDF samples that hit the
+        light weigh nothing, so gloss needs more samples than under the bare light. The camera sees an environment or
+        area light as it is.
+
+        The ``nrf`` integrator takes the nested light bare where the medium is in the scene, since it casts the shadows
+        of fields itself. Stock ``volpath`` does too if the medium fills a shape there: give it the bare light.
+
+        Does not support: the field's shadow on what mirrors (delta BSDFs) reflect; importance sampling by position
+        (particle tracers).
+        """
+
+        def __init__(self, props):
+            read = properties.Reader(props, "ntf emitter", properties.EMITTER, nested=True)
+            self.visibility = read.choice("visibility", "auto", METHODS)
+            read.number("sampling_weight", 1.0, 0.0, 1e30)
+            nested = [value for _, value in props.objects()]
+            other = [o for o in nested if not (isinstance(o, mi.Emitter) or getattr(o, "is_nrf", False))]
+            if other:
+                raise MiNtfError(f"ntf emitter: it has no place for a nested {other[0].class_name()}; it takes a light "
+                                 "and an nrf medium")
+            self.inner = _single([o for o in nested if isinstance(o, mi.Emitter)], "emitter", "a light to wrap")
+            self.medium = _single([o for o in nested if getattr(o, "is_nrf", False)], "medium", "an nrf medium")
+            mi.Emitter.__init__(self, props)
+            # An environment's flags let the camera see it; the shape that shines asks for those of its emitter.
+            self.m_flags = int(self.inner.flags())
+            self.m_needs_sample_2 = self.m_needs_sample_3 = False
+            self.bare = False
+            self._prepare()
+
+        def _prepare(self):
+            method = "neural_transmittance" if self.visibility == "auto" else self.visibility
+            table = None
+            light_checks.check(self.inner, scene_lights.kind(self.inner), drawn=True)
+            environment.check_unscaled(self.inner)
+            if method != scene_lights.method_for_drawn(method):
+                kind = scene_lights.kind(self.inner)
+                if kind not in scene_lights.SINGLE or not scene_lights.is_discrete(self.inner):
+                    raise MiNtfError(
+                        f"ntf emitter: visibility is {method}, which is made for one light, but {kind} shines from "
+                        "many places; choose raymarch or neural_transmittance"
+                    )
+                table = scene_lights.rows([(self.inner, kind)], 1).table(self.medium.frame)
+            self._method = build(method, self.medium, table, Options(STEP))
+
+        def sample_direction(self, it, sample, active=True):
+            inner = self.attached()
+            ds, weight = inner.sample_direction(it, sample, active)
+            if _is_far(inner):
+                # The nested light never learns the scene's size: it believes in a unit sphere and would end shadow rays
+                # there.
+                frame = self.medium.frame
+                reach = dr.norm(it.p - mi.Point3f(frame.origin.tolist())) + frame.length
+                ds.dist = dr.maximum(ds.dist, 1000 * reach)
+                ds.p = it.p + ds.d * ds.dist
+            ds.emitter = mi.EmitterPtr(self)
+            if self.bare:
+                return ds, weight
+            ds.delta = dr.ones(mi.Bool, dr.width(ds.pdf))
+            return ds, weight * self._tau(it, ds, active & (ds.pdf > 0))
+
+        def _tau(self, it, ds, active):
+            if self._method is None:
+                return mi.Float(1)
+            frame = self.medium.frame
+            distance = mi.Float(dr.inf) if _is_far(self.inner) else ds.dist / frame.length
+            x, d = frame.point_to_field(it.p), frame.direction_to_field(ds.d)
+            return outside.tau(self._method, x, d, distance, mi.UInt32(0), active)
+
+        def attached(self):
+            """The nested light; one with a surface shines from the shape that this emitter belongs to."""
+            shape = self.get_shape()
+            if shape is not None and self.inner.get_shape() is None:
+                self.inner.set_shape(shape)
+            return self.inner
+
+        def pdf_direction(self, it, ds, active=True):
+            if self.bare:
+                return self.attached().pdf_direction(it, ds, active)
+            hit = mi.Float(0 if mi.has_flag(self.inner.flags(), mi.EmitterFlags.Delta) else NEVER)
+            return dr.select(active, hit, 0)
+
+        def eval_direction(self, it, ds, active=True):
+            value = self.attached().eval_direction(it, ds, active)
+            return value if self.bare else value * self._tau(it, ds, active)
+
+        def eval(self, si, active=True):
+            return self.attached().eval(si, active)
+
+        def bbox(self):
+            return self.attached().bbox()
+
+        def traverse(self, callback):
+            mi.Emitter.traverse(self, callback)
+            callback.put("emitter", self.inner, mi.ParamFlags.Differentiable)
+
+        def parameters_changed(self, keys):
+            mi.Emitter.parameters_changed(self, keys)
+            self._prepare()
+
+        def to_string(self):
+            return f"NTFEmitter[\n  visibility = {self.visibility},\n  emitter = {self.inner}\n]"
+
+    return NTFEmitter
+
+
+def _is_far(emitter) -> bool:
+    """Whether its light comes from infinity: an environment or a directional light."""
+    return bool(mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite))
+
+
+def _single(objects: list, kind: str, what: str):
+    if len(objects) != 1:
+        raise MiNtfError(f"ntf emitter: found {len(objects)} nested {kind} objects, needs exactly one: {what}")
+    return objects[0]

@@ -1,0 +1,196 @@
+"""The ``nrf`` integrator."""
+
+import itertools
+import time
+
+import drjit as dr
+import mitsuba as mi
+
+from ...core.errors import MiNtfError, root
+from ...infer.visibility import METHODS
+from ..scene.camera import Camera, Reconstruction
+from ..transport import aovs
+from ..transport.composition import Composition
+from . import properties
+
+CHUNK = 1 << 18
+"""Camera rays in flight: bounds the memory at about half a GiB whatever the image and the number of lights."""
+
+
+def integrator_class() -> type:
+    """The plugin class for the current variant."""
+
+    class NRFIntegrator(mi.SamplingIntegrator):
+        """Volumetric integrator of neural reflectance fields (``nrf``).
+
+        =================== ======= ===================================================================================
+        parameter           type    meaning
+        =================== ======= ===================================================================================
+        visibility          string  how light reaches a point: ``raymarch``, ``transmittance_map``,
+                                    ``neural_transmittance``, ``transmittance_volume``, ``visibility_mlp``, ``none``,
+                                    or ``auto``, the cheaper of the first two (default: auto)
+        samples             integer steps across the unit sphere's diameter (default: 384)
+        light_samples       integer lights per shading point, drawn from Mitsuba's emitter sampling and resampled, from
+                                    any emitters; 0: all lights, cells of environments among them, and 2 drawn (1 of a
+                                    projector or textured spot) of each emitter that is no finite set of lights, such
+                                    as an area; these need no map and are marched under ``transmittance_map``
+                                    (default: 0)
+        environment_lights  integer most directional lights that stand for an environment (default: 512)
+        map_resolution      integer texels per side of a light's transmittance map (default: 192)
+        map_source          string  ``field``: marched once per texel; ``network``: one query per texel (default: field)
+        map_components      integer logistics per texel of a marched map, 1 or 2: two err less on maps of 256² or more
+                                    and on what is not opaque, and take four times the memory (default: 1)
+        map_memory          float   MiB that maps or volumes may take: more lights are rendered in several runs
+                                    (default: 1024)
+        map_file            string  EXR of ``mi-ntf bake`` that holds the maps (default: none)
+        max_depth           integer longest path in edges: 1 shows emitters alone, 2 is single scattering, more is
+                                    multiple scattering in fields and between surfaces, −1 has no limit and ends paths
+                                    by Russian roulette from depth 5 on (default: 2)
+        bounces             string  how light of `max_depth` > 2 is found: ``paths``, traced, exact and noisy;
+                                    ``radiosity``, without noise, between opaque fields alone, whose skins count as
+                                    diffuse; ``auto``: ``radiosity`` where nothing else takes part (default: auto)
+        aovs                string  further outputs, a comma-separated list of ``depth``, ``normal``, ``albedo``,
+                                    ``roughness``, ``opacity``, ``visibility``, ``visibility_lights``: see
+                                    :mod:`mi_ntf.render.transport.aovs` (default: none)
+        hide_emitters       boolean leave the environment and shapes that shine out of the picture (default: false)
+        timeout             float   seconds after which rendering ends with what is there; below 0: never (default: -1)
+        =================== ======= ===================================================================================
+
+        At `max_depth` 2 light scatters once: camera ray → point → light, with L = ∫ τ σ h dt (Bi et al. 2020, eq. 2).
+        Alpha is the opacity. Every camera ray carries its whole distribution of depths, so 16 samples per pixel look
+        like thousands of a path tracer.
+
+        Any number of ``nrf`` media, which may overlap (densities add), and ordinary shapes with any BSDF: all hide,
+        shade and, from `max_depth` 3 on, light each other. Shadow rays of surfaces are marched where `visibility` is a
+        method of maps or volumes. With ``none`` fields cast no shadows and receive none, and light that one scatters
+        meets no field again.
+
+        The image can be differentiated by the lights: power, an environment's texels, and, of at most 32 lights in the
+        scene, position and direction, whose shadows are then marched whatever the method; and by the reflectance of
+        diffuse surfaces. Other parameters with gradients are refused.
+
+        Does not support: media other than ``nrf``; spectral and polarised variants; derivatives by the fields and by
+        environments that turn; ``timed_sunsky``; environments whose `to_world` shears or, among surfaces, scales.
+        """
+
+        def __init__(self, props):
+            read = properties.Reader(props, "nrf integrator", properties.INTEGRATOR)
+            # Kept here: Mitsuba's own clock would count from the construction of the plugin.
+            self.timeout = read.number("timeout", -1.0)
+            self.visibility = read.choice("visibility", "auto", METHODS)
+            self.map_source = read.choice("map_source", "field", ("field", "network"))
+            self.samples = read.whole("samples", 384, 8, 8192)
+            self.light_samples = read.whole("light_samples", 0, 0, 65536)
+            self.environment_lights = read.whole("environment_lights", 512, 1, 65536)
+            self.map_resolution = read.whole("map_resolution", 192, 4, 4096)
+            self.map_components = read.whole("map_components", 1, 1, 2)
+            self.map_memory = read.number("map_memory", 1024.0, 0.0, 2.0**24)
+            self.map_file = read.text("map_file", "")
+            self.max_depth = read.whole("max_depth", 2, -1, 1 << 20)
+            self.bounces = read.choice("bounces", "auto", ("auto", "paths", "radiosity"))
+            self.aovs = aovs.parse(read.text("aovs", ""))
+            read.flag("hide_emitters", False)
+            self.lights_seen = 0
+            self.patches = None  # of the fields rendered last, by radiosity
+            props["timeout"] = -1.0
+            mi.SamplingIntegrator.__init__(self, props)
+
+        def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+            sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            try:
+                return _render(self, scene, sensor, seed, spp, develop)
+            except RuntimeError as error:
+                raise root(error) from None
+
+        def aov_names(self):
+            """Of the last render: a layer for each light is known from then on."""
+            known = [name for name in self.aovs if name not in aovs.OF_LIGHTS or self.lights_seen]
+            return aovs.channel_names(tuple(known), self.lights_seen)
+
+        def to_string(self):
+            return (
+                f"NRFIntegrator[\n  visibility = {self.visibility},\n  samples = {self.samples},\n"
+                f"  light_samples = {self.light_samples},\n  environment_lights = {self.environment_lights},\n"
+                f"  map_resolution = {self.map_resolution},\n  map_source = {self.map_source},\n"
+                f"  map_components = {self.map_components},\n  map_memory = {self.map_memory},\n"
+                f"  map_file = {self.map_file},\n"
+                f"  max_depth = {self.max_depth},\n  bounces = {self.bounces},\n  aovs = {', '.join(self.aovs)},\n"
+                f"  hide_emitters = {self.hide_emitters},\n  timeout = {self.timeout}\n]"
+            )
+
+    return NRFIntegrator
+
+
+def _render(self, scene, sensor, seed: int, spp: int, develop: bool):
+    """Camera rays in chunks of pixels → radiance and opacity → film."""
+    if dr.flag(dr.JitFlag.FreezingScope):
+        raise MiNtfError(
+            "nrf integrator: dr.freeze cannot record a render whose number of shading points is known only while it "
+            "runs; call mi.render outside of frozen functions (its kernels are cached all the same)"
+        )
+    start = time.monotonic()
+    camera = Camera(sensor, spp)
+    film = camera.film
+    composition = Composition(scene, self, sensor, camera.spp)
+    picture = None
+    if self.aovs:
+        self.lights_seen = len(composition.lights.rows.power)
+        picture = aovs.Picture(camera, self.aovs, self.lights_seen)
+    film.prepare(picture.names if picture else [])
+    block = film.create_block()
+    block.set_offset(film.crop_offset())
+    pixels = Reconstruction(block, camera)
+    # Lights in runs whose maps fit into memory, and for each the same camera rays.
+    chunks = range(0, camera.count, max(1, CHUNK // camera.spp))
+    for run, first in itertools.product(range(len(composition.runs)), chunks):
+        if self.should_stop() or (self.timeout > 0 and time.monotonic() - start > self.timeout):
+            _stop(pixels, run, first, len(composition.runs))
+            break
+        composition.select(run)
+        count = min(chunks.step, camera.count - first)
+        # Another stream for each chunk and seed; opaque, so that no seed is compiled into a kernel.
+        stream = mi.sample_tea_32(_opaque(seed), dr.opaque(mi.UInt32, first))[0]
+        ray, weight, position = camera.rays(first, count, stream)
+        sums = picture and picture.sums(dr.width(ray), run, composition.runs[run])
+        with composition.lights.bare():
+            radiance, opacity = composition.trace(ray, camera.quadrature(count), stream, sums)
+        alpha = [opacity] if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else []
+        once = [*alpha, dr.ones(mi.Float, dr.width(ray))]
+        pixels.add(first, position, [*(radiance * weight), *([None] * len(once) if run else once)])
+        if sums:
+            picture.put(first, position, sums)
+    if picture:
+        picture.write_to(block)
+    film.put_block(block)
+    if not develop:
+        return mi.TensorXf()
+    image = film.develop()
+    return image + _no_slope(scene) if composition.effects.gradients and not dr.grad_enabled(image) else image
+
+
+def _no_slope(scene):
+    """0, attached to every attached parameter of `scene`: of a picture in which none of them shows, derivatives are 0;
+    Dr.Jit would take a detached one for a mistake of the caller."""
+    attached = [value for _, value in mi.traverse(scene) if dr.grad_enabled(value)]
+    zero = dr.opaque(mi.Float, 0)  # a literal one would detach
+    return sum((zero * dr.sum(dr.ravel(getattr(value, "matrix", value))) for value in attached), zero)
+
+
+def _stop(pixels: Reconstruction, run: int, first: int, runs: int) -> None:
+    """Rendering ends before source pixel `first` of `run`: pixels that not all runs of lights have reached stay
+    empty."""
+    last = run == runs - 1
+    if runs > 1:
+        pixels.keep(first if last else 0)
+    mi.Log(
+        mi.LogLevel.Warn,
+        f"nrf integrator: stopped after {first if last else 0} of {pixels.camera.count} pixels"
+        + ("" if last else f", in run {run + 1} of {runs} of the lights: more map_memory needs fewer runs"),
+    )
+
+
+def _opaque(seed):
+    """A seed, Python number (from Python) or array (from the stock program), as a value that no kernel contains."""
+    value = mi.UInt32(seed)
+    dr.make_opaque(value)
+    return value

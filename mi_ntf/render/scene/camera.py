@@ -1,0 +1,164 @@
+"""From a sensor's samples to its film: camera rays a chunk of pixels at a time, and pixels that sum their samples."""
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+
+from ...core.errors import MiNtfError
+
+LATTICE = 3242174889, 2447445414
+"""2³² over ρ and ρ², ρ³ = ρ + 1: steps of a sequence that fills a square evenly however many of its points are taken
+(Roberts 2018, the R₂ sequence)."""
+CHANNELS = 8
+"""Channels that one kernel sums: each is a register of its loop."""
+
+
+class Camera:
+    """The samples of one render: `count` source pixels, those of the film's border included if it is sampled, `spp`
+    samples each.
+
+    spp  samples a pixel; 0: the sampler's own number, which samplers that need a square or a power of two round up
+    """
+
+    def __init__(self, sensor, spp: int):
+        self.sensor, self.film = sensor, sensor.film()
+        self.sampler = sensor.sampler().clone()
+        if spp:
+            self.sampler.set_sample_count(spp)
+        self.spp = self.sampler.sample_count()
+        if self.spp < 1:  # Mitsuba's samplers divide by it
+            raise MiNtfError("nrf integrator: the sampler's sample_count is 0, expected 1 or more samples a pixel")
+        self.sampler.set_samples_per_wavefront(self.spp)
+        self.border = self.film.rfilter().border_size() if self.film.sample_border() else 0
+        width, height = (int(n) + 2 * self.border for n in self.film.crop_size())
+        self.width, self.count = width, width * height
+
+    def rays(self, first: int, count: int, stream):
+        """Rays of `count` source pixels from `first` on, `spp` consecutive ones each: ``(ray, weight, position)``,
+        `position` on the film. `stream`: opaque seed."""
+        n = count * self.spp
+        self.sampler.seed(stream, n)
+        pixel = dr.arange(mi.UInt32, n) // dr.opaque(mi.UInt32, self.spp) + dr.opaque(mi.UInt32, first)
+        y = pixel // dr.opaque(mi.UInt32, self.width)
+        corner = mi.Vector2f(mi.Float(pixel - y * self.width), mi.Float(y)) - self.border
+        inside = corner + self.sampler.next_2d()
+        aperture = self.sampler.next_2d() if self.sensor.needs_aperture_sample() else mi.Point2f(0.5)
+        moment = mi.Float(self.sensor.shutter_open())
+        if self.sensor.shutter_open_time() > 0:
+            moment += self.sampler.next_1d() * self.sensor.shutter_open_time()
+        scaled = mi.Point2f(inside / mi.Vector2f(self.film.crop_size()))
+        # The one of Mitsuba's two calls that every sensor answers.
+        ray, weight = self.sensor.sample_ray_differential(moment, 0.0, scaled, aperture)
+        ray = mi.Ray3f(ray)
+        if dr.width(ray) < n:  # a sensor whose rays are all the same
+            ray = dr.gather(mi.Ray3f, ray, dr.zeros(mi.UInt32, n))
+        return ray, weight, inside + mi.Vector2f(self.film.crop_offset())
+
+    def quadrature(self, count: int):
+        """Two numbers in [0, 1) for each ray of the last :meth:`rays`, those of `count` source pixels: uniform ones,
+        and evenly spread over the samples of a pixel, whatever the sampler, which gives the first sample's. Where in
+        its skin a ray's samples lie decides half of their light."""
+        spp = dr.opaque(mi.UInt32, self.spp)
+        index = dr.arange(mi.UInt32, count * self.spp)
+        first = index // spp * spp
+        numbers = []
+        for step in LATTICE:
+            start = mi.UInt32(dr.gather(mi.Float, self.sampler.next_1d(), first) * 2**24) << 8
+            # Integers wrap around; the upper 24 bits are a float's.
+            numbers.append(mi.Float((start + (index - first) * step) >> 8) * 2**-24)
+        return tuple(numbers)
+
+
+class Reconstruction:
+    """The pixels of an image block, each the sum of the samples around it by the film's reconstruction filter.
+
+    Mitsuba's ``ImageBlock.put`` adds every sample to its pixels atomically, in whatever order threads come along, and
+    float32 sums differ in their last bits from run to run. Here pixels fetch their samples, in one order: same seed,
+    same bits.
+    """
+
+    def __init__(self, block, camera: Camera):
+        self.block, self.camera = block, camera
+        self._filter = camera.film.rfilter()
+        # Source pixels on each side whose samples may count.
+        self._reach = 0 if self._filter.is_box_filter() else math.ceil(self._filter.radius() - 0.5)
+
+    def add(self, first: int, position, values: list) -> None:
+        """Add samples as :meth:`Camera.rays` orders them, from source pixel `first` on: at each film `position` one of
+        `values` a channel; None adds nothing to its channel."""
+        camera, reach = self.camera, self._reach
+        height, width, channels = self.block.tensor().shape
+        last = first + dr.width(position) // camera.spp
+        # Source rows lie `border` above the block's.
+        top = max(first // camera.width - camera.border - reach, 0)
+        bottom = min((last - 1) // camera.width - camera.border + reach + 1, height)
+        dr.eval(position, values)
+        if bottom <= top:
+            return
+        pixel = dr.arange(mi.UInt32, (bottom - top) * width) + dr.opaque(mi.UInt32, top * width)
+        present = [c for c, value in enumerate(values) if value is not None]
+        for k in range(0, len(present), CHANNELS):
+            group = present[k : k + CHANNELS]
+            sums = self._sums(pixel, width, first, last, position, [mi.Float(values[c]) for c in group])
+            for c, value in zip(group, sums, strict=True):
+                dr.scatter_reduce(
+                    dr.ReduceOp.Add, self.block.tensor().array, value, pixel * channels + c,
+                    mode=dr.ReduceMode.NoConflicts,
+                )  # fmt: skip
+        dr.eval(self.block.tensor())
+
+    def _sums(self, pixel, width: int, first: int, last: int, position, values: list) -> list:
+        """Of the samples around the block's pixels `pixel`, each of `values` by the filter's weights. What rounding
+        takes off a sum is added with the next sample (Kahan): 10⁶ samples would lose five of float32's seven digits."""
+        spp, columns, count = (dr.opaque(mi.UInt32, n) for n in (self.camera.spp, self.camera.width, last - first))
+        begin = dr.opaque(mi.UInt32, first)
+        y = pixel // dr.opaque(mi.UInt32, width)
+        x = pixel - y * dr.opaque(mi.UInt32, width)
+        centre = mi.Point2f(mi.Float(x), mi.Float(y)) + 0.5 + mi.Vector2f(self.block.offset())
+        side = dr.opaque(mi.UInt32, 2 * self._reach + 1)
+        # Wraps around below 0, which is then no column and no source pixel.
+        shift = dr.opaque(mi.UInt32, (self.camera.border - self._reach) % 2**32)
+        one = mi.Float(1)
+
+        def body(i, j, k, sums, lost):
+            column = x + shift + i
+            source = (y + shift + j) * columns + column - begin
+            active = (column < columns) & (source < count)
+            index = source * spp + k
+            weight = one
+            if self._reach:
+                place = dr.gather(type(position), position, index, active)
+                weight = self._filter.eval(place.x - centre.x) * self._filter.eval(place.y - centre.y)
+            more = [weight * dr.gather(mi.Float, v, index, active) + r for v, r in zip(values, lost, strict=True)]
+            before = dr.detach(sums)
+            sums = [s + m for s, m in zip(sums, more, strict=True)]
+            lost = [dr.detach(m - (s - b)) for m, s, b in zip(more, sums, before, strict=True)]
+            k = k + 1
+            i = dr.select(k == spp, i + 1, i)
+            k = dr.select(k == spp, 0, k)
+            j = dr.select(i == side, j + 1, j)
+            return dr.select(i == side, 0, i), j, k, sums, lost
+
+        n = dr.width(pixel)
+        zeros = [dr.zeros(mi.UInt32, n) for _ in range(3)]
+        return dr.while_loop(
+            state=(*zeros, *([dr.zeros(mi.Float, n) for _ in values] for _ in range(2))),
+            cond=lambda i, j, k, sums, lost: j < side,
+            body=body,
+            label="reconstruction",
+            max_iterations=-1 if dr.grad_enabled(values) else None,  # a sum
+        )[3]
+
+    def keep(self, done: int) -> None:
+        """Set to 0 the pixels that samples of source pixels from `done` on would reach."""
+        tensor, reach, border = self.block.tensor(), self._reach, self.camera.border
+        height, width, channels = tensor.shape
+        entry = dr.arange(mi.UInt32, height * width * channels)
+        pixel = entry // channels
+        y = pixel // width
+        x = pixel - y * width
+        size = self.camera.count // self.camera.width
+        last = dr.minimum(y + border + reach, size - 1) * self.camera.width
+        last += dr.minimum(x + border + reach, self.camera.width - 1)
+        dr.scatter(tensor.array, mi.Float(0), entry, last >= done)

@@ -1,0 +1,153 @@
+"""What a scene calls for: one look at it, a frozen description, and everything after it branches on that."""
+
+from dataclasses import dataclass
+
+import mitsuba as mi
+import numpy as np
+
+from ...core.errors import MiNtfError
+from ..cost import model
+from . import gradient_checks
+from .media import ordinary_shapes
+
+PINHOLES = ("PerspectiveCamera",)
+"""Cameras whose rays all pass one point: light from there goes the way of the view."""
+MIN_GLOSS = 0.01
+"""Specular lobes that stay below this share of a white diffuse surface (:class:`mi_ntf.infer.grid.GridField`, `gloss`)
+are left out."""
+NEAR = 1e-3
+"""A light counts as at the camera within this share of the distance to the nearest field's sphere."""
+
+
+@dataclass(frozen=True)
+class Effects:
+    """What takes part in a render; what does not is neither traced into a kernel nor built.
+
+    emitters    their kinds
+    lit         a light has power, and `max_depth` lets it scatter
+    background  the environment is seen directly
+    exhaustive  every light at every shading point, rather than random ones
+    visibility  the method that runs, never ``auto``; `reason`: why that one
+    collocated  all light comes from the camera: the view transmittance is the light's too
+    in_view     of each medium, whether the camera may see matter of it
+    surfaces    there are shapes other than the media's bounds
+    specular    a field has a specular lobe
+    fresnel     one whose weight grows towards grazing angles
+    bounces     how light that scatters more than once is found, ``paths`` or ``radiosity``; "": it is not looked for
+    gradients   a scene parameter is attached
+    """
+
+    emitters: tuple[str, ...]
+    lit: bool
+    background: bool
+    exhaustive: bool
+    visibility: str
+    reason: str
+    collocated: bool
+    in_view: tuple[bool, ...]
+    surfaces: bool
+    specular: bool
+    fresnel: bool
+    bounces: str
+    gradients: bool
+
+    @property
+    def needs_visibility(self) -> bool:
+        """Whether a visibility method has to be built."""
+        return self.lit and (not self.collocated or self.surfaces or self.bounces)
+
+
+def describe(scene, integrator, sensor, spp: int, media: list, light) -> Effects:
+    """The effects of rendering `scene`, with its `media` and `light`
+    (:class:`mi_ntf.render.lights.scene_lights.Lights`), by an ``nrf`` integrator with `spp` camera rays a pixel."""
+    depth = integrator.max_depth
+    lit = bool(light.rows.power.size or light.sampled) and not 0 <= depth < 2
+    exhaustive = integrator.light_samples == 0
+    gradients = gradient_checks.check(scene, light)
+    # Derivatives by a light's place need the light's own transmittance.
+    collocated = lit and not gradients and integrator.visibility != "none" and _at_camera(light, sensor, media)
+    surfaces = len(ordinary_shapes(scene)) > 0
+    width, height = sensor.film().crop_size()
+    method, reason = _method(integrator, width * height * spp, exhaustive, media)
+    if collocated:
+        reason += "; not needed where the camera's own transmittance is the light's"
+    rims = [m.field.header.architecture.fresnel for m in media]
+    return Effects(
+        emitters=tuple(light.kinds),
+        lit=lit,
+        background=scene.environment() is not None and not integrator.hide_emitters and depth != 0,
+        exhaustive=exhaustive,
+        visibility=method,
+        reason=reason,
+        collocated=collocated,
+        in_view=_in_view(sensor, media),
+        surfaces=surfaces,
+        specular=any(rims) or any(m.field.grid.gloss > MIN_GLOSS for m in media),
+        fresnel=any(rims),
+        bounces=_bounces(integrator.bounces, media, method, surfaces, gradients) if lit and not 0 <= depth <= 2 else "",
+        gradients=gradients,
+    )
+
+
+SOLID = 0.5
+"""Fields with fewer opaque skins than this share are smoke, whose bounces radiosity does not know."""
+
+
+def _bounces(name: str, media: list, method: str, surfaces: bool, gradients: bool) -> str:
+    """How further bounces are found: `name`, or the fast way where it knows all that takes part."""
+    unknown = [what for what, there in (
+        ("surfaces", surfaces), ("derivatives", gradients), ("visibility=none", method == "none"),
+        ("smoke", any(m.field.softness.solid < SOLID for m in media if m.field.grid.majorant > 0))) if there]
+    if name == "radiosity" and unknown:
+        raise MiNtfError(
+            f"nrf integrator: bounces=radiosity is light between the opaque skins of fields, but here are "
+            f"{' and '.join(unknown)}; choose bounces=paths"
+        )
+    return name if name != "auto" else "paths" if unknown else "radiosity"
+
+
+def _method(integrator, rays: int, exhaustive: bool, media: list) -> tuple[str, str]:
+    """The visibility method that runs, and why."""
+    method, reason = integrator.visibility, "chosen by name"
+    if method in ("transmittance_map", "transmittance_volume") and not exhaustive:
+        raise MiNtfError(
+            f"light_samples is {integrator.light_samples}, but visibility={method} holds one map or volume for every "
+            "light and sums all of them; remove light_samples or choose raymarch or neural_transmittance"
+        )
+    if method == "auto":
+        if not exhaustive:
+            return "raymarch", "random lights have no maps"
+        return model.choose(model.work(integrator, media[0], method, rays))
+    return method, reason
+
+
+def _at_camera(light, sensor, media) -> bool:
+    """Whether all lights are points at the pinhole of the camera."""
+    if light.sampled or sensor.class_name() not in PINHOLES or not light.rows.is_point.all():
+        return False
+    eye = _eye(sensor)
+    to_field = min(abs(np.linalg.norm(m.frame.origin - eye) - m.frame.length) for m in media)
+    return bool((np.linalg.norm(light.rows.where - eye, axis=1) <= NEAR * to_field).all())
+
+
+def _in_view(sensor, media) -> tuple[bool, ...]:
+    """Of each medium, whether its sphere reaches into the pinhole camera's pyramid and holds matter."""
+    held = [m.field.grid.majorant > 0 for m in media]
+    if sensor.class_name() not in PINHOLES:
+        return tuple(held)
+    film = sensor.film()
+    margin = film.rfilter().radius() + 1 if film.sample_border() else 0
+    (u0, u1), (v0, v1) = ((-margin / n, 1 + margin / n) for n in film.crop_size())
+    rays, _ = sensor.sample_ray(0.0, 0.0, mi.Point2f([u0, u1, u1, u0], [v0, v0, v1, v1]), mi.Point2f(0.5))
+    corners = np.array(rays.d, np.float64).T
+    sides = np.cross(corners, np.roll(corners, -1, axis=0))
+    sides *= np.sign(sides @ corners.sum(0))[:, None] / np.linalg.norm(sides, axis=1, keepdims=True)
+    eye = _eye(sensor)
+    return tuple(
+        h and bool((sides @ (m.frame.origin - eye) > -m.frame.length).all()) for h, m in zip(held, media, strict=True)
+    )
+
+
+def _eye(sensor) -> np.ndarray:
+    """Where the pinhole of a camera is."""
+    return np.array(sensor.world_transform().translation(), np.float64).ravel()

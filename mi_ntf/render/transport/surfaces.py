@@ -1,0 +1,81 @@
+"""Ordinary shapes around the fields: what hides them, what shades them, and how they reflect the scene's light."""
+
+import drjit as dr
+import mitsuba as mi
+
+from ..lights import environment
+
+
+class Surfaces:
+    """The ordinary shapes of `scene`, without the fields' bounding shapes.
+
+    shapes         those shapes
+    hide_emitters  whether shapes that shine are left out of what the camera sees
+    transmittance  callable ``(p, d, distance, active)``: what the fields let through, scene coordinates
+
+    Direct light as stock ``path`` estimates it: emitter and BSDF sampling, weighted by the power heuristic (Veach
+    1997), each dimmed by the fields on its way.
+    """
+
+    def __init__(self, scene, shapes: list, hide_emitters: bool, transmittance):
+        environment.check_unscaled(scene.environment())
+        self.scene, self.transmittance = scene, transmittance
+        self._all = _scene_of(shapes)
+        seen = [s for s in shapes if not (hide_emitters and s.is_emitter())]
+        self._seen = self._all if len(seen) == len(shapes) else _scene_of(seen)
+        self.shining = any(s.is_emitter() for s in seen)
+        deltas = (mi.has_flag(e.flags(), mi.EmitterFlags.Delta) for e in scene.emitters())
+        self.lights_can_be_hit = not all(deltas)
+
+    def first(self, ray):
+        """The camera rays' intersection, a PreliminaryIntersection3f."""
+        return self._seen.ray_intersect_preliminary(ray, coherent=True)
+
+    def intersect(self, ray):
+        """The next intersection of rays on their way through the scene, a SurfaceInteraction3f."""
+        return self._all.ray_intersect(ray)
+
+    def blocked(self, p, d, distance, active):
+        """Whether a shape lies between `p` and the light at `distance` along `d`."""
+        far = dr.detach(distance) * (1 - mi.math.ShadowEpsilon)
+        return self._all.ray_test(mi.Ray3f(dr.detach(p), dr.detach(d), far, 0.0, []), active)
+
+    def direct(self, si, rng, active):
+        """Reflected radiance of one emitter sample."""
+        bsdf = si.bsdf()
+        active = active & (mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth))
+        u = mi.Point2f(rng.next_float32(), rng.next_float32())
+        ds, weight = self.scene.sample_emitter_direction(si, u, False, active)
+        active = active & (ds.pdf > 0)
+        value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active)
+        active = active & ((dr.max(value) > 0) & ~self._all.ray_test(si.spawn_ray_to(ds.p), active))
+        value = value * weight * dr.select(ds.delta, 1, _power(ds.pdf, pdf))
+        return dr.select(active, value * self.transmittance(si.p, ds.d, ds.dist, active), 0)
+
+    def scatter(self, si, rng, active):
+        """``(ray, weight, pdf)`` of a BSDF sample; pdf is −1 for specular reflection and refraction."""
+        u = mi.Point2f(rng.next_float32(), rng.next_float32())
+        sample, weight = si.bsdf().sample(mi.BSDFContext(), si, rng.next_float32(), u, active)
+        pdf = dr.select(mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta), -1, sample.pdf)
+        return si.spawn_ray(si.to_world(sample.wo)), dr.select(active, weight, 0), pdf
+
+    def emission(self, si, ray, pdf, active):
+        """Radiance along BSDF-sampled rays from the emitter that they reach at `si`; `pdf` is that of the sample."""
+        emitter = si.emitter(self.scene)
+        start = dr.zeros(mi.Interaction3f, dr.width(ray.o))
+        start.p = ray.o
+        ds = mi.DirectionSample3f(self.scene, si, start)
+        other = self.scene.pdf_emitter_direction(start, ds, active & (pdf > 0))
+        value = emitter.eval(si, active) * dr.select(pdf < 0, 1, _power(pdf, other))
+        active = active & (dr.max(value) > 0)
+        return dr.select(active, value * self.transmittance(ray.o, ray.d, si.t, active), 0)
+
+
+def _scene_of(shapes: list):
+    """A scene of these very shapes alone."""
+    return mi.load_dict({"type": "scene", **{f"shape_{i}": s for i, s in enumerate(shapes)}}, optimize=False)
+
+
+def _power(a, b):
+    """Weight of a sample of density `a` beside another technique of density `b`."""
+    return dr.select(a > 0, a * a / (a * a + b * b), 0)
