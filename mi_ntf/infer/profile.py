@@ -1,5 +1,7 @@
 """The march that describes a ray: where, seen from the light, its optical depth passes given levels."""
 
+from types import ModuleType
+
 import drjit as dr
 
 from ..core import spheres
@@ -13,6 +15,11 @@ FOR_NETWORKS = 0.93
 skipped."""
 FOR_MAPS = 0.97
 """The same for maps of one logistic that are fitted to the march; those of two take half of it."""
+
+
+def of(medium, step: float, dj: ModuleType) -> "DepthProfile":
+    """The march through `medium` in steps of `step`, field units."""
+    return DepthProfile(medium.source.density, medium.field.grid, dr.opaque(dj.Float, step))
 
 
 class DepthProfile:

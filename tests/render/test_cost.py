@@ -10,7 +10,8 @@ from helpers.variants import VARIANT
 
 import mi_ntf.render
 from mi_ntf.core.errors import MiNtfError
-from mi_ntf.infer.visibility import METHODS
+from mi_ntf.infer.visibility import REGISTRY
+from mi_ntf.infer.visibility.raymarch import light_steps
 from mi_ntf.render.commands import calibration
 from mi_ntf.render.cost import model
 
@@ -27,7 +28,7 @@ def cache(variant, monkeypatch, tmp_path):
 
 
 def test_break_even_by_hand():
-    march = model.light_steps(384) * 1.6
+    march = light_steps(384) * 1.6
     assert model.break_even(WORK, KNOT) == pytest.approx(0.785398 * 16384 * 576 / (0.5 * (march - 4.5)))
     # Four times the texels, four times the points; any number of lights.
     assert model.break_even(replace(WORK, texels=256**2), KNOT) == pytest.approx(4 * model.break_even(WORK, KNOT))
@@ -42,8 +43,8 @@ def test_volumes_hold_one_and_a_half_entries_a_sample():
 
 def test_steps_of_a_light_march():
     """Steps of a quarter of 1/192, growing by a fifth of the distance, at last 1/80 long: counted for 384 samples."""
-    assert model.light_steps(384) == 93
-    assert model.light_steps(96) < model.light_steps(384) < model.light_steps(1536)
+    assert light_steps(384) == 93
+    assert light_steps(96) < light_steps(384) < light_steps(1536)
 
 
 def test_auto_changes_sides_at_the_break_even():
@@ -73,7 +74,7 @@ def test_the_chosen_method_is_the_cheaper_one():
     assert march == pytest.approx(tmap, rel=1e-6)
 
 
-@pytest.mark.parametrize("method", [m for m in METHODS if m != "auto"])
+@pytest.mark.parametrize("method", list(REGISTRY))
 def test_every_method_has_a_price(method):
     stages = model.seconds(replace(WORK, method=method), model.Constants())
     assert min(stages.values()) >= 0 and stages["lights"] > 0

@@ -7,13 +7,15 @@ units, infinite for directional lights; `index` the light's row in the table. `a
 unused. Construction does the work that depends on the lights alone.
 """
 
-METHODS = (
-    "raymarch",
-    "transmittance_volume",
-    "neural_transmittance",
-    "transmittance_map",
-    "visibility_mlp",
-    "none",
-    "auto",
-)
-"""Every name that users may type."""
+from . import neural_transmittance, none, raymarch, transmittance_map, transmittance_volume, visibility_mlp
+
+REGISTRY = {
+    module.METHOD.name: module.METHOD
+    for module in (raymarch, transmittance_volume, neural_transmittance, transmittance_map, visibility_mlp, none)
+}
+"""Name → :class:`mi_ntf.infer.visibility.method.Method`. What is not in here does not exist."""
+
+
+def names() -> tuple[str, ...]:
+    """Every name that users may type."""
+    return (*REGISTRY, "auto")

@@ -4,7 +4,8 @@
 import drjit as dr
 
 from ...core import mixture, spheres
-from .. import ops
+from .. import ops, profile
+from .method import Method, Options
 
 
 class NeuralTransmittance:
@@ -26,3 +27,17 @@ class NeuralTransmittance:
         beyond = mixture.optical_depth(ops, dr.select(inside, light, t), mix)
         depth = dr.select(inside, dr.maximum(depth - beyond, 0), dr.maximum(depth, 0))
         return dr.select(hit & (light > -h), dr.exp(-depth), 1)
+
+
+def build(medium, table, options: Options, dj, keep) -> NeuralTransmittance:
+    """See :class:`mi_ntf.infer.visibility.method.Method`."""
+    return NeuralTransmittance(medium.field.network, profile.of(medium, options.step * profile.FOR_NETWORKS, dj))
+
+
+METHOD = Method(
+    name="neural_transmittance",
+    summary="one query of the ray network per point and light",
+    build=build,
+    pair=lambda work, prices: prices.ray,
+    prices={"ray": 600.0},
+)

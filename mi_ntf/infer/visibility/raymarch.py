@@ -5,6 +5,7 @@ import drjit as dr
 from ...core import spheres
 from .. import ops
 from ..bundle import clear_distance, density_where, safe_inverse
+from .method import Method, Options, queries
 
 MAX_OPTICAL_DEPTH = 12.0
 """Light rays end here, and count as blocked: a lamp that shines through at τ = 6e-6 would light what is outside an
@@ -75,3 +76,30 @@ def optical_depth(density, grid, x, d, length, steps, active):
         label="light march",
         max_iterations=-1 if attached else None,  # a sum
     )[1]
+
+
+def light_steps(samples: int) -> int:
+    """Steps of a light's march from a point over the mean chord, 1 unit-sphere radius."""
+    shortest, longest, growth = default_steps(2 / samples)
+    t, count = 0.0, 0
+    while t < 1:
+        t += min(max(growth * t, shortest), longest)
+        count += 1
+    return count
+
+
+def build(medium, table, options: Options, dj, keep) -> RayMarch:
+    """See :class:`mi_ntf.infer.visibility.method.Method`."""
+    steps = default_steps(options.step, gradients=table is not None and table.moving)
+    return RayMarch(medium.source.density, medium.field.grid, tuple(dr.opaque(dj.Float, s) for s in steps))
+
+
+METHOD = Method(
+    name="raymarch",
+    summary="one march through the field per point and light: the reference",
+    build=build,
+    pair=lambda work, prices: light_steps(work.samples) * (prices.march + queries(work, prices)),
+    prices={"march": 2.0},
+    derivatives=True,
+    automatic=True,
+)

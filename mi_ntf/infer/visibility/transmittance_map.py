@@ -13,9 +13,12 @@ from types import ModuleType
 import drjit as dr
 import numpy as np
 
+from .. import profile
 from ..lights import LightTable
+from . import map_source
 from .light_rays import LightRays
 from .map_source import Source
+from .method import FILLED, Method, Options, queries
 
 SAME, APART = 1.0, 2.0
 """Texels by which the centres of four neighbouring rays may differ to count as one surface, and as two. On `statue`,
@@ -94,3 +97,56 @@ def _shifts(mixtures, weights, size):
     top, low = (f(f(centres[0], centres[1]), f(centres[2], centres[3])) for f in (dr.maximum, dr.minimum))
     share = dr.clip((APART - (top - low) / size) * (1 / (APART - SAME)), 0, 1)
     return [share * (c - mean) for c in centres]
+
+
+def width(medium, table, options: Options) -> int:
+    """float32 numbers a texel."""
+    if options.map_source == "field":
+        return channels(options.map_components)
+    components = medium.field.network.components
+    return channels(components, components > 1 or _inside(table))
+
+
+def _inside(table) -> bool:
+    """Whether some light lies inside the sphere."""
+    return bool((table.is_point & (np.linalg.norm(table.where, axis=1) < 1)).any())
+
+
+def build(medium, table, options: Options, dj, keep) -> TransmittanceMap:
+    """See :class:`mi_ntf.infer.visibility.method.Method`."""
+    network = options.map_source == "network"
+    # Two logistics follow a ray closely enough for the march's own error to show.
+    step = options.step * (profile.FOR_NETWORKS if network else profile.FOR_MAPS / options.map_components)
+    reader = profile.of(medium, step, dj)
+    if network:
+        source = map_source.network_source(medium.field.network, reader, _inside(table))
+    else:
+        source = map_source.field_source(medium.source, reader, options.map_components)
+
+    def make(values=None):
+        values = None if values is None else dj.Float(values)
+        return TransmittanceMap(table, options.map_resolution, medium.field.grid.hull, source, dj, values)
+
+    return keep(width(medium, table, options), step, make)
+
+
+def per_ray(work, prices) -> float:
+    """ns of one ray of a map: q of research/transmittance.md, section 5."""
+    if work.source == "network":
+        return prices.ray
+    return work.samples * (prices.texel + queries(work, prices))
+
+
+METHOD = Method(
+    name="transmittance_map",
+    summary="per light, a table of the logistics of its rays",
+    build=build,
+    pair=lambda work, prices: prices.lookup * work.components,
+    prices={"lookup": 5.0, "texel": 1.0},
+    making=lambda work, prices: FILLED * work.texels * per_ray(work, prices),
+    numbers=width,
+    dials=("map_resolution", "map_source", "map_components", "map_memory", "map_file"),
+    drawn="raymarch",
+    automatic=True,
+    trial=(128, 256),  # maps of so many lights fit no cache, and neither do a scene's
+)

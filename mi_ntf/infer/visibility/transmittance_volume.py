@@ -1,6 +1,7 @@
 """``transmittance_volume``: per light, τ tabulated along the rays of its map, m × m × n (NRF, Bi et al. 2020, after
 deep shadow maps, Lokovic and Veach 2000)."""
 
+import math
 from types import ModuleType
 
 import drjit as dr
@@ -11,6 +12,7 @@ from ...core.errors import MiNtfError
 from .. import ops
 from ..lights import LightTable
 from .light_rays import LightRays
+from .method import FILLED, Method, Options, queries
 
 ENTRIES = 1.5
 """Entries of a ray for each cell of the camera's march: τ is linear between them, and skins are as thin."""
@@ -74,3 +76,29 @@ class TransmittanceVolume:
         zero = dr.zeros(self.dj.Float, dr.width(texel))
         state = (dr.zeros(self.dj.UInt32, dr.width(texel)), zero, hit & (self._n > 0))
         dr.while_loop(state=state, cond=lambda j, depth, active: active, body=body, label="transmittance volume")
+
+
+def depths(options: Options) -> int:
+    """Entries of a ray."""
+    return math.ceil(ENTRIES * 2 / options.step)
+
+
+def build(medium, table, options: Options, dj, keep) -> TransmittanceVolume:
+    """See :class:`mi_ntf.infer.visibility.method.Method`."""
+    hull, density = medium.field.grid.hull, medium.source.density
+    return TransmittanceVolume(table, options.map_resolution, depths(options), hull, density, dj)
+
+
+METHOD = Method(
+    name="transmittance_volume",
+    summary="per light, τ tabulated along the rays of its map",
+    build=build,
+    pair=lambda work, prices: prices.fetch,
+    prices={"fetch": 15.0, "cell": 2.0},
+    making=lambda work, prices: (
+        FILLED * work.texels * ENTRIES * work.samples * (prices.cell + queries(work, prices))),
+    numbers=lambda medium, table, options: depths(options),
+    dials=("map_resolution", "map_memory"),
+    drawn="raymarch",
+    trial=(52, 4),
+)

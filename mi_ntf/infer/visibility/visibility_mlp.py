@@ -7,6 +7,7 @@ from ...core import spheres
 from ...core.architecture import NO_VISIBILITY
 from ...core.errors import MiNtfError
 from .. import ops
+from .method import Method, Options
 
 SHORT = 1e-5
 """Ways through less of the sphere pass nothing: of a light or a point on it, rounding decides on which side it is."""
@@ -33,3 +34,18 @@ class VisibilityMLP:
         way = dr.minimum(here + distance, h) - t
         tau = self.field.visibility(tuple(a + t * b for a, b in zip(m, wi, strict=True)), wi)
         return dr.select(hit & (way > SHORT), tau, 1)
+
+
+def build(medium, table, options: Options, dj, keep) -> VisibilityMLP:
+    """See :class:`mi_ntf.infer.visibility.method.Method`."""
+    return VisibilityMLP(medium.field.network)
+
+
+METHOD = Method(
+    name="visibility_mlp",
+    summary="one query of a network of a point and a direction per point and light: the baseline",
+    build=build,
+    pair=lambda work, prices: prices.mlp,
+    prices={"mlp": 1500.0},
+    needs=lambda medium: medium.field.header.architecture.visibility is not None,
+)

@@ -3,6 +3,7 @@
 import statistics
 import time
 from collections.abc import Callable
+from dataclasses import asdict
 from typing import Any
 
 import drjit as dr
@@ -13,57 +14,61 @@ from ...core import radiosity
 from ...infer import march, shade
 from ...infer.bundle import Strand
 from ...infer.lights import LightTable
-from ...infer.visibility.transmittance_volume import ENTRIES
+from ...infer.visibility import REGISTRY
+from ...infer.visibility.method import Options
 from ..cost import model
 from ..maps import building
 from ..transport import bounced
 
 SAMPLES = 384
 WIDTH = 1 << 15
-MAP = 128
 FEW = 4
 MANY = 256
-"""Lights of the lookups: their maps fit no cache, and neither do a scene's."""
-VOLUME = 52
-"""Rays along a volume's side: fewer, since each has more than an entry for each sample."""
 
 
 def calibrate(medium) -> model.Constants:
     """Constants of this machine, by `medium`'s field; kept in the cache. Takes some seconds, compilation mostly."""
     grid, network = medium.field.grid, medium.field.network
-    few, many = _table(FEW), _table(MANY)
-    options, small = building.Options(2 / SAMPLES, MAP), building.Options(2 / SAMPLES, VOLUME)
-    # What is in a map does not matter to lookups: this one is marched in a few steps.
-    methods = {name: (building.build(name, medium, table, o), table) for name, table, o in (
-        ("raymarch", few, options), ("transmittance_map", many, building.Options(1 / 4, MAP)),
-        ("transmittance_volume", few, small), ("neural_transmittance", few, options))}
-    if medium.field.header.architecture.visibility is not None:
-        methods["visibility_mlp"] = building.build("visibility_mlp", medium, few, options), few
-    points = _points(medium)
-    work = {name: (lambda pair=pair: _tau(*pair, points.x)) for name, pair in methods.items()}
-    work |= {"map": lambda: building.build("transmittance_map", medium, few, options).values,
-             "volume": lambda: building.build("transmittance_volume", medium, few, small).values,
-             "camera": lambda: _camera(grid).t,
-             "reflect": lambda: [*_flat(grid.reflectance(points.x)), medium.field.softness(points.x)],
-             "shade": lambda: shade.reflect(points, many, None), "density": lambda: network.density(points.x)}
+    points, many = _points(medium), _table(MANY)
     skin = bounced.Skin(medium, np.random.default_rng(0))
+    jobs = {
+        "camera": (lambda: _camera(grid).t, WIDTH * SAMPLES),
+        "reflect": (lambda: [*_flat(grid.reflectance(points.x)), medium.field.softness(points.x)], WIDTH),
+        "shade": (lambda: shade.reflect(points, many, None), WIDTH * MANY),
+        "density": (lambda: network.density(points.x), WIDTH),
+    }
     if len(skin.position):
-        work["between"] = lambda: _between(grid, skin)
-    found = seconds(work, 5, min)  # the machine's own prices: other work only adds to them
-    pairs = {name: WIDTH * pair[1].count for name, pair in methods.items()}
-    samples = FEW * model.FILLED * SAMPLES
-    counts = pairs | {"map": MAP**2 * samples, "volume": VOLUME**2 * ENTRIES * samples,
-                      "camera": WIDTH * SAMPLES, "reflect": WIDTH, "shade": WIDTH * MANY, "density": WIDTH,
-                      "between": len(skin.position) * radiosity.FEW**2}
-    ns = {name: 1e9 * value / counts[name] for name, value in found.items()}
-    result = model.Constants(
-        camera=ns["camera"], reflect=ns["reflect"], shade=ns["shade"], texel=ns["map"], cell=ns["volume"],
-        march=ns["raymarch"] / model.light_steps(SAMPLES), lookup=ns["transmittance_map"],
-        fetch=ns["transmittance_volume"], density=ns["density"], ray=ns["neural_transmittance"],
-        mlp=ns.get("visibility_mlp", model.Constants().mlp), between=ns.get("between", model.Constants().between),
-    )
+        jobs["between"] = lambda: _between(grid, skin), len(skin.position) * radiosity.FEW**2
+    for method in REGISTRY.values():
+        if method.prices and method.needs(medium):
+            jobs |= _jobs(method, medium, points.x)
+    found = seconds({name: job for name, (job, _) in jobs.items()}, 5, min)  # other work only adds to them
+    result = model.Constants(**{name: 1e9 * value / jobs[name][1] for name, value in found.items()})
     model.remember(result)
     return result
+
+
+def _jobs(method, medium, x) -> dict:
+    """Price → what it is measured by, and how many of its units that are."""
+    resolution, lights = method.trial
+    few, many = _table(FEW), _table(lights)
+    work = model.Work(WIDTH, WIDTH, FEW, method.name, resolution**2, SAMPLES)
+    pair, *making = method.prices
+    # What is in many maps does not matter to lookups: those are marched in a few steps.
+    step = 2 / SAMPLES if lights == FEW else 1 / 4
+    built = building.build(method.name, medium, many, Options(step, resolution))
+    jobs = {pair: (lambda: _tau(built, many, x), WIDTH * lights * method.pair(work, _alone(pair)))}
+    if making:
+        def make():
+            return building.build(method.name, medium, few, Options(2 / SAMPLES, resolution)).values
+
+        jobs[making[0]] = make, FEW * method.making(work, _alone(making[0]))
+    return jobs
+
+
+def _alone(name: str) -> model.Constants:
+    """Constants of which one is 1 and the others 0: whatever is counted with them is units of it."""
+    return model.Constants(**{other: float(other == name) for other in asdict(model.Constants())})
 
 
 def _table(count: int) -> LightTable:

@@ -7,6 +7,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from ...infer.visibility import REGISTRY
 from ..cost import model
 from ..cost.measurement import measure as watch
 from ..lights import environment, scene_lights
@@ -105,7 +106,7 @@ def _sum(stages) -> dict:
 
 def _effects(scene, found, integrator, count: int) -> dict:
     """Each effect: whether it takes part, and the reason."""
-    use_map = found.needs_visibility and found.visibility in ("transmittance_map", "transmittance_volume")
+    use_map = found.needs_visibility and REGISTRY[found.visibility].numbers is not None
     others = len(ordinary_shapes(scene))
     unlit = "no emitter has power" if found.emitters else "there is no emitter"
     answers = {

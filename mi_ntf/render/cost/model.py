@@ -8,8 +8,9 @@ import ctypes
 import json
 import math
 import platform
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields, make_dataclass
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -18,8 +19,7 @@ import numpy as np
 from ... import __version__
 from ...core import radiosity
 from ...infer.grid import CELLS
-from ...infer.visibility.raymarch import default_steps
-from ...infer.visibility.transmittance_volume import ENTRIES
+from ...infer.visibility import REGISTRY
 from .. import user_cache
 
 CACHE = "cost.json"
@@ -27,10 +27,6 @@ CACHE = "cost.json"
 
 FACING = 0.5
 """Share of (point, light) pairs whose light falls on the front, the others ask for no visibility."""
-FILLED = math.pi / 4
-"""Share of a map's texels whose rays meet the object."""
-
-
 COVERAGE = 0.35
 """Share of the camera rays that hit the object."""
 POINTS_A_HIT = 15
@@ -39,34 +35,19 @@ NOT_SKIPPED = 0.05
 """Share of the samples across the diameter at which a camera ray's march asks the field."""
 
 
-@dataclass(frozen=True)
-class Constants:
-    """Nanoseconds on all cores together.
+_OWN = {"camera": 0.5, "reflect": 40.0, "shade": 2.0, "between": 1000.0, "density": 60.0}
+_PRICES = _OWN | {name: price for method in REGISTRY.values() for name, price in method.prices.items()}
+Constants: Any = make_dataclass(
+    "Constants", [(name, float, field(default=price)) for name, price in _PRICES.items()], frozen=True)
+"""Nanoseconds on all cores together.
 
-    camera    a camera ray, per sample that would lie across the unit sphere's diameter (most are skipped)
-    reflect   reflectance at a shading point
-    shade     a point and light, its visibility left out
-    march     a step of a light's march, empty space included
-    texel     a ray of a map marched from the field, per sample across the diameter
-    lookup    a point and light, from the map
-    cell      an entry of a transmittance volume
-    fetch     a point and light, from the volume
-    between   a ray between patches of the skin
-    density, ray, mlp   a query of the density, the transmittance and the visibility network
-    """
-
-    camera: float = 0.5
-    reflect: float = 40.0
-    shade: float = 2.0
-    march: float = 2.0
-    texel: float = 1.0
-    lookup: float = 5.0
-    cell: float = 2.0
-    fetch: float = 15.0
-    between: float = 1000.0
-    density: float = 60.0
-    ray: float = 600.0
-    mlp: float = 1500.0
+camera    a camera ray, per sample that would lie across the unit sphere's diameter (most are skipped)
+reflect   reflectance at a shading point
+shade     a point and light, its visibility left out
+between   a ray between patches of the skin
+density   a query of the density network
+…         what each visibility method counts in (:attr:`mi_ntf.infer.visibility.method.Method.prices`)
+"""
 
 
 @dataclass(frozen=True)
@@ -95,29 +76,9 @@ class Work:
     patches: int = 0
 
 
-def light_steps(samples: int) -> int:
-    """Steps of a light's march from a point over the mean chord, 1 unit-sphere radius."""
-    shortest, longest, growth = default_steps(2 / samples)
-    t, count = 0.0, 0
-    while t < 1:
-        t += min(max(growth * t, shortest), longest)
-        count += 1
-    return count
-
-
-def per_ray(work: Work, c: Constants) -> float:
-    """ns of one ray of a map: q of research/transmittance.md, section 5."""
-    if work.source == "network":
-        return c.ray
-    return work.samples * (c.texel + (c.density if work.network else 0))
-
-
 def per_pair(work: Work, c: Constants) -> float:
     """ns of one point and light by the method that `work` names, once it is built."""
-    step = c.march + (c.density if work.network else 0)
-    return {"raymarch": light_steps(work.samples) * step, "transmittance_map": c.lookup * work.components,
-            "transmittance_volume": c.fetch, "neural_transmittance": c.ray, "visibility_mlp": c.mlp,
-            "none": 0.0}[work.method]
+    return REGISTRY[work.method].pair(work, c)
 
 
 def break_even(work: Work, c: Constants) -> float:
@@ -126,9 +87,9 @@ def break_even(work: Work, c: Constants) -> float:
         P* = (π/4) m² q / (f (n c_s − c_l))
 
     with q a texel's cost, n c_s a march's, c_l a lookup's, f the share of lights that a point faces."""
-    march = per_pair(_with(work, "raymarch"), c)
-    lookup = per_pair(_with(work, "transmittance_map"), c)
-    return FILLED * work.texels * per_ray(work, c) / (FACING * (march - lookup)) if march > lookup else math.inf
+    march, maps = REGISTRY["raymarch"], REGISTRY["transmittance_map"]
+    gain = march.pair(work, c) - maps.pair(work, c)
+    return maps.making(work, c) / (FACING * gain) if gain > 0 else math.inf
 
 
 def choose(work: Work, c: Constants | None = None) -> tuple[str, str]:
@@ -166,11 +127,10 @@ def seconds(work: Work, c: Constants) -> dict[str, float]:
     """Predicted wall seconds of each stage, compilation left out; ``bounces`` where they are by radiosity."""
     query = c.density if work.network else 0
     pairs = work.points * work.lights
-    tables = {"transmittance_map": FILLED * work.texels * per_ray(work, c),
-              "transmittance_volume": FILLED * work.texels * ENTRIES * work.samples * (c.cell + query)}
+    making = REGISTRY[work.method].making
     lit = c.shade + FACING * per_pair(work, c)
     stages = {
-        "maps or volumes": 1e-9 * work.lights * tables.get(work.method, 0.0),
+        "maps or volumes": 1e-9 * work.lights * (making(work, c) if making else 0.0),
         "camera march": 1e-9 * work.rays * work.samples * (c.camera + NOT_SKIPPED * query),
         "reflectance": 1e-9 * work.points * (c.reflect + query),
         "lights": 1e-9 * pairs * lit,
@@ -192,10 +152,6 @@ def memory(work: Work, chunk: int) -> dict[str, int]:
         # Some 24 floats a shading point, 12 a ray between patches, in arrays that Dr.Jit rounds up to powers of two.
         "rays in flight": round(max(camera * max(share, 1) * 128, between * 72)),
     }
-
-
-def _with(work: Work, method: str) -> Work:
-    return Work(**(asdict(work) | {"method": method}))
 
 
 def machine() -> str:

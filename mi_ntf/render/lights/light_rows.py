@@ -1,6 +1,7 @@
 """Mitsuba's emitters as rows of a light table: point, spot and directional lights as they are, environments as a
 directional light for each of their cells."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
@@ -92,3 +93,39 @@ def sky(emitter, kind: str, limit: int) -> tuple[Rows, environment.Cells]:
     if sun:
         where, power = np.concatenate([where, sun.axis[None]]), np.concatenate([power, sun.power[None]])
     return Rows(where, power, np.zeros(len(power), bool)), cells
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of emitter. `name`: the plugin's; `rows`: ``(emitter, name, limit)`` → :class:`Rows`, at most `limit` of
+    them, and the cells of an environment or None; it is None itself for what is no finite set of lights and is drawn at
+    random. `single`: it is always one row."""
+
+    name: str
+    rows: Callable | None = None
+    single: bool = False
+
+
+def _one(emitter, name: str, limit: int):
+    return delta(emitter, name), None
+
+
+KINDS = {
+    "PointLight": Kind("point", _one, single=True),
+    "SpotLight": Kind("spot", _one, single=True),
+    "DirectionalEmitter": Kind("directional", _one, single=True),
+    "EnvironmentMapEmitter": Kind("envmap", sky),
+    "ConstantBackgroundEmitter": Kind("constant", sky),
+    "SunskyEmitter": Kind("sunsky", sky),
+    "TimedSunskyEmitter": Kind("timed_sunsky"),
+    "AreaLight": Kind("area"),
+    "DirectionalArea": Kind("directionalarea"),
+    "Projector": Kind("projector"),
+}
+"""Mitsuba's class name → what is known of it. Others are drawn at random, by Mitsuba's own sampling."""
+
+
+def kind(emitter) -> Kind:
+    """The kind of an emitter, of ``ntf`` that of what it wraps."""
+    inner = getattr(emitter, "inner", None)
+    return kind(inner) if inner is not None else KINDS.get(emitter.class_name(), Kind(emitter.class_name()))

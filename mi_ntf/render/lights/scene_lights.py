@@ -11,24 +11,6 @@ from ..scene.frame import Frame
 from . import light_checks, light_gradients, light_rows
 from .emitter_samples import EmitterSamples
 
-KINDS = {
-    "PointLight": "point",
-    "SpotLight": "spot",
-    "DirectionalEmitter": "directional",
-    "EnvironmentMapEmitter": "envmap",
-    "ConstantBackgroundEmitter": "constant",
-    "SunskyEmitter": "sunsky",
-    "TimedSunskyEmitter": "timed_sunsky",
-    "AreaLight": "area",
-    "DirectionalArea": "directionalarea",
-    "Projector": "projector",
-}
-"""Mitsuba's class name → plugin name."""
-SINGLE = ("point", "spot", "directional")
-"""Those that become one row of a table."""
-SKIES = ("envmap", "constant", "sunsky")
-"""Those that become many."""
-
 
 @dataclass(frozen=True)
 class Discrete:
@@ -42,9 +24,7 @@ class Discrete:
     @classmethod
     def of(cls, emitter, kind: str, environment_lights: int) -> "Discrete":
         """`environment_lights`: most rows of an environment, which has those without power, too."""
-        if kind in SKIES:
-            return cls(emitter, kind, *light_rows.sky(emitter, kind, environment_lights))
-        return cls(emitter, kind, light_rows.delta(emitter, kind))
+        return cls(emitter, kind, *light_rows.kind(emitter).rows(emitter, kind, environment_lights))
 
 
 class Lights:
@@ -121,20 +101,16 @@ class Lights:
         return result
 
 
-def method_for_drawn(method: str) -> str:
-    """The visibility method of drawn lights where `method` serves the table's: maps and volumes are made of rows."""
-    return "raymarch" if method in ("transmittance_map", "transmittance_volume") else method
-
-
 def kind(emitter) -> str:
     """Plugin name of an emitter, ``ntf`` that of what it wraps; the class name where Mitsuba has a new one."""
-    inner = getattr(emitter, "inner", None)
-    return kind(inner) if inner is not None else KINDS.get(emitter.class_name(), emitter.class_name())
+    return light_rows.kind(emitter).name
 
 
 def is_discrete(emitter) -> bool:
-    """Whether the light is a finite set of points and directions: a spot without texture; an environment by texels."""
-    return emitter.class_name() in KINDS and kind(emitter) in (*SINGLE, *SKIES) and not _is_textured_spot(emitter)
+    """Whether the light is a finite set of points and directions: a spot without texture; an environment by texels.
+    What hides behind an ``ntf`` emitter is not."""
+    known = light_rows.KINDS.get(emitter.class_name())
+    return bool(known and known.rows) and not _is_textured_spot(emitter)
 
 
 def _is_textured_spot(emitter) -> bool:

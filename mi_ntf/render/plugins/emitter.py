@@ -4,9 +4,10 @@ import drjit as dr
 import mitsuba as mi
 
 from ...core.errors import MiNtfError
-from ...infer.visibility import METHODS, outside
-from ..lights import environment, light_checks, scene_lights
-from ..maps.building import Options, build
+from ...infer.visibility import REGISTRY, names, outside
+from ...infer.visibility.method import Options
+from ..lights import environment, light_checks, light_rows, scene_lights
+from ..maps.building import build
 from . import properties
 
 STEP = 2 / 384
@@ -48,7 +49,7 @@ def emitter_class() -> type:
 
         def __init__(self, props):
             read = properties.Reader(props, "ntf emitter", properties.EMITTER, nested=True)
-            self.visibility = read.choice("visibility", "auto", METHODS)
+            self.visibility = read.choice("visibility", "auto", names())
             read.number("sampling_weight", 1.0, 0.0, 1e30)
             nested = [value for _, value in props.objects()]
             other = [o for o in nested if not (isinstance(o, mi.Emitter) or getattr(o, "is_nrf", False))]
@@ -69,9 +70,9 @@ def emitter_class() -> type:
             table = None
             light_checks.check(self.inner, scene_lights.kind(self.inner), drawn=True)
             environment.check_unscaled(self.inner)
-            if method != scene_lights.method_for_drawn(method):
+            if REGISTRY[method].for_drawn != method:
                 kind = scene_lights.kind(self.inner)
-                if kind not in scene_lights.SINGLE or not scene_lights.is_discrete(self.inner):
+                if not light_rows.kind(self.inner).single or not scene_lights.is_discrete(self.inner):
                     raise MiNtfError(
                         f"ntf emitter: visibility is {method}, which is made for one light, but {kind} shines from "
                         "many places; choose raymarch or neural_transmittance"

@@ -7,7 +7,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ...core.errors import MiNtfError, root
-from ...infer.visibility import METHODS
+from ...infer.visibility import names
 from ..scene.camera import Camera, Reconstruction
 from ..transport import aovs
 from ..transport.composition import Composition
@@ -77,7 +77,7 @@ def integrator_class() -> type:
             read = properties.Reader(props, "nrf integrator", properties.INTEGRATOR)
             # Kept here: Mitsuba's own clock would count from the construction of the plugin.
             self.timeout = read.number("timeout", -1.0)
-            self.visibility = read.choice("visibility", "auto", METHODS)
+            self.visibility = read.choice("visibility", "auto", names())
             self.map_source = read.choice("map_source", "field", ("field", "network"))
             self.samples = read.whole("samples", 384, 8, 8192)
             self.light_samples = read.whole("light_samples", 0, 0, 65536)

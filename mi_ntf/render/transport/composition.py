@@ -8,6 +8,7 @@ import mitsuba as mi
 from ...core.errors import MiNtfError
 from ...infer import march, shade
 from ...infer.bundle import Strand
+from ...infer.visibility import REGISTRY
 from ..cost import measurement
 from ..lights import environment, scene_lights
 from ..maps import building
@@ -97,9 +98,9 @@ class Composition:
             return Part(medium, whole, whole, None, None)
         table = whole.part(*self.runs[self.run]) if len(self.runs) > 1 else whole
         options = building.options(self.integrator)
-        drawn = scene_lights.method_for_drawn(found.visibility)
-        if table.moving and drawn != "none":
-            drawn = "raymarch"  # the only one with derivatives
+        drawn = REGISTRY[found.visibility].for_drawn
+        if table.moving and not REGISTRY[drawn].derivatives:
+            drawn = "raymarch"
         method = found.visibility if table.count else drawn  # maps of no light are no maps
         mapped = building.build(method, medium, table, options)
         if drawn == method:

@@ -1,0 +1,78 @@
+"""What a visibility method is to the rest of the renderer: how it is built, what it serves, what it costs.
+
+Every method's file ends with its own :class:`Method`; :data:`mi_ntf.infer.visibility.REGISTRY` lists them.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+FILLED = 0.785398
+"""Share of a map's texels whose rays meet the object: π/4."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """`step`: length of the camera march's cells, field units; `map_resolution`: texels along a map's side;
+    `map_source`: ``field`` or ``network``; `map_components`: logistics a texel that the field's march is fitted by, 1
+    or 2 (the network has its own number); `map_memory`: MiB that the maps or volumes of one part of the lights may
+    take; `map_file`: EXR of `mi-ntf bake` that holds the maps, or none; `cache`: maps are kept for the next frame and
+    on disk (:mod:`mi_ntf.render.maps.map_cache`)."""
+
+    step: float
+    map_resolution: int = 192
+    map_source: str = "field"
+    map_components: int = 1
+    map_memory: float = 1024.0
+    map_file: str = ""
+    cache: bool = False
+
+
+@dataclass(frozen=True)
+class Method:
+    """
+    name         what users type
+    summary      what it does, a sentence
+    build        ``(medium, table, options, dj, keep)`` → an object with ``tau``, in the medium's field coordinates.
+                 `table`: the :class:`mi_ntf.infer.lights.LightTable` that what is held per light is made for, and whose
+                 moving lights are followed more finely; None: the others. ``keep(width, step, make)`` → ``make()``, or
+                 ``make(values)`` where what it would make, `width` float32 numbers for each of the squared
+                 ``map_resolution`` rays of each light, marched in steps of `step`, is at hand
+    pair         ``(work, prices)`` → nanoseconds of a point and light; `work`: :class:`mi_ntf.render.cost.model.Work`,
+                 `prices`: :class:`mi_ntf.render.cost.model.Constants`
+    prices       name → nanoseconds on two cores of 2024; the first is what `pair` counts in, the second what `making`
+                 does
+    making       as `pair`, of what is held for a light; None for methods that hold nothing
+    numbers      ``(medium, table, options)`` → float32 numbers that are held for each of the squared ``map_resolution``
+                 rays of a light
+    dials        properties of the integrator that it reads
+    drawn        name of the method that serves lights which are drawn at random, and all other rays; "": itself
+    derivatives  whether places of lights have derivatives
+    automatic    whether ``auto`` may choose it
+    needs        ``(medium)`` → whether the field can serve it
+    trial        ``(resolution, lights)`` that its prices are measured with
+    """
+
+    name: str
+    summary: str
+    build: Callable[..., Any]
+    pair: Callable[[Any, Any], float]
+    prices: dict[str, float] = field(default_factory=dict)
+    making: Callable[[Any, Any], float] | None = None
+    numbers: Callable[[Any, Any, Options], int] | None = None
+    dials: tuple[str, ...] = ()
+    drawn: str = ""
+    derivatives: bool = False
+    automatic: bool = False
+    needs: Callable[[Any], bool] = lambda medium: True
+    trial: tuple[int, int] = (128, 4)
+
+    @property
+    def for_drawn(self) -> str:
+        """Name of the method that serves drawn lights where this one serves the table's."""
+        return self.drawn or self.name
+
+
+def queries(work, prices) -> float:
+    """Nanoseconds that a density costs on top, where the field is its networks."""
+    return prices.density if work.network else 0.0

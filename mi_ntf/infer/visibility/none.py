@@ -1,0 +1,11 @@
+"""``none``: nothing casts or receives shadows."""
+
+from .method import Method
+
+METHOD = Method(
+    name="none",
+    summary="no shadows",
+    build=lambda medium, table, options, dj, keep: None,
+    pair=lambda work, prices: 0.0,
+    derivatives=True,
+)
