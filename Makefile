@@ -15,6 +15,7 @@ demo:
 test:
 	@$(PYTHON) tools/setup_env.py dev
 	@$(RUN) -m ruff check .
+	@$(RUN) -m mypy mi_ntf
 	@$(RUN) -m pytest -n 2 --dist loadfile -q -m "not slow and not gpu"
 
 # Every slow test, and the whole catalogue of hard cases as a table, with 200 random scenes in one process and 60 beside

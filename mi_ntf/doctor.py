@@ -22,8 +22,8 @@ MITSUBA = "3.9.1"
 """The version that pyproject.toml pins: the bridge binds to its C++ interface."""
 LLVM_MINIMUM = 17
 EXTRAS = {
-    "train": ("torch", "tensorboard", "torchmetrics", "matplotlib", "cv2"),
-    "eval": ("skimage", "flip_evaluator", "matplotlib", "trimesh"),
+    "train": ("torch", "tensorboard", "matplotlib", "PIL", "cv2"),
+    "eval": ("skimage", "flip_evaluator", "matplotlib", "PIL"),
 }
 """Extras of this package and the modules that they bring."""
 

@@ -7,6 +7,7 @@ parse, instantiate, render without developing, let the film write the file.
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -68,7 +69,7 @@ def render_file(path: Path, parameters: dict[str, str], *, sensor_index: int = 0
     """
     if not path.is_file():
         raise MiNtfError(f"scene {path} does not exist")
-    scene = mi.load_file(str(path), **parameters)
+    scene = mi.load_file(str(path), **parameters)  # type: ignore[arg-type]  # they are $names
     if not isinstance(scene, mi.Scene):
         raise MiNtfError(f"{path}: the root element must be a <scene>")
     if not 0 <= sensor_index < len(scene.sensors()):
@@ -77,7 +78,7 @@ def render_file(path: Path, parameters: dict[str, str], *, sensor_index: int = 0
         raise MiNtfError(f"{path}: no integrator specified")
 
     sensor = scene.sensors()[sensor_index]
-    scene.integrator().render(scene, sensor, seed=0, spp=0, develop=False, evaluate=True)
+    scene.integrator().render(scene, sensor, develop=False)
     sensor.film().write(str(output or path))
 
 
@@ -96,8 +97,10 @@ def _apply_settings(args: argparse.Namespace) -> None:
             f"this machine cannot run {args.mode or 'any of ' + ', '.join(VARIANT_PRIORITY)}: "
             f"`mi-ntf doctor` names the remedy ({error})"
         ) from error
-    mi.Log(mi.LogLevel.Info, f'Rendering using the "{mi.variant()}" variant.')
-    bridge.register_all(mi.variant())
+    variant = str(mi.variant())
+    log: Any = mi.Log  # an object in the stub
+    log(mi.LogLevel.Info, f'Rendering using the "{variant}" variant.')
+    bridge.register_all(variant)
 
     if args.threads is not None:
         if args.threads < 1:
@@ -105,7 +108,7 @@ def _apply_settings(args: argparse.Namespace) -> None:
         # The film writes EXR from a worker thread and waits for it for ever if there is none.
         dr.set_thread_count(max(args.threads, 2))
     for folder in filter(None, args.append.split(";")):
-        mi.file_resolver().append(folder)
+        mi.file_resolver().append(folder)  # type: ignore[operator]  # an object in the stub
 
     flags = (
         dr.JitFlag.MergeFunctions,

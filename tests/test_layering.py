@@ -5,10 +5,15 @@ Training never imports Mitsuba or Dr.Jit, rendering never imports PyTorch.
 
 import ast
 import graphlib
+import re
+import sys
+import tomllib
 from pathlib import Path
 
 import pytest
 from helpers.programs import run_program
+
+from mi_ntf import doctor
 
 PACKAGE = Path(__file__).parents[1] / "mi_ntf"
 
@@ -37,6 +42,10 @@ FORBIDDEN = {
 
 ROOMS = ("user_cache", "cost", "scene", "lights", "maps", "transport", "plugins", "commands")
 """Of `render`: each may import those before it."""
+
+PACKAGE_OF = {"cv2": "opencv-python-headless", "drjit": "mitsuba", "flip_evaluator": "flip-evaluator", "PIL": "pillow",
+              "skimage": "scikit-image"}
+"""What brings a module of another name."""
 
 TOP_LEVEL_FORBIDDEN = TORCH
 """The same for the modules at the top of the package (command line, bridge, doctor)."""
@@ -105,6 +114,18 @@ def test_no_module_imports_itself_by_way_of_others():
         name = ".".join(file.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__")
         graph[name] = {module_of(other) for other in imports_of(file)} - {None, name}
     list(graphlib.TopologicalSorter(graph).static_order())  # raises CycleError, which names the modules
+
+
+def test_third_parties_are_declared_where_they_are_used_and_nowhere_else():
+    project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text())["project"]
+    kinds = {"": project["dependencies"], **project["optional-dependencies"]}
+    declared = {kind: {re.split("[=<>[]", name)[0].lower() for name in names} for kind, names in kinds.items()}
+    shipped = declared[""] | declared["train"] | declared["eval"]
+    tops = {name.split(".")[0] for file in FILES for name in imports_of(file)} - {"mi_ntf"} - sys.stdlib_module_names
+    # tensorboard is used by way of torch.utils.tensorboard.
+    assert {PACKAGE_OF.get(name, name.lower()) for name in tops} | {"tensorboard"} == shipped
+    for extra, modules in doctor.EXTRAS.items():
+        assert {PACKAGE_OF.get(name, name.lower()) for name in modules} == declared[extra]
 
 
 def test_relative_imports_are_resolved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

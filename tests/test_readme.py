@@ -1,4 +1,4 @@
-"""Every command and snippet of the README runs, with smaller settings where its own would take minutes."""
+"""Every command and snippet of the pages runs, with smaller settings where its own would take minutes."""
 
 import re
 import shutil
@@ -10,16 +10,18 @@ from data import forms
 from helpers.programs import run_program
 
 ROOT = Path(__file__).parents[1]
-TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
-BLOCKS = dict(re.findall(r"```(\w+)\n(.*?)```", TEXT, re.S))
-COMMANDS = [line.split("#")[0].split() for line in TEXT.splitlines() if re.match(r"    (mi-ntf|mitsuba|make) ", line)]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+TEXT = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
+BLOCKS = re.findall(r"```(\w+)\n(.*?)```", TEXT, re.S)
+COMMANDS = [line.split("#")[0] for line in TEXT.splitlines() if re.match(r"    (mi-ntf|mitsuba|make) ", line)]
+COMMANDS = [line.split() for line in dict.fromkeys(map(str.rstrip, COMMANDS))]
 SMALLER = {"--minutes": "0.1", "--steps": "20", "--size": "24"}
 CAPTURE = {"--views": "12", "--size": "24", "--test-views": "1", "--spp": "2"}
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """The shipped scenes, a mesh scene of one's own, photographs with a COLMAP model, and two images, as the README's
+    """The shipped scenes, a mesh scene of one's own, photographs with a COLMAP model, and two images, as the pages'
     commands expect them."""
     folder = tmp_path_factory.mktemp("readme")
     shutil.copytree(ROOT / "scenes", folder / "scenes")
@@ -29,7 +31,8 @@ def folder(tmp_path_factory):
     finally:
         sys.path.pop(0)
     (folder / "scene.xml").write_text(BOXES)
-    forms.colmap(folder / "skull_flash")
+    for name in ("skull_flash", "mine"):
+        forms.colmap(folder / name)
     shutil.copy(ROOT / "scenes/statue/reference_point.exr", folder / "a.exr")
     shutil.copy(ROOT / "scenes/statue/reference_env.exr", folder / "reference.exr")
     return folder
@@ -41,16 +44,16 @@ def check(*words, folder):
     return done.stdout
 
 
-def test_xml_snippet(folder):
-    small = BLOCKS["xml"].replace('"256"', '"24"').replace('value="16"', 'value="2"')
-    (folder / "snippet.xml").write_text(small)
-    check("mitsuba", "-m", "llvm_ad_rgb", "-o", "snippet.exr", "snippet.xml", folder=folder)
-    assert (folder / "snippet.exr").stat().st_size > 0
-
-
-def test_python_snippet(folder):
-    (folder / "snippet.py").write_text(BLOCKS["python"] + "assert image.shape == (64, 64, 4)\n")
-    check("python", "snippet.py", folder=folder)
+@pytest.mark.parametrize(("language", "code"), BLOCKS, ids=[language for language, _ in BLOCKS])
+def test_snippet(folder, language, code):
+    if language == "xml":
+        (folder / "snippet.xml").write_text(code.replace('"256"', '"24"').replace('value="16"', 'value="2"'))
+        check("mitsuba", "-m", "llvm_ad_rgb", "-o", "snippet.exr", "snippet.xml", folder=folder)
+        assert (folder / "snippet.exr").stat().st_size > 0
+    else:
+        assert language == "python"
+        (folder / "snippet.py").write_text(code + "assert image.shape == (64, 64, 4)\n")
+        check("python", "snippet.py", folder=folder)
 
 
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
@@ -78,8 +81,20 @@ def test_every_command_is_shown():
     assert shown == {"capture", "inspect", "train", "swap", "mitsuba", "info", "compare", "explain", "bake", "make"}
 
 
-def test_names_in_the_table_are_the_plugins(folder):
-    from mi_ntf.infer.visibility import names
+def test_readme_is_short():
+    """Two screens."""
+    lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    assert len(lines) <= 110 and max(map(len, lines)) <= 120
 
-    rows = re.findall(r"^\| `(\w+)` \|", TEXT, re.M)
-    assert set(names()) <= set(rows)
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_somewhere(page):
+    """To files that are there, and to headings in them."""
+    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
+        if target.startswith("https:"):
+            continue
+        name, _, heading = target.partition("#")
+        file = (page.parent / name).resolve() if name else page
+        assert file.is_file(), target
+        headings = re.findall(r"^#+ (.*)", file.read_text(encoding="utf-8"), re.M) if heading else []
+        assert not heading or heading in [re.sub(r"[^\w -]", "", h).lower().replace(" ", "-") for h in headings], target

@@ -15,6 +15,7 @@ its end points p1 and p2 (encoding `frequency` of the six coordinates). The four
 import math
 from dataclasses import asdict, dataclass, field
 from itertools import pairwise
+from typing import Any
 
 from .depth_profile import FEATURES
 from .errors import MiNtfError, shown
@@ -121,7 +122,7 @@ class Header:
         return {"format": FORMAT} | asdict(self)
 
 
-def header_from_json(data: object, source: str) -> Header:
+def header_from_json(data: Any, source: str) -> Header:
     """Parse and check a header, any JSON; `source` (a file name) starts every error text. Raises MiNtfError."""
     version = data.get("format") if isinstance(data, dict) else None
     if version != FORMAT:
@@ -177,7 +178,7 @@ def _whole(value: object, what: str, low: int, high: int = 1 << 31) -> int:
     return value
 
 
-def _number(value: object, what: str, above: float = -math.inf) -> float:
+def _number(value: Any, what: str, above: float = -math.inf) -> float:
     if type(value) not in (int, float) or not above < value or not abs(value) < 1e30:
         raise ValueError(f"{what} is {shown(value)}, expected a finite number" + (" above 0" if above == 0 else ""))
     return float(value)

@@ -23,8 +23,9 @@ def save(path: str | Path, header: Header, tensors: dict[str, np.ndarray], dtype
     interpolation and a trained perceptron smooth anyway and halves the file; planes that it cannot hold are float32.
     """
     _check(str(path), header, tensors)
-    data = {k: np.ascontiguousarray(v, _fitting(v, dtype) if ".planes." in k else np.float32)
-            for k, v in tensors.items()}
+    data: dict[str, np.ndarray] = {
+        k: np.ascontiguousarray(v, _fitting(v, dtype) if ".planes." in k else np.float32) for k, v in tensors.items()
+    }
     files.write(path, safetensors.numpy.save(data, metadata={_KEY: json.dumps(header.to_json())}))
 
 

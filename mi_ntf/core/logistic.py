@@ -14,7 +14,6 @@ MAX_SLOPE = 665.0
 MAX_CENTRE = 1.2
 """|b| stays below this many half chords. Beyond 1, so that an empty central chord can reach τ = 1 at its far end."""
 _CLIP = 80.0  # e^80 is finite in float32; S differs from 0 or 1 by less than any float32 can tell.
-_SERIES = 0.5
 
 
 def sigmoid(ops, z):
@@ -29,12 +28,8 @@ def softplus(ops, z):
     max(z, 0) is written (z + |z|)/2: frameworks disagree on the derivative of a tie, this form has ½ at 0 in all of
     them.
     """
-    return (z + ops.abs(z)) / 2 + _bend(ops, z)
-
-
-def _bend(ops, z):
-    """softplus(z) − max(z, 0), in (0, ln 2]."""
-    return ops.log(1 + ops.exp(-ops.abs(z)))
+    size = ops.abs(z)
+    return (z + size) / 2 + ops.log(1 + ops.exp(-size))
 
 
 def transmittance(ops, t, a, b):
@@ -45,29 +40,6 @@ def transmittance(ops, t, a, b):
 def optical_depth(ops, t, a, b):
     """−ln τ(t) = softplus(−a (t − b)); finite where τ itself has long underflowed."""
     return softplus(ops, -a * (t - b))
-
-
-def mean_transmittance(ops, t0, t1, a, b):
-    """Mean of τ over [t0, t1], t1 ≥ t0: a box filter that keeps gradients below 1 for slopes of any steepness.
-
-    [softplus(a (t1 − b)) − softplus(a (t0 − b))] / Δ with Δ = a (t1 − t0). For Δ below ½ the difference would cancel
-    (in float32 all digits are gone at Δ = 1e-7), so there the series around the middle c of the step takes over:
-
-        S + S″ δ²/6 + S⁗ δ⁴/120,   S = S(a (c − b)),  δ = Δ/2,  S′ = S (1 − S),  S″ = S′ (1 − 2S),  S⁗ = S″ (1 − 12 S′)
-
-    whose first neglected term is below 2e-8.
-    """
-    width = a * (t1 - t0)
-    centre = transmittance(ops, (t0 + t1) / 2, a, b)
-    slope = centre * (1 - centre)
-    d2 = width * width / 4
-    series = centre + slope * (1 - 2 * centre) * (d2 / 6) * (1 + (1 - 12 * slope) * (d2 / 20))
-    z0, z1 = a * (t0 - b), a * (t1 - b)
-    # max(z1, 0) − max(z0, 0) as a clamp: exactly Δ where both are large. `maximum` below keeps the gradient of the
-    # branch not taken finite at Δ = 0.
-    rise = ops.minimum(ops.maximum(z1, 0.0), width)
-    difference = (rise + _bend(ops, z1) - _bend(ops, z0)) / ops.maximum(width, _SERIES)
-    return ops.where(width < _SERIES, series, difference)
 
 
 def parameters(ops, raw_a, raw_b, h):

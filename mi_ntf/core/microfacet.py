@@ -33,10 +33,11 @@ def ggx(sin2_h, alpha):
     return a2 / (math.pi * k * k)
 
 
-def smith_g1(ops, cos_v, alpha):
-    """G1: visible share of the microfacets, 2c/(c + sqrt(α² + (1 − α²) c²)) at the cosine c = `cos_v` ≥ 0."""
+def smith(ops, cos, alpha):
+    """G1(ω)/(2⟨n,ω⟩), of the visible share of the microfacets and the cosine ⟨n,ω⟩ = `cos` ≥ 0. In one piece it is
+    finite at grazing directions, where both vanish."""
     a2 = alpha * alpha
-    return 2 * cos_v / (cos_v + ops.sqrt(a2 + (1 - a2) * cos_v * cos_v))
+    return 1 / (cos + ops.sqrt(a2 + (1 - a2) * cos * cos))
 
 
 def lobes(ops, wi, wo, n, roughness):
@@ -103,16 +104,12 @@ def soft_cosine(ops, cos, softness):
 def _cosines(ops, wi, wo, n, roughness):
     """⟨n,ω_i⟩⁺, ⟨n,ω_o⟩⁺ and the specular ρ (0 seen from below)."""
     cos_i, cos_o = ops.maximum(dot(n, wi), 0.0), dot(n, wo)
-    # G1(ω)/(2⟨n,ω⟩) in one piece: finite at grazing directions, where both factors vanish.
     alpha = roughness * roughness
-    a2 = alpha * alpha
-    gi = 1 / (cos_i + ops.sqrt(a2 + (1 - a2) * cos_i * cos_i))
     above = ops.maximum(cos_o, 0.0)
-    go = 1 / (above + ops.sqrt(a2 + (1 - a2) * above * above))
     half = normalize(ops, tuple(a + b for a, b in zip(wi, wo, strict=True)))
     # ⟨n,h⟩ > 0 wherever the lobe is not zero, so D needs no sign of it.
     across = cross(n, half)
-    gloss = ggx(dot(across, across), alpha) * gi * go
+    gloss = ggx(dot(across, across), alpha) * smith(ops, cos_i, alpha) * smith(ops, above, alpha)
     return cos_i, above, ops.where(cos_o > 0, gloss, 0.0 * gloss)
 
 
@@ -121,6 +118,5 @@ def lobes_collocated(ops, cos, roughness):
     direction."""
     c = ops.maximum(cos, 0.0)
     alpha = roughness * roughness
-    a2 = alpha * alpha
-    g = 1 / (c + ops.sqrt(a2 + (1 - a2) * c * c))
+    g = smith(ops, c, alpha)
     return c * INV_PI, ggx((1 - c) * (1 + c), alpha) * g * g * c

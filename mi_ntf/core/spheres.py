@@ -13,7 +13,9 @@ Every argument named above is a 3-component tuple (points, directions) or a scal
 elementary functions (:mod:`mi_ntf.core.ops`).
 """
 
-from .ops import dot, normalize
+import numpy as np
+
+from .ops import dot
 
 MIN_HALF_CHORD = 0.05
 """Chords shorter than twice this graze the sphere, where no captured object reaches (the similarity leaves a margin)
@@ -49,15 +51,15 @@ def end_points(m, d, h):
     return p1, p2
 
 
-def from_end_points(ops, p1, p2):
-    """Inverse of :func:`end_points`: ``(m, d, h)`` of the chord from `p1` to `p2`, two distinct points of the unit
-    sphere."""
-    m = tuple((a + b) / 2 for a, b in zip(p1, p2, strict=True))
-    span = tuple(b - a for a, b in zip(p1, p2, strict=True))
-    h = ops.sqrt(ops.maximum(dot(span, span), 1e-20)) / 2
-    return m, normalize(ops, span), h
-
-
 def coordinate(x, d):
     """t' = ⟨x, ω'⟩: the place of `x` on its ray. No origin is needed, since the midpoint is perpendicular to ω'."""
     return dot(x, d)
+
+
+def fibonacci(count: int, start: float = 0.0) -> np.ndarray:
+    """`count` unit vectors (count, 3), evenly spread: a Fibonacci lattice down z, its first vector turned by `start`
+    golden angles."""
+    i = np.arange(count)
+    z, phi = 1 - (i + 0.5) * 2 / count, (i + start) * np.pi * (3 - 5**0.5)
+    across = np.sqrt(1 - z * z)
+    return np.stack([across * np.cos(phi), across * np.sin(phi), z], axis=1)

@@ -11,11 +11,12 @@ import hashlib
 import json
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from mi_ntf.core import files
+from mi_ntf.core import files, spheres
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.data import schema
 from mi_ntf.data.bounds import bounding_sphere
@@ -28,10 +29,8 @@ VOLUME_INTEGRATORS = {"VolumetricPathIntegrator", "VolpathMisIntegratorImpl"}  #
 
 def view_directions(count: int, rng: np.random.Generator) -> np.ndarray:
     """Unit directions (count, 3) from the object to the cameras: a Fibonacci lattice, turned at random."""
-    i = np.arange(count) + 0.5
-    z, phi = 1.0 - 2.0 * i / count, np.pi * (1.0 + 5.0**0.5) * i
-    lattice = np.stack([np.cos(phi) * np.sqrt(1 - z * z), np.sin(phi) * np.sqrt(1 - z * z), z], -1)
     q, r = np.linalg.qr(rng.normal(size=(3, 3)))
+    lattice = spheres.fibonacci(count, 0.5) * (1, -1, 1)
     return lattice @ (q * np.sign(np.diag(r))).T
 
 
@@ -50,10 +49,11 @@ def _load(path: Path):
     media a volumetric one, else `path` or `volpath` of depth 6."""
     import mitsuba as mi
 
-    if mi.variant() is None:
+    variant = mi.variant()
+    if variant is None:
         mi.set_variant("llvm_ad_rgb")
-    if "rgb" not in mi.variant():
-        raise MiNtfError(f"variant '{mi.variant()}' is active; photographs are linear RGB: set an rgb variant "
+    elif "rgb" not in variant:
+        raise MiNtfError(f"variant '{variant}' is active; photographs are linear RGB: set an rgb variant "
                          "such as llvm_ad_rgb")
     if not Path(path).is_file():
         raise MiNtfError(f"{path} does not exist; name a Mitsuba scene file (.xml)")
@@ -200,7 +200,8 @@ def capture(scene: Path, out: Path, *, views: int = 100, size: int = 128, test_v
             params["light.position"] = mi.Point3f(frame.light_pos.tolist())
             params["light.intensity.value"] = mi.Color3f(frame.light_intensity.tolist())
             params.update()
-            image = np.array(mi.render(studio, spp=spp, seed=seed * len(frames) + index))
+            stream: Any = seed * len(frames) + index  # a number, where Mitsuba's stub asks for an array
+            image = np.array(mi.render(studio, spp=spp, seed=stream))
             if bad := np.count_nonzero(~np.isfinite(image).all(-1)):
                 raise MiNtfError(f"{scene}: {bad} pixels of view {frame.file} are NaN or infinite; look for extreme "
                                  "values in its materials and media, or give it another integrator")

@@ -35,6 +35,7 @@ def find_model(folder: Path) -> Path | None:
 def read(folder: Path) -> Found:
     """All posed photographs of the folder's model as one split, `train`, by name, and its points. Raises MiNtfError."""
     model = find_model(folder)
+    assert model is not None  # what makes it a folder of this form
     cameras, images, points = colmap_files.read(model)
     root = next((p for p in (folder, folder.parent, folder.parent.parent) if (p / "images").is_dir()), None)
     if root is None:

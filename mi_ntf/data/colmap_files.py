@@ -131,6 +131,9 @@ class _Bytes:
         self.at += struct.calcsize("<" + form)
         return values
 
+    def count(self) -> int:
+        return self.take("Q")[0]
+
     def name(self) -> str:
         end = self.data.index(b"\0", self.at)
         text = self.data[self.at : end].decode()
@@ -145,7 +148,7 @@ class _Bytes:
 
 def _cameras_bin(data: bytes) -> dict[int, Camera]:
     stream, cameras, names = _Bytes(data), {}, list(MODELS)
-    for _ in range(*stream.take("Q")):
+    for _ in range(stream.count()):
         number, model, width, height = stream.take("IiQQ")
         if not 0 <= model < len(names):
             raise ValueError(f"unknown camera model {model}")
@@ -155,17 +158,18 @@ def _cameras_bin(data: bytes) -> dict[int, Camera]:
 
 def _images_bin(data: bytes) -> list[Image]:
     stream, images = _Bytes(data), []
-    for _ in range(*stream.take("Q")):
+    for _ in range(stream.count()):
         _, *pose, camera = stream.take("I7dI")
         images.append(_image(stream.name(), camera, tuple(pose)))
-        stream.skip(*stream.take("Q"), 24)
+        stream.skip(stream.count(), 24)
     return images
 
 
 def _points_bin(data: bytes) -> np.ndarray:
-    stream, rows = _Bytes(data), []
-    for _ in range(*stream.take("Q")):
+    stream = _Bytes(data)
+    rows: list[tuple[float, ...]] = []
+    for _ in range(stream.count()):
         _, x, y, z, _, _, _, _ = stream.take("Q3d3Bd")
         rows.append((x, y, z))
-        stream.skip(*stream.take("Q"), 8)
+        stream.skip(stream.count(), 8)
     return _points(rows)

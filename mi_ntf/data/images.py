@@ -15,14 +15,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mi_ntf.core import files
+from mi_ntf.core import files, ops, srgb
 from mi_ntf.core.errors import MiNtfError, shown
 
 SUFFIXES = (".png", ".exr", ".jpg", ".jpeg", ".tif", ".tiff")
 MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
-_LEVELS = np.arange(256) / 255.0
-LINEAR = np.where(_LEVELS <= 0.04045, _LEVELS / 12.92, ((_LEVELS + 0.055) / 1.055) ** 2.4).astype(np.float32)
-"""sRGB's 256 levels in linear light (IEC 61966-2-1)."""
+LINEAR = srgb.decode(ops, np.arange(256) / 255.0).astype(np.float32)
+"""sRGB's 256 levels in linear light."""
 
 
 def linear(stored: np.ndarray) -> np.ndarray:
@@ -35,9 +34,8 @@ def linear(stored: np.ndarray) -> np.ndarray:
 
 def levels(pixels: np.ndarray) -> np.ndarray:
     """The 8-bit levels (..., 4) nearest to linear premultiplied RGBA; the inverse of :func:`linear`."""
-    rgb = np.clip(pixels[..., :3], 0, 1)
-    srgb = np.where(rgb <= 0.0031308, 12.92 * rgb, 1.055 * np.maximum(rgb, 1e-9) ** (1 / 2.4) - 0.055)
-    return np.round(255 * np.concatenate([srgb, np.clip(pixels[..., 3:], 0, 1)], -1)).astype(np.uint8)
+    color = srgb.encode(ops, pixels[..., :3])
+    return np.round(255 * np.concatenate([color, np.clip(pixels[..., 3:], 0, 1)], -1)).astype(np.uint8)
 
 
 class Decoded(NamedTuple):
@@ -180,7 +178,7 @@ def _tiff_tags(path: Path) -> tuple[tuple[int, ...], bool]:
 
     try:
         with Image.open(path) as image:
-            tags = image.tag_v2
+            tags = image.tag_v2  # type: ignore[attr-defined]  # a TIFF has them
             return tuple(tags.get(258, (1,))), 1 in tuple(tags.get(338, ()))
     except UnidentifiedImageError:
         return (), False
@@ -202,7 +200,8 @@ def size_of(path: Path) -> tuple[int, int] | None:
             import OpenEXR
 
             low, high = OpenEXR.File(str(path), header_only=True).header()["dataWindow"]
-            return tuple(int(n) for n in high - low + 1)
+            width, height = high - low + 1
+            return int(width), int(height)
         from PIL import Image
 
         with Image.open(path) as image:

@@ -14,7 +14,8 @@ HALF = (1e-3, 65504.0)
 """Between these, the brightest light of a photograph for which half precision will do: it has 11 bits down to 6e-5."""
 
 
-def load(views: list[View], size: int | None = None, black: bool = False):
+def load(views: list[View], size: int | None = None, black: bool = False
+         ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """``(images (N, H, W, 4) as stored, c2w (N, 4, 4), focal (N, 2), principal (N, 2))`` of a split; pixels, float64.
 
     `size`: longer side in pixels that photographs are scaled down to. `black`: alpha is what the black background tells

@@ -215,7 +215,7 @@ def _light_positions(views: list[View]) -> np.ndarray:
 
 
 def _intensities(views: list[View], estimated: float | None) -> np.ndarray:
-    return np.stack([v.light_intensity if estimated is None else np.full(3, estimated) for v in views]
+    return np.stack([np.full(3, estimated) if v.light_intensity is None else v.light_intensity for v in views]
                     ).astype(np.float32)
 
 

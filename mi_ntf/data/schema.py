@@ -156,12 +156,12 @@ def fingerprint(splits: dict[str, Split]) -> dict[str, str]:
         for split, name in itertools.product(sorted(splits), names):
             value = np.ascontiguousarray(getattr(splits[split], name))
             digest.update(f"{split} {name} {value.dtype} {value.shape}".encode())
-            digest.update(value)
+            digest.update(value.data)
         found[what] = digest.hexdigest()
     return found
 
 
-def focal_length(angle_x: float, w: int) -> float:
+def focal_length(angle_x: float, w: float) -> float:
     """Focal length in pixels of a camera `w` pixels wide with horizontal field of view `angle_x` (radians)."""
     return float(0.5 * w / np.tan(0.5 * angle_x))
 

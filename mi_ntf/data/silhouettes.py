@@ -72,7 +72,7 @@ def _pooled(outline: Outline) -> Outline:
         padded = np.pad(mask, room)
         return padded.reshape(padded.shape[0] // step, step, padded.shape[1] // step, step)
 
-    return Outline(blocks(outline.maybe).any((1, 3)), blocks(outline.surely).all((1, 3)), outline.c2w,
+    return Outline(np.any(blocks(outline.maybe), (1, 3)), np.all(blocks(outline.surely), (1, 3)), outline.c2w,
                    outline.focal / step, outline.principal / step)
 
 

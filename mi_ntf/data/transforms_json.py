@@ -31,6 +31,7 @@ def read(folder: Path) -> Found:
     given = {split: sphere for split, sphere in spheres.items() if sphere is not None}
     sphere = given.get("train") or next(iter(given.values()), None)
     for split, (center, radius) in given.items():
+        assert sphere is not None  # it is one of them
         if not (np.allclose(center, sphere[0], atol=1e-6 * sphere[1]) and np.isclose(radius, sphere[1])):
             raise MiNtfError(f"{folder / f'transforms_{split}.json'}: 'unit_sphere' is {center.tolist()}, {radius:g}, "
                              f"another split says {sphere[0].tolist()}, {sphere[1]:g}; all splits show one object: "

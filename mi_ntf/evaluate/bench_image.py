@@ -13,6 +13,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -64,6 +65,7 @@ def integrator(columns: int, rows: int, **options):
 def timed(scene, integrator_, repeats: int, first: bool = True) -> list[float]:
     """Wall seconds of each of `repeats` renders, after a `first` one that compiles."""
     found = []
+    seed: Any  # a number, where Mitsuba's stub asks for an array
     for seed in range(repeats + first):
         dr.sync_thread()
         start = time.perf_counter()
@@ -76,7 +78,7 @@ def timed(scene, integrator_, repeats: int, first: bool = True) -> list[float]:
 def in_own_process(size: int, columns: int, rows: int, repeats: int) -> dict:
     """``seconds`` (list) and ``peak_bytes`` of such renders in a fresh process."""
     words = [sys.executable, "-m", "mi_ntf.evaluate.bench_image", "--size", str(size), "--columns", str(columns),
-             "--rows", str(rows), "--repeats", str(repeats), "--variant", mi.variant()]
+             "--rows", str(rows), "--repeats", str(repeats), "--variant", str(mi.variant())]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     if done.returncode:
         raise MiNtfError(f"{' '.join(words)}\nfailed with exit code {done.returncode}; its output ends with\n"

@@ -8,7 +8,10 @@ field: :class:`PaperField` adds a vanishing part of each query to the shipped fi
 Costs are measured per network query and composed; both sides of a ratio march, shade and query in kernels of one size.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -22,7 +25,6 @@ from ..infer.network import NetworkField
 from ..infer.profile import DepthProfile
 from ..render.commands.calibration import seconds, table_of
 from .bench_measure import Row, Sizes, row
-from .transmittance import directions
 
 LIGHTS = 500
 SIDE = 600
@@ -36,7 +38,8 @@ VANISHING = 1e-30
 def random_network(hidden: tuple[int, ...], seed: int = 0) -> NetworkField:
     """The paper's three networks, of `hidden` layers, with random weights of the usual variance."""
     rng = np.random.default_rng(seed)
-    architecture = Architecture(*(replace(PAPER.density, hidden=hidden) for _ in range(3)))
+    network = replace(PAPER.density, hidden=hidden)
+    architecture = Architecture(network, network, network)
     tensors = {}
     for name, shape in architecture.skeleton().items():
         scale = np.sqrt(2 / shape[-1]) if name.endswith("weight") else 0
@@ -65,14 +68,14 @@ def light_rays(lights: int, count: int):
     """``(o, d)`` of `count` rays in all, spread evenly over `lights` of the 500 directional lights and over the disc of
     each, radius 0.9."""
     index = np.arange(count)
-    d = directions(LIGHTS)[(index % lights) * (LIGHTS // lights)]
+    d = spheres.fibonacci(LIGHTS)[(index % lights) * (LIGHTS // lights)]
     r, phi = 0.9 * np.sqrt((index + 0.5) / count), index * np.pi * (3 - 5**0.5)
     side = np.cross(d, np.where(np.abs(d[:, :1]) > 0.9, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]]))
     side /= np.linalg.norm(side, axis=1, keepdims=True)
     o = r[:, None] * (np.cos(phi)[:, None] * side + np.sin(phi)[:, None] * np.cross(d, side))
-    o, d = (tuple(mi.Float(c) for c in v.T.astype(np.float32)) for v in (o, d))
-    dr.eval(o, d)
-    return o, d
+    rays = tuple(tuple(mi.Float(c) for c in v.T.astype(np.float32)) for v in (o, d))
+    dr.eval(rays)
+    return rays
 
 
 def tabulate(density, o, d, samples: int):
@@ -98,9 +101,15 @@ def stage_costs(medium, network: NetworkField, sizes: Sizes) -> dict[str, float]
     many = light_rays(sizes.slow_lights, sizes.queries)
     counts = {n: max(1, sizes.queries // n) for n in (STAGE_SAMPLES, IMAGE_SAMPLES)}
     few = {n: light_rays(sizes.slow_lights, count) for n, count in counts.items()}
-    work = {f"volume/{n}": (lambda n=n: tabulate(network.density, *few[n], n)) for n in counts}
-    work |= {name: (lambda net=net: net.ray_mixture(*many, profile)[2])
-             for name, net in (("map", network), ("ours", medium.field.network))}
+
+    def mixture(net):
+        return net.ray_mixture(*many, profile)[2]
+
+    work: dict[str, Callable[[], Any]] = {}
+    for n, (o, d) in few.items():
+        work[f"volume/{n}"] = partial(tabulate, network.density, o, d, n)
+    for name, net in (("map", network), ("ours", medium.field.network)):
+        work[name] = partial(mixture, net)
     found = seconds(work, sizes.repeats)
     rays = {f"volume/{n}": count for n, count in counts.items()}
     costs = {name: value / rays.get(name, sizes.queries) for name, value in found.items()}
@@ -112,8 +121,8 @@ def stage_rows(costs: dict[str, float], sizes: Sizes) -> list[Row]:
     """The transmittance stage: 500 directional lights, 64 + 192 samples a ray, m = 600² on both sides. Our network
     pays for the voxels that it reads, baked from the paper's field once."""
     rays = max(1, sizes.queries // STAGE_SAMPLES)
-    rest = {"extrapolated": f"volume: {sizes.slow_lights} lights, {rays} rays in all",
-            "details": {"costs": costs}}
+    rest: dict[str, Any] = {"extrapolated": f"volume: {sizes.slow_lights} lights, {rays} rays in all",
+                            "details": {"costs": costs}}
     m = max(sizes.paper_maps)
     slow, theirs, ours = (LIGHTS * m**2 * costs[name] for name in (f"volume/{STAGE_SAMPLES}", "map", "ours"))
     what = f"transmittance stage, {LIGHTS} lights, m = {m}², volume over map, "
@@ -131,7 +140,7 @@ def camera_cost(sensor, medium, paper: PaperField, sizes: Sizes):
     middle = dr.full(mi.Float, 0.5, dr.width(far))
     step = dr.opaque(mi.Float, 2 / IMAGE_SAMPLES)
     strand = Strand(paper.density, medium.field.grid, o, d, step)
-    last = []
+    last: list[shade.Points] = []
 
     def view():
         found = march.camera_samples([strand], far, middle, middle)
@@ -162,11 +171,10 @@ def shading_costs(medium, points, sizes: Sizes) -> dict[str, float]:
     from ..render.maps import building
 
     count = sizes.slow_lights
-    table = table_of(directions(count))
+    table = table_of(spheres.fibonacci(count))
     options = building.Options(2 / IMAGE_SAMPLES, sizes.map)
     built = {name: building.build(f"transmittance_{name}", medium, table, options) for name in ("volume", "map")}
-    found = seconds({f"shade/{n}": (lambda v=v: shade.reflect(points, table, v)) for n, v in built.items()},
-                    sizes.repeats)
+    found = seconds({f"shade/{n}": partial(shade.reflect, points, table, v) for n, v in built.items()}, sizes.repeats)
     return {n: v / max(dr.width(points.x[0]) * count, 1) for n, v in found.items()}
 
 

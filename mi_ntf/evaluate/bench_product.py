@@ -1,14 +1,18 @@
 """The shipped statue, rendered as users render it: whole images, many lights, one lookup, the map's error."""
 
 import statistics
+from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core import spheres
 from ..infer import shade
 from ..render.commands.calibration import seconds, table_of
-from . import bench_image, transmittance
+from . import bench_image, metrics, transmittance
 from .bench_measure import Row, Sizes, row
 
 
@@ -51,10 +55,10 @@ def collocated_rows(sizes: Sizes) -> list[Row]:
 
     cases = {"collocated": (at(0), "raymarch"), "raymarch": (at(0.02), "raymarch"),
              "map": (at(0.02), "transmittance_map")}
-    work = {}
+    work: dict[str, Callable[[], Any]] = {}
     for name, (scene, method) in cases.items():
         nrf = mi.load_dict({"type": "nrf", "visibility": method, "samples": bench_image.SAMPLES})
-        work[name] = lambda scene=scene, nrf=nrf: mi.render(scene, integrator=nrf, spp=1)
+        work[name] = partial(mi.render, scene, integrator=nrf, spp=1)
     found = seconds(work, sizes.repeats)
     what = f"{sizes.image}² image, one light at the camera, speed-up over "
     return [row(what + "a march for each point", found["raymarch"] / found["collocated"], "×", least=3, details=found),
@@ -67,7 +71,7 @@ def lookup_rows(medium, sizes: Sizes) -> list[Row]:
     from ..render.maps import building
 
     count, width = 10 * sizes.slow_lights, max(1 << 10, sizes.queries // 4)
-    points, d = _inside(medium, width), transmittance.directions(count)
+    points, d = _inside(medium, width), spheres.fibonacci(count)
     tables = {"": table_of(d), " of a point light": table_of(2.5 * d, True),
               " of a light inside the sphere": table_of(0.5 * d, True)}
     tables[" of two logistics"] = tables[""]
@@ -75,16 +79,18 @@ def lookup_rows(medium, sizes: Sizes) -> list[Row]:
     for name, table in tables.items():
         options = building.Options(2 / 384, sizes.map, map_components=2 if "two" in name else 1)
         tmap = building.build("transmittance_map", medium, table, options)
-        work |= {f"map{name}": lambda table=table, tmap=tmap: shade.reflect(points, table, tmap),
-                 f"none{name}": lambda table=table: shade.reflect(points, table, _Everything())}
+        work |= {f"map{name}": partial(shade.reflect, points, table, tmap),
+                 f"none{name}": partial(shade.reflect, points, table, _Everything())}
     found = seconds(work, max(sizes.repeats, 3))
     ns = {k: 1e9 * v / (width * count) for k, v in found.items()}
     gather = ns["gathers"] - ns["none"]
     rows = [Row("four bare gathers where a map is looked up, per point and light", gather, "ns")]
     for name in tables:
         lookup = ns[f"map{name}"] - ns[f"none{name}"]
-        asked = {} if name else {"asked": "≤ 8 ns, or ≤ 2 × four gathers", "met": lookup <= 8 or lookup <= 2 * gather,
-                                 "details": {k + "_ns": v for k, v in ns.items()}}
+        asked: dict[str, Any] = {} if name else {
+            "asked": "≤ 8 ns, or ≤ 2 × four gathers", "met": lookup <= 8 or lookup <= 2 * gather,
+            "details": {k + "_ns": v for k, v in ns.items()},
+        }
         rows.append(Row(f"lookup of a map{name} in the shading loop, per point and light", lookup, "ns", **asked))
     return rows
 
@@ -126,14 +132,14 @@ class Gathers:
 def error_rows(scene, sizes: Sizes) -> list[Row]:
     """Image error of maps marched from the field, against a fine march."""
     lit = transmittance.with_lights(scene, sizes.error_lights)
-    samples = {"samples": 1536, "hide_emitters": True}
+    samples: dict[str, Any] = {"samples": 1536, "hide_emitters": True}
     tmap = samples | {"visibility": "transmittance_map", "map_resolution": sizes.error_map}
     kinds = {"fine": samples | {"visibility": "raymarch"}, "logistic": tmap, "mixture": tmap | {"map_components": 2}}
     images = {k: np.array(mi.render(lit, integrator=mi.load_dict({"type": "nrf", **v}), spp=4))[..., :3]
               for k, v in kinds.items()}
     truth = images.pop("fine")
     return [row(f"map_source=field, {sizes.error_map}², {kind}, relative RMSE to a march, 1536 samples, "
-                f"{sizes.error_lights} lights", 100 * float(np.sqrt(((v - truth) ** 2).mean() / (truth**2).mean())),
+                f"{sizes.error_lights} lights", 100 * metrics.relative_rmse(v, truth),
                 "%", most={"logistic": 2, "mixture": 1}[kind]) for kind, v in images.items()]
 
 

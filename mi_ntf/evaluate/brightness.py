@@ -9,6 +9,7 @@ others than 2 also what the bounces beyond the first add to the mean, of the fie
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -51,7 +52,7 @@ def study(mesh: Path, field: Path, size: int = 96, depth: int = 2) -> dict[str, 
     sensor, found = original.sensors()[0], {}
 
     def image(kind: str, light: dict, depth: int) -> np.ndarray:
-        own = {"mesh": {"type": "path"}, "field": {"type": "nrf", "environment_lights": CELLS}}[kind]
+        own: dict[str, Any] = {"type": "path"} if kind == "mesh" else {"type": "nrf", "environment_lights": CELLS}
         integrator = {**own, "max_depth": depth, "hide_emitters": True}
         scene = mi.load_dict({"type": "scene", "integrator": integrator, "light": light, **bodies[kind]})
         return np.array(mi.render(scene, sensor=sensor, spp=SPP[kind]), np.float64)[..., :3]

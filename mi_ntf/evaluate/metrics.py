@@ -7,20 +7,21 @@ need the extra ``eval``.
 
 import numpy as np
 
+from mi_ntf.core import ops
+from mi_ntf.core import srgb as curve
 from mi_ntf.core.errors import MiNtfError
 
 SSIM_WINDOW = 11
 
 
 def srgb(linear: np.ndarray) -> np.ndarray:
-    """Linear values, clipped to [0, 1], encoded by the sRGB curve (IEC 61966-2-1)."""
-    x = np.clip(linear, 0, 1)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 0.0031308) ** (1 / 2.4) - 0.055)
+    """Linear values, clipped to [0, 1], encoded by the sRGB curve."""
+    return curve.encode(ops, linear)
 
 
 def linear(encoded: np.ndarray) -> np.ndarray:
     """Inverse of :func:`srgb`, for values in [0, 1]."""
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    return curve.decode(ops, encoded)
 
 
 def relative_rmse(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:

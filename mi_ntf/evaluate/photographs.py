@@ -9,6 +9,7 @@ their shading normals and the field's, degrees, over pixels that both fill.
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -36,7 +37,8 @@ def study(field: Path, dataset: Path, mesh: Path | None = None, spp: int = 32, d
                 "intensity": {"type": "rgb", "value": split.light_intensity[i].tolist()}}
         integrator = {"type": "nrf", "max_depth": depth, "aovs": "normal,opacity" if mesh else ""}
         scene = mi.load_dict({"type": "scene", "integrator": integrator, "lamp": lamp, "ball": ball})
-        image = np.array(mi.render(scene, sensor=view, spp=spp, seed=i))
+        seed: Any = i  # a number, where Mitsuba's stub asks for an array
+        image = np.array(mi.render(scene, sensor=view, spp=spp, seed=seed))
         truth = photograph[..., :3].astype(np.float64)
         scores.append((metrics.psnr(image[..., :3], truth), metrics.ssim(image[..., :3], truth)))
         if originals is not None:

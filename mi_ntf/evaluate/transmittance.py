@@ -11,6 +11,7 @@ import argparse
 import statistics
 import time
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -18,7 +19,10 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-VARIANTS = {
+from ..core.spheres import fibonacci
+from .metrics import relative_rmse
+
+VARIANTS: dict[str, dict[str, Any]] = {
     "neural_transmittance": {"visibility": "neural_transmittance"},
     "map, field, 128²": {"visibility": "transmittance_map", "map_resolution": 128},
     "map, field, 256²": {"visibility": "transmittance_map", "map_resolution": 256},
@@ -27,18 +31,11 @@ VARIANTS = {
 }
 
 
-def directions(count: int) -> np.ndarray:
-    """`count` unit vectors (count, 3), evenly spread (Fibonacci)."""
-    z = 1 - (np.arange(count) + 0.5) * 2 / count
-    phi = np.arange(count) * np.pi * (3 - 5**0.5)
-    return np.stack([np.sqrt(1 - z * z) * np.cos(phi), np.sqrt(1 - z * z) * np.sin(phi), z], 1)
-
-
 def with_lights(scene, count: int):
     """The field and the view of `scene` under `count` directional lights."""
     parts = {"type": "scene", "sensor": scene.sensors()[0]}
     parts |= {f"shape{i}": shape for i, shape in enumerate(scene.shapes())}
-    for i, d in enumerate(directions(count)):
+    for i, d in enumerate(fibonacci(count)):
         parts[f"light{i}"] = {"type": "directional", "direction": list(-d), "irradiance": 1.0}
     return mi.load_dict(parts)
 
@@ -53,7 +50,7 @@ def study(path: Path, size: int, spp: int, count: int) -> dict[str, float]:
         integrator = mi.load_dict({"type": "nrf", "hide_emitters": True, **options})
         images[name] = np.array(mi.render(scene, integrator=integrator, spp=spp))[..., :3]
     truth = images.pop("raymarch")
-    result = {k: float(np.sqrt(((v - truth) ** 2).mean() / (truth**2).mean())) for k, v in images.items()}
+    result = {k: relative_rmse(v, truth) for k, v in images.items()}
     return result | {"ns": query_time(find_media(scene)[0])}
 
 
@@ -62,11 +59,11 @@ def query_time(medium, count: int = 1 << 20) -> float:
     from ..infer.profile import FOR_NETWORKS, DepthProfile
 
     rng = np.random.default_rng(0)
-    d = rng.normal(size=(3, count))
-    d /= np.linalg.norm(d, axis=0)
+    way = rng.normal(size=(3, count))
+    way /= np.linalg.norm(way, axis=0)
     low, high = medium.field.grid.bounds
-    x = (low + rng.uniform(size=(count, 3)) * (high - low)).T
-    x, d = (tuple(mi.Float(c.astype(np.float32)) for c in v) for v in (x, d))
+    place = (low + rng.uniform(size=(count, 3)) * (high - low)).T
+    x, d = (tuple(mi.Float(c.astype(np.float32)) for c in v) for v in (place, way))
     profile = DepthProfile(medium.source.density, medium.field.grid, dr.opaque(mi.Float, FOR_NETWORKS * 2 / 384))
     times = []
     for _ in range(6):

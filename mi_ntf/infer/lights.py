@@ -1,6 +1,7 @@
 """A table of discrete lights in field coordinates: what the exhaustive light sum loops over."""
 
 from types import ModuleType
+from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -36,8 +37,8 @@ class LightTable:
         self._rows = dj.Float(rows.astype(np.float32).ravel())
         self._scale = dr.opaque(dj.Float, scale)
         self.moving = False  # whether a light's place carries gradients
-        columns = [] if cones is None else np.array(np.transpose(cones), np.float32, order="C")
-        self._cones = [dj.Float(c) for c in columns] or None
+        columns = () if cones is None else np.array(np.transpose(cones), np.float32, order="C")
+        self._cones: list | None = [dj.Float(c) for c in columns] or None
 
     def part(self, first: int, last: int) -> "LightTable":
         """The lights `first` … `last` − 1 as a table of their own."""
@@ -51,13 +52,15 @@ class LightTable:
         """Let gradients flow to `where`, `power` and, if there are cones, their `axes`: 3-tuples of arrays of a number
         a light. Their values stay."""
         self.moving = dr.grad_enabled(where) or dr.grad_enabled(axes)
-        if axes is not None:
-            self._cones[:3] = [dr.replace_grad(c, axis) for c, axis in zip(self._cones, axes, strict=False)]
+        # Dr.Jit's stub has replace_grad return nothing.
+        replaced: Any = dr.replace_grad
+        if axes is not None and self._cones is not None:
+            self._cones[:3] = [replaced(c, axis) for c, axis in zip(self._cones, axes, strict=False)]
         rows = self.dj.Float(self._rows)
         first = 8 * dr.arange(self.dj.UInt32, self.count)
         for offset, column in zip((0, 1, 2, 4, 5, 6), (*where, *power), strict=True):
             dr.scatter(rows, column, first + offset)
-        self._rows = dr.replace_grad(self._rows, rows)
+        self._rows = replaced(self._rows, rows)
 
     def sample(self, index, x, active):
         """Light `index` seen from `x`: ``(wi, irradiance, distance)``.

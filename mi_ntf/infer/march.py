@@ -30,7 +30,7 @@ class Samples:
     view: object
     transmittance: object
     first: object
-    count: object
+    count: Any
 
     def line(self, i: int, ray):
         """``(o, d)`` of the rays `ray` in the coordinates of field `i`."""
@@ -53,14 +53,18 @@ class Samples:
         values are attached."""
         count = self.count
 
+        def more(k, sums):
+            return k < count
+
         def body(k, sums):
             return k + 1, [s + dr.gather(type(s), v, self.first + k, k < count)
                            for s, v in zip(sums, values, strict=True)]  # fmt: skip
 
         n = dr.width(count)
+        state: Any = (dr.zeros(type(count), n), [dr.zeros(type(self.t), n) for _ in values])
         return dr.while_loop(
-            state=(dr.zeros(type(count), n), [dr.zeros(type(self.t), n) for _ in values]),
-            cond=lambda k, sums: k < count,
+            state=state,
+            cond=more,
             body=body,
             label="samples of a ray",
             max_iterations=-1 if gradients else None,  # a sum

@@ -1,6 +1,7 @@
 """The field as its networks, in Dr.Jit: the twin of :mod:`mi_ntf.core.reference` (conventions there)."""
 
 from types import ModuleType
+from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -124,7 +125,7 @@ class _Network:
             for ours, theirs in (("weight", "weights"), ("bias", "bias")):
                 value = np.ascontiguousarray(tensors[f"{name}.layers.{i}.{ours}"], np.float16 if half else np.float32)
                 net[f"layers.{2 * i}.{theirs}"] = tensor(value)
-        self.packed = nn.pack(net, layout="inference")
+        self.packed: Any = nn.pack(net, layout="inference")  # the network, called
 
     def encode(self, p) -> list:
         """Features of the points `p`, a list of scalar arrays."""

@@ -38,7 +38,8 @@ def _measure(grid, n: int, dj: ModuleType) -> tuple[np.ndarray, float]:
 
     index = _occupied(grid, n, dj)
     if len(index):
-        out = _depth(grid, *look(index), skin.DEEPEST).numpy()
+        x, normal = look(index)
+        out = _depth(grid, x, normal, skin.DEEPEST).numpy()
         seen = (out > 0) & (out < skin.DEEPEST)
         index, out = index[seen], out[seen]
     if len(index):
@@ -101,5 +102,6 @@ def _box(values: np.ndarray) -> np.ndarray:
     for axis in range(3):
         padded = np.pad(values, [(1, 1) if a == axis else (0, 0) for a in range(3)])
         n = values.shape[axis]
-        values = sum(padded.take(range(k, k + n), axis) for k in range(3))
+        first, second, third = (padded.take(range(k, k + n), axis) for k in range(3))
+        values = first + second + third
     return values

@@ -59,5 +59,6 @@ def _warn(where: Path | None, reason: str) -> None:
     """Once for each folder."""
     if where not in _warned:
         _warned.add(where)
-        mi.Log(mi.LogLevel.Warn, f"mi_ntf keeps nothing for later renders: {reason}. XDG_CACHE_HOME names another "
-                                 "folder, MI_NTF_MAP_CACHE=memory does without.")
+        text = (f"mi_ntf keeps nothing for later renders: {reason}. XDG_CACHE_HOME names another folder, "
+                "MI_NTF_MAP_CACHE=memory does without.")
+        mi.Log(mi.LogLevel.Warn, text)  # type: ignore[operator]  # an object in the stub

@@ -77,13 +77,12 @@ class Bounced:
 
     def _direct(self, marched: TransmittanceTargets, x: np.ndarray, normal: np.ndarray) -> np.ndarray:
         """(views, patches, 3): irradiance by the flashes alone."""
-        outside = _tensor(radiosity.above(x, normal))
-        normal = _tensor(normal)
+        outside, upward = _tensor(radiosity.above(x, normal)), _tensor(normal)
         result = torch.zeros(len(self.power), len(x), 3)
         for place, power, lit in zip(self.flash.place, self.power, result, strict=True):
             away = place - outside
             distance = away.norm(dim=1)
-            cos = (away * normal).sum(1) / distance
+            cos = (away * upward).sum(1) / distance
             faces = (cos > 0).nonzero()[:, 0]
             _, depth = walk(marched, outside[faces], (away / distance[:, None])[faces], 6.0)
             lit[faces] = (cos[faces] / distance[faces] ** 2 * torch.exp(-depth))[:, None] * power

@@ -32,9 +32,9 @@ def read(path: Path, identity: dict) -> dict | None:
     if changed:
         raise MiNtfError(f"{path} belongs to a run on other data: {', '.join(changed)} changed since; put back what "
                          "the run began with, or delete the file to start anew")
-    changed = {k: found.get(k) for k in _differences(found, {k: v for k, v in identity.items() if k != "data"})}
-    if changed:
-        raise MiNtfError(f"{path} belongs to a run with other settings ({str(changed)[:200]}); repeat that command, or "
+    others = {k: found.get(k) for k in _differences(found, {k: v for k, v in identity.items() if k != "data"})}
+    if others:
+        raise MiNtfError(f"{path} belongs to a run with other settings ({str(others)[:200]}); repeat that command, or "
                          "delete the file to start anew")
     return state
 

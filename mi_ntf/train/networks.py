@@ -71,8 +71,8 @@ class Networks:
             pairs = depth_profile.components(ops, raw[:count], places, total, h)
         else:
             ends = torch.cat([torch.stack(p, 1) for p in spheres.end_points(m, d.unbind(1), h)], 1)
-            raw = perceptron(self.tensors, "transmittance", encode(net.encoding, self.tensors, "transmittance", ends))
-            raw = raw.unbind(1)
+            features = encode(net.encoding, self.tensors, "transmittance", ends)
+            raw = perceptron(self.tensors, "transmittance", features).unbind(1)
             pairs = [logistic.parameters(ops, raw[i], raw[i + 1], h) for i in range(0, count, 2)]
         mix = mixture.from_outputs(ops, pairs, list(raw[count:]), h)
         return hit, torch.stack([torch.stack(part, 1) for part in mix], 1)

@@ -1,5 +1,6 @@
 """Photographs as camera rays in field coordinates, and what of space they leave possibly occupied."""
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -52,11 +53,11 @@ class Photographs:
         self.stored = torch.as_tensor(split.images).reshape(-1, 4)
         self.levels = self.stored.dtype == torch.uint8
         """Whether pixels are 8-bit levels, which end at both ends."""
-        exact = {"dtype": torch.float64}
-        self.rotation = torch.as_tensor(split.c2w[:, :3, :3], **exact)
-        self.origin = torch.as_tensor((split.c2w[:, :3, 3] - split.center) / split.radius, **exact)
-        self.focal, self.principal = (torch.as_tensor(v, **exact) for v in (split.focal, split.principal))
-        self.flash = torch.as_tensor((split.light_pos - split.center) / split.radius, **exact)
+        exact = functools.partial(torch.as_tensor, dtype=torch.float64)
+        self.rotation = exact(split.c2w[:, :3, :3])
+        self.origin = exact((split.c2w[:, :3, 3] - split.center) / split.radius)
+        self.focal, self.principal = exact(split.focal), exact(split.principal)
+        self.flash = exact((split.light_pos - split.center) / split.radius)
         """Where the light is (views, 3), field coordinates."""
         self.light = torch.as_tensor(split.light_intensity / split.radius**2).float()
         self.windows = torch.tensor([0, self.height, 0, self.width]).expand(self.views, 4)
@@ -125,7 +126,7 @@ class Photographs:
         return pixels, len(rows), len(columns)
 
 
-def sphere_span(o: torch.Tensor, d: torch.Tensor):
+def sphere_span(o: torch.Tensor, d: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """``(t0, t1)`` where the rays are inside the unit sphere and in front of their origin; t1 = t0 where they miss."""
     hit, m, h = spheres.chord(ops, o.unbind(1), d.unbind(1))
     middle = ((torch.stack(m, 1) - o) * d).sum(1)

@@ -141,7 +141,8 @@ class Report:
         steps = [entry["step"] for entry in history]
         self.page.curves("Validation", {"PSNR": (steps, [entry["psnr"] for entry in history])}, "step", "dB")
         if trace:
-            self.page.curves("Loss, running mean", {"loss": tuple(zip(*trace, strict=True))}, "step", "")
+            when, loss = zip(*trace, strict=True)
+            self.page.curves("Loss, running mean", {"loss": (when, loss)}, "step", "")
 
     def photographs(self, names: tuple[str, ...], agreement: Agreement, gains: torch.Tensor | None) -> None:
         """What each photograph for training differs by."""

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 import torch
 
-from . import device
+from ..core import srgb as curve
+from . import device, ops
 from .bounced import Bounced
 from .flash import Flash
 from .networks import Networks
@@ -21,8 +22,7 @@ CELLS = 128
 
 def srgb(x: torch.Tensor) -> torch.Tensor:
     """sRGB-encoded, clipped to [0, 1], of linear values."""
-    x = x.clamp(0, 1)
-    return torch.where(x <= 0.0031308, 12.92 * x, 1.055 * x.clamp(min=1e-8) ** (1 / 2.4) - 0.055)
+    return curve.encode(ops, x)
 
 
 @dataclass(frozen=True)

@@ -72,7 +72,7 @@ def train(dataset: Path, out: Path, *, preset: str = "fast", minutes: float | No
         before = None if field is None else hashlib.sha256(Path(field).read_bytes()).hexdigest()
         run = kind(Path(dataset), Path(out), config, preset, minutes=None if steps is not None else float(limit),
                    steps=steps, seed=seed, tensorboard=tensorboard, given=before, reading=reading, estimate=estimate)
-        if given is not None:
+        if field is not None and given is not None:
             run.take(field, *given)
         run.resume()
         if not run.step and given is None:
@@ -89,7 +89,8 @@ class _Loop(Recipe):
     def __init__(self, dataset: Path, out: Path, config: TrainConfig | HierarchicalConfig, preset: str, *, minutes,
                  steps, seed, tensorboard=None, given=None, reading=None, estimate=False):
         self.log = Log(tensorboard if parallel.first() else None)
-        super().__init__(dataset, config, minutes, steps, seed, reading, estimate)
+        # The stepper's, next in line.
+        super().__init__(dataset, config, minutes, steps, seed, reading, estimate)  # type: ignore[call-arg]
         self.out, self.checkpoint = out, Path(f"{out}.ckpt")
         identity = {"preset": preset, "minutes": minutes, "steps": steps, "seed": seed,
                     "config": dataclasses.asdict(config), "field": given, "estimate": estimate,

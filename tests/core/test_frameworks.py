@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from helpers.frameworks import BACKENDS, oracle
 
-from mi_ntf.core import fresnel, logistic, microfacet, ops, spheres
+from mi_ntf.core import fresnel, logistic, microfacet, ops, spheres, srgb
 
 COUNT = 4000
 STEP = 1e-6
@@ -58,11 +58,6 @@ def _end_points(o, x, y, z, dx, dy, dz, h):
     return *p1, *p2
 
 
-def _from_end_points(o, *c):
-    m, d, h = spheres.from_end_points(o, c[:3], c[3:])
-    return *m, *d, h
-
-
 T, B = _uniform(-1, 1), _uniform(-1.1, 1.1)
 GENTLE, STEEP = _log_uniform(0.01, 20), _log_uniform(20, 665)
 # z = a (t − b) carries 3 roundings of 6e-8·|z|; where S(z) is not yet flat |z| < 15 for gentle slopes: 1e-6. Steep ones
@@ -70,7 +65,6 @@ GENTLE, STEEP = _log_uniform(0.01, 20), _log_uniform(20, 665)
 FORMULAS = [
     Formula("chord", _chord, (_point, _direction), 1e-6, 5e-6),
     Formula("end_points", _end_points, (_point, _direction, _uniform(0.05, 1)), 5e-7, 5e-7),
-    Formula("from_end_points", _from_end_points, (_point, _direction), 1e-6, 3e-6),
     Formula("coordinate", lambda o, *c: [spheres.coordinate(c[:3], c[3:])], (_point, _direction), 5e-7, 5e-7),
     Formula("sigmoid", lambda o, z: [logistic.sigmoid(o, z)], (_uniform(-90, 90),), 5e-7, 5e-7),
     Formula("softplus", lambda o, z: [logistic.softplus(o, z)], (_uniform(-90, 90),), 5e-7, 5e-7),
@@ -79,11 +73,6 @@ FORMULAS = [
     Formula("transmittance, steep", lambda o, *c: [logistic.transmittance(o, *c)], (T, STEEP, B), 5e-5, 1e-4, 665.0),
     Formula("optical_depth", lambda o, *c: [logistic.optical_depth(o, *c)], (T, GENTLE, B), 3e-6, 6e-6),
     Formula("optical_depth, steep", lambda o, *c: [logistic.optical_depth(o, *c)], (T, STEEP, B), 1e-6, 1e-4, 100.0),
-    Formula("mean_transmittance, short steps", lambda o, t, w, a, b: [logistic.mean_transmittance(o, t, t + w, a, b)],
-            (T, _log_uniform(1e-4, 0.02), GENTLE, B), 3e-6, 1e-5),
-    # The difference of two softplus over Δ ≥ ½, derivatives over Δ and the width (0.05): rounding divided by both.
-    Formula("mean_transmittance, long steps", lambda o, t, w, a, b: [logistic.mean_transmittance(o, t, t + w, a, b)],
-            (T, _uniform(0.05, 1), GENTLE, B), 3e-6, 3e-5),
     # ln a is 6.5 tanh: 6.5·2e-7 of a; derivative likewise.
     Formula("parameters", lambda o, *c: logistic.parameters(o, *c), (_uniform(-12, 12), _uniform(-5, 5),
             _uniform(0.05, 1)), 3e-6, 1e-5),
@@ -92,7 +81,7 @@ FORMULAS = [
             (T, _log_uniform(0.02, 1), _log_uniform(0.02, 1), _log_uniform(0.01, 1)), 3e-6, 3e-5, 10.0),
     # dD/dα is a difference of two terms 1000 times its value where it crosses zero.
     Formula("ggx", lambda o, s, a: [microfacet.ggx(s, a)], (_uniform(0, 1), _log_uniform(0.0225, 1)), 1e-6, 3e-5),
-    Formula("smith_g1", lambda o, c, a: [microfacet.smith_g1(o, c, a)], (_uniform(0, 1), _log_uniform(0.0225, 1)),
+    Formula("smith", lambda o, c, a: [2 * c * microfacet.smith(o, c, a)], (_uniform(0, 1), _log_uniform(0.0225, 1)),
             1e-6, 3e-6),
     # Directions rounded by 6e-8 under a lobe of width α ≥ 0.0225: 6e-8/α per order of derivative, unit peak-relative.
     Formula("lobes", lambda o, *c: microfacet.lobes(o, c[:3], c[3:6], c[6:9], c[9]),
@@ -111,6 +100,8 @@ FORMULAS = [
     Formula("diffuse_albedo", lambda o, *c: [microfacet.diffuse_albedo(*c)],
             (_uniform(0, 1), _uniform(0.15, 1), _uniform(0, 1)), 5e-7, 5e-7),
     Formula("normalize", lambda o, *c: ops.normalize(o, c), (_point,), 5e-7, 1e-5, 1.0),
+    Formula("sRGB", lambda o, x: [srgb.encode(o, x)], (_uniform(-0.2, 1.2),), 5e-7, 5e-6),
+    Formula("sRGB, back", lambda o, x: [srgb.decode(o, x)], (_uniform(0, 1),), 5e-7, 5e-6),
 ]
 
 
@@ -146,8 +137,6 @@ SINGULAR = {
     "tangent line": (lambda o, x: _chord(o, x, 0 * x, 0 * x, 0 * x, 0 * x, x), 1.0),
     "line far outside": (lambda o, x: _chord(o, 50 * x, 0 * x, 0 * x, 0 * x, 0 * x, x), 1.0),
     "line through the centre": (lambda o, x: _chord(o, 0 * x, 0 * x, x, 0 * x, 0 * x, x), 1.0),
-    "coinciding end points": (lambda o, x: _from_end_points(o, x, 0 * x, 0 * x, x, 0 * x, 0 * x), 1.0),
-    "step of no width": (lambda o, x: [logistic.mean_transmittance(o, x, x, 600 * x, 0 * x)], 1.0),
     "huge logit": (lambda o, x: [logistic.sigmoid(o, x), logistic.sigmoid(o, -x), logistic.softplus(o, x)], 1e30),
     "huge raw parameters": (lambda o, x: logistic.parameters(o, x, -x, 0.5 + 0 * x), 1e30),
     "coinciding quantiles": (lambda o, x: logistic.through_quantiles(o, x, x, x, 0 * x), 0.3),

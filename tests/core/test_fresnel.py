@@ -40,7 +40,8 @@ def _reflected(cos, roughness, n=400):
     oh = dot(o, h)
     ci = 2 * oh * h[2] - cos
     ok = (oh > 0) & (ci > 0)
-    g = microfacet.smith_g1(ops, np.where(ok, ci, 1.0), alpha) * microfacet.smith_g1(ops, cos, alpha)
+    ci = np.where(ok, ci, 1.0)
+    g = 4 * ci * cos * microfacet.smith(ops, ci, alpha) * microfacet.smith(ops, cos, alpha)
     weight = np.where(ok, g * oh / (cos * c), 0)
     return weight.mean(), (weight * (1 - np.clip(oh, 0, 1)) ** 5).mean()
 

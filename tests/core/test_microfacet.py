@@ -44,7 +44,7 @@ def test_normal_distribution_is_normalised(roughness):
 
 @pytest.mark.parametrize("roughness", ROUGHNESS)
 @pytest.mark.parametrize("cos_v", [0.05, 0.4, 1.0])
-def test_smith_g1_makes_the_visible_facets_cover_the_projected_area(roughness, cos_v):
+def test_smith_makes_the_visible_facets_cover_the_projected_area(roughness, cos_v):
     # Heitz 2014, eq. 14: ∫ G1(v) D(h) max(⟨v,h⟩, 0) dh = cos_v ties G1 to D; no formula of G1 enters the integral.
     alpha = roughness**2
     t, w = _nodes(400)
@@ -57,7 +57,7 @@ def test_smith_g1_makes_the_visible_facets_cover_the_projected_area(roughness, c
     # dh·D·cos = du·dφ/2π
     area = np.einsum("i,j,ij->", w / 2, w / 2, visible)
     # 3e-3: the kink at ⟨v,h⟩ = 0 on 400² nodes.
-    assert microfacet.smith_g1(ops, cos_v, alpha) * area == pytest.approx(cos_v, rel=3e-3)
+    assert 2 * cos_v * microfacet.smith(ops, cos_v, alpha) * area == pytest.approx(cos_v, rel=3e-3)
 
 
 def _visible_normals(wo, alpha, count=300):

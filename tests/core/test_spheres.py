@@ -38,19 +38,6 @@ def test_chord_meets_the_sphere_and_its_midpoint_is_perpendicular(o, d):
             assert np.linalg.norm(p) == pytest.approx(1, abs=1e-14)
 
 
-@given(directions, directions)
-def test_round_trip_from_points_on_the_sphere(p1, p2):
-    if np.linalg.norm(p2 - p1) < 2 * spheres.MIN_HALF_CHORD * 1.001:
-        return  # grazing: no chord by definition
-    m, d, h = (np.array(v) for v in spheres.from_end_points(ops, tuple(p1), tuple(p2)))
-    assert np.linalg.norm(d) == pytest.approx(1, abs=1e-15)
-    hit, m2, h2 = _chord(m + 0.3 * h * d, d)
-    assert hit
-    # End points to 1e-13: 1e-16 of the inputs over the shortest half chord, 0.05, twice.
-    np.testing.assert_allclose(spheres.end_points(tuple(m2), tuple(d), h2), [p1, p2], atol=1e-13)
-    assert h2 == pytest.approx(float(h), abs=1e-13)
-
-
 @given(near_points, directions)
 def test_reversal_swaps_the_end_points_and_negates_t(o, d):
     hit, m, h = _chord(o, d)
@@ -101,25 +88,17 @@ def test_float32_error_grows_with_the_distance_and_no_faster(distance):
     assert np.abs(h - h64)[deep].max() < 1.2e-6 * distance  # dh = m·dm/h, |m|/h < 2 there
 
 
-def test_shortest_chords_in_float32_lose_at_most_a_part_in_10000_of_their_direction():
-    rng = np.random.default_rng(2)
-    d = rng.normal(size=(20000, 3))
-    d /= np.linalg.norm(d, axis=1, keepdims=True)
-    across = np.cross(d, rng.normal(size=(20000, 3)))
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    h = rng.uniform(spheres.MIN_HALF_CHORD, 0.1, (20000, 1))
-    p = [np.float32(np.sqrt(1 - h * h) * across + s * h * d) for s in (-1, 1)]
-    m, d2, h2 = spheres.from_end_points(ops, tuple(p[0].T), tuple(p[1].T))
-    assert np.abs(np.array(d2).T - d).max() < 3e-6  # end points rounded by 6e-8, over 2·0.05
-    assert np.abs(h2 - h[:, 0]).max() < 2e-7  # three coordinates rounded by 6e-8
-    assert np.abs(np.array(m).T - np.sqrt(1 - h * h) * across).max() < 2e-7
-
-
 def test_lines_that_miss_or_graze_have_finite_results():
     d = (np.zeros(5), np.zeros(5), np.ones(5))
     x = np.array([0.0, 1.0, 1.0 - 1e-12, np.sqrt(1 - 0.0499**2), 50.0])
     hit, m, h = spheres.chord(ops, (x, 0 * x, 3 + 0 * x), d)
     assert hit.tolist() == [True, False, False, False, False]
     np.testing.assert_allclose(h, [1, 0.05, 0.05, 0.05, 0.05])
-    m, d, h = spheres.from_end_points(ops, (1.0, 0.0, 0.0), (1.0, 0.0, 0.0))
-    assert np.isfinite([*m, *d, h]).all() and h < 1e-9
+    assert np.isfinite(m).all()
+
+
+def test_lattice_is_spread_evenly():
+    d = spheres.fibonacci(50)
+    np.testing.assert_allclose(np.linalg.norm(d, axis=1), 1, rtol=1e-12)
+    assert np.abs(d.mean(0)).max() < 0.02  # its points balance each other
+    assert (d @ d.T - 2 * np.eye(50)).max() < np.cos(0.3)  # 50 caps of equal area have a radius of 0.28

@@ -3,20 +3,12 @@
 from pathlib import Path
 
 import mitsuba as mi
-import numpy as np
 from helpers.variants import VARIANT
 
 import mi_ntf.render
 from mi_ntf.evaluate import transmittance
 
 STATUE = Path(__file__).parents[2] / "scenes/statue/scene.xml"
-
-
-def test_directions_are_spread_evenly():
-    d = transmittance.directions(50)
-    np.testing.assert_allclose(np.linalg.norm(d, axis=1), 1, rtol=1e-12)
-    assert np.abs(d.mean(0)).max() < 0.02  # Fibonacci points balance each other
-    assert (d @ d.T - 2 * np.eye(50)).max() < np.cos(0.3)  # 50 caps of equal area have a radius of 0.28
 
 
 def test_study_of_the_statue():

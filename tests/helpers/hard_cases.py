@@ -12,6 +12,7 @@ from helpers.jit import arrays
 from mi_ntf.infer.grid import GridField
 from mi_ntf.infer.lights import LightTable
 from mi_ntf.infer.network import MIN_DENSITY, NetworkField
+from mi_ntf.infer.skin import Softness
 from mi_ntf.infer.visibility import outside
 from mi_ntf.render.maps import building
 
@@ -46,7 +47,7 @@ def baked(header, tensors, resolution: int = 192):
     """A field as a render holds it: stands for a medium whose frame is the identity."""
     network = NetworkField(header, tensors, mi)
     grid = GridField(network, resolution, mi)
-    return SimpleNamespace(source=grid, field=SimpleNamespace(network=network, grid=grid))
+    return SimpleNamespace(source=grid, field=SimpleNamespace(network=network, grid=grid, softness=Softness(grid, mi)))
 
 
 def seen_from(x: np.ndarray, light) -> tuple:

@@ -19,6 +19,7 @@ from mi_ntf.infer import ops as infer_ops
 from mi_ntf.infer.grid import CELLS, GridField
 from mi_ntf.infer.lights import LightTable
 from mi_ntf.infer.network import NetworkField
+from mi_ntf.infer.skin import Softness
 from mi_ntf.render.maps import building
 
 METHODS = {
@@ -69,7 +70,7 @@ def _balls(what: Balls, factor: float):
             values[:] = rng.normal(size=values.shape) * 0.5 * what.wild
     network = NetworkField(header, tensors, mi)
     grid = GridField(network, 48, mi)
-    return SimpleNamespace(source=grid, field=SimpleNamespace(network=network, grid=grid))
+    return SimpleNamespace(source=grid, field=SimpleNamespace(network=network, grid=grid, softness=Softness(grid, mi)))
 
 
 class Exact:
@@ -133,7 +134,7 @@ class Exact:
         grid = SimpleNamespace(clearance=dr.zeros(mi.Float, CELLS**3), hull=corners, density=self.density)
         network = Balls(0).medium().field.network
         return SimpleNamespace(source=SimpleNamespace(density=self.density, reflectance=self.reflectance),
-                               field=SimpleNamespace(network=network, grid=grid))
+                               field=SimpleNamespace(network=network, grid=grid, softness=Softness(grid, mi)))
 
 
 def _inside(x, d, radius):

@@ -84,7 +84,6 @@ def test_gradient_of_the_planes_is_that_of_finite_differences():
 FORMULAS = {
     "transmittance": (lambda o, t, a, b: logistic.transmittance(o, t, a, b), 3),
     "optical_depth": (lambda o, t, a, b: logistic.optical_depth(o, t, a, b), 3),
-    "mean_transmittance": (lambda o, t, a, b: logistic.mean_transmittance(o, t, t + 0.3, a, b), 3),
     "parameters": (lambda o, a, b, h: sum(logistic.parameters(o, a, b, h)), 3),
     "chord": (lambda o, x, y, z: spheres.chord(o, (x, y, z), (0.6, 0.0, 0.8))[2], 3),
     "collocated": (lambda o, c, r: sum(microfacet.lobes_collocated(o, c, r)), 2),

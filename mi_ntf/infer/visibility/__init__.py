@@ -7,11 +7,20 @@ units, infinite for directional lights; `index` the light's row in the table. `a
 unused. Construction does the work that depends on the lights alone.
 """
 
-from . import neural_transmittance, none, raymarch, transmittance_map, transmittance_volume, visibility_mlp
+from . import (
+    neural_transmittance,
+    none,
+    raymarch,
+    transmittance_atlas,
+    transmittance_map,
+    transmittance_volume,
+    visibility_mlp,
+)
 
 REGISTRY = {
     module.METHOD.name: module.METHOD
-    for module in (raymarch, transmittance_volume, neural_transmittance, transmittance_map, visibility_mlp, none)
+    for module in (raymarch, transmittance_volume, neural_transmittance, transmittance_map, transmittance_atlas,
+                   visibility_mlp, none)
 }
 """Name → :class:`mi_ntf.infer.visibility.method.Method`. What is not in here does not exist."""
 

@@ -12,12 +12,13 @@ are octahedral (Engelhardt and Dachsbacher 2008), neighbours across the seams in
 """
 
 from types import ModuleType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import drjit as dr
 import numpy as np
 
-from ...core.ops import dot
+from ...core.ops import cross, dot
+from .. import octahedral
 from ..lights import LightTable
 
 ROW = 16
@@ -36,7 +37,7 @@ class Light(NamedTuple):
     v0: object
     axis: tuple
     columns: object
-    position: tuple | None = None
+    position: Any = None
     kind: object = None
 
 
@@ -55,6 +56,20 @@ class LightRays:
         self._rows = dj.Float(rows.astype(np.float32).ravel())
         self._texels = dr.opaque(dj.UInt32, resolution**2)
         self._area = dr.opaque(dj.Float, resolution**2 + 0.5)
+
+    def _side(self):
+        """Cells along a side of the directions of lights that look everywhere."""
+        return dr.sqrt(dr.floor(self._area))
+
+    def one(self, index, x, u, active):
+        """``(inside, texel)`` of one of the four rays of directional light `index` nearest to `x`, drawn by their
+        bilinear weights with the uniform numbers `u` (2)."""
+        light = self.light(index, active, False)
+        fu, fv = dot(light.u, x) + light.u0, dot(light.v, x) + light.v0
+        columns, lines = light.columns, self.lines(light)
+        inside = active & (fu > -0.5) & (fv > -0.5) & (fu < columns - 0.5) & (fv < lines - 0.5)
+        tu, tv = (dr.clip(dr.floor(f + r), 0, n - 1) for f, r, n in ((fu, u[0], columns), (fv, u[1], lines)))
+        return inside, self.dj.UInt32(index) * self._texels + self.dj.UInt32(tv * columns + tu)
 
     def light(self, index, active, place=True) -> Light:
         """The row of light `index`; without position and kind unless `place`."""
@@ -77,14 +92,14 @@ class LightRays:
         su, sv = (tu - light.u0) / u2, (tv - light.v0) / v2
         o = tuple(su * a + sv * b for a, b in zip(light.u, light.v, strict=True))
         k2 = dot(light.axis, light.axis)
-        towards = _cross(light.u, light.v)  # along the axis, of length |û||v̂|
+        towards = cross(light.u, light.v)  # along the axis, of length |û||v̂|
         scale = dr.rsqrt(u2 * v2)
         out = tuple(scale * a + dr.sqrt(k2) * c for a, c in zip(towards, o, strict=True))
         norm = dr.rsqrt(dot(out, out))
         d = tuple(-c * norm for c in out)
         if self.full:
             sphere = light.kind == SPHERE
-            around = self._octahedral_direction(tu, tv)
+            around = octahedral.direction(tu, tv, self._side())
             d = tuple(dr.select(sphere, -a, b) for a, b in zip(around, d, strict=True))
             o = tuple(dr.select(sphere, a, b) for a, b in zip(light.position, o, strict=True))
         return o, d, dr.select(light.kind == DIRECTIONAL, dr.inf, dot(light.position, d))
@@ -119,7 +134,7 @@ class LightRays:
             inside &= depth > NEAREST_DEPTH / 2
         if self.full:
             sphere = light.kind == SPHERE
-            su, sv = self._octahedral_place(tuple(-c for c in wi))
+            su, sv = octahedral.place(tuple(-c for c in wi), self._side())
             fu, fv, inside = dr.select(sphere, su, fu), dr.select(sphere, sv, fv), inside | (active & sphere)
         iu, iv = dr.floor(fu), dr.floor(fv)
         wu, wv = fu - iu, fv - iv
@@ -138,7 +153,7 @@ class LightRays:
                 texel = row + self.dj.UInt32(u[i])
                 t = along if self.parallel else place(u[i], v[j])
                 if self.full:
-                    tu, tv = self._wrap(iu + i, iv + j)
+                    tu, tv = octahedral.wrap(iu + i, iv + j, self._side())
                     texel = dr.select(sphere, base + self.dj.UInt32(tv) * width + self.dj.UInt32(tu), texel)
                     t = dr.select(sphere, self._sphere_place(x, wi, distance, tu, tv), t)
                 found.append(((wu if i else 1 - wu) * (wv if j else 1 - wv), texel, t))
@@ -166,44 +181,9 @@ class LightRays:
         return place
 
     def _sphere_place(self, x, wi, distance, tu, tv):
-        d = tuple(-c for c in self._octahedral_direction(tu, tv))
+        d = tuple(-c for c in octahedral.direction(tu, tv, self._side()))
         cosine = dr.maximum(dot(d, wi), 0.1)
         return dot(x, d) - distance * (1 - cosine * cosine) / cosine
-
-    def _octahedral_place(self, w):
-        """Cell coordinates of the unit direction `w`."""
-        scale = dr.rcp(dr.abs(w[0]) + dr.abs(w[1]) + dr.abs(w[2]))
-        a, b = _fold(w[0] * scale, w[1] * scale, w[2] < 0)
-        half = dr.sqrt(dr.floor(self._area)) * 0.5
-        return (a + 1) * half - 0.5, (b + 1) * half - 0.5
-
-    def _octahedral_direction(self, tu, tv):
-        """Unit direction through the centre of cell (tu, tv)."""
-        step = 2 * dr.rsqrt(dr.floor(self._area))
-        a, b = (tu + 0.5) * step - 1, (tv + 0.5) * step - 1
-        z = 1 - dr.abs(a) - dr.abs(b)
-        a, b = _fold(a, b, z < 0)
-        norm = dr.rsqrt(a * a + b * b + z * z)
-        return a * norm, b * norm, z * norm
-
-    def _wrap(self, tu, tv):
-        """The cell that lies where (tu, tv), up to one cell outside, would: an edge meets its own mirror image."""
-        last = dr.sqrt(dr.floor(self._area)) - 1
-        tv = dr.select((tu < 0) | (tu > last), last - tv, tv)
-        tu = dr.clip(tu, 0, last)
-        tu = dr.select((tv < 0) | (tv > last), last - tu, tu)
-        return tu, dr.clip(tv, 0, last)
-
-
-def _fold(a, b, lower):
-    """The lower half of the octahedron, folded out; its own inverse."""
-    fa = (1 - dr.abs(b)) * dr.select(a < 0, -1, 1)
-    fb = (1 - dr.abs(a)) * dr.select(b < 0, -1, 1)
-    return dr.select(lower, fa, a), dr.select(lower, fb, b)
-
-
-def _cross(a, b):
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 def frames(lights: LightTable, hull: np.ndarray, resolution: int) -> np.ndarray:

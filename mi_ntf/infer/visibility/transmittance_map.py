@@ -13,6 +13,7 @@ from types import ModuleType
 import drjit as dr
 import numpy as np
 
+from ...core.ops import dot
 from .. import profile
 from ..lights import LightTable
 from . import map_source
@@ -61,6 +62,13 @@ class TransmittanceMap:
         root = 0
         for (weight, _, t), shift, parts in zip(found, shifts, mixtures, strict=True):
             root += weight * _root(t + shift, parts)
+        return dr.select(inside, dr.minimum(root * root, 1), 1)
+
+    def tau_of_one(self, index, x, d, u, active):
+        """τ at `x` of one of the four rays of the directional light `index`, towards `d`, drawn by the uniform numbers
+        `u` (2); 1 where light meets nothing."""
+        inside, texel = self.rays.one(index, x, u, active)
+        root = _root(dot(x, d), self._fetch(texel, inside))
         return dr.select(inside, dr.minimum(root * root, 1), 1)
 
     def _fetch(self, texel, active):

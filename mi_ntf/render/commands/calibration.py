@@ -33,7 +33,7 @@ def calibrate(medium) -> model.Constants:
     skin = bounced.Skin(medium, np.random.default_rng(0))
     jobs = {
         "camera": (lambda: _camera(grid).t, WIDTH * SAMPLES),
-        "reflect": (lambda: [*_flat(grid.reflectance(points.x)), medium.field.softness(points.x)], WIDTH),
+        "reflect": (lambda: (grid.reflectance(points.x), medium.field.softness(points.x)), WIDTH),
         "shade": (lambda: shade.reflect(points, many, None), WIDTH * MANY),
         "density": (lambda: network.density(points.x), WIDTH),
     }
@@ -45,6 +45,8 @@ def calibrate(medium) -> model.Constants:
     found = seconds({name: job for name, (job, _) in jobs.items()}, 5, min)  # other work only adds to them
     result = model.Constants(**{name: 1e9 * value / jobs[name][1] for name, value in found.items()})
     model.remember(result)
+    jobs.clear()
+    dr.flush_malloc_cache()  # what was built here is not part of a render that follows
     return result
 
 
@@ -149,8 +151,3 @@ def _between(grid, skin) -> None:
     """Rays from each patch of the `skin`."""
     rng = np.random.default_rng(0)
     bounced.meet(grid.density, grid, *radiosity.rays(skin.position, skin.normal, radiosity.FEW, rng), rng)
-
-
-def _flat(reflectance) -> list:
-    normal, albedo, *rest = reflectance
-    return [*normal, *albedo, *rest]

@@ -4,6 +4,7 @@ where NumPy works beside kernels."""
 import os
 import time
 from contextlib import contextmanager
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -66,14 +67,15 @@ def measure(scene, integrator, spp: int) -> dict:
     radiosity; ``wall_seconds`` of the whole, Python and the film included; ``points``: shading points; ``peak_bytes``:
     most memory that Dr.Jit held.
     """
+    seeds: tuple[Any, Any] = 1, 0  # numbers, where Mitsuba's stub asks for arrays
     with maps_made_anew(), dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        dr.eval(mi.render(scene, integrator=integrator, seed=1, spp=spp))
+        dr.eval(mi.render(scene, integrator=integrator, seed=seeds[0], spp=spp))
         integrator.patches = None
         dr.sync_thread()
         dr.detail.malloc_clear_statistics()
         with _watching() as history:
             start = time.perf_counter()
-            dr.eval(mi.render(scene, integrator=integrator, seed=0, spp=spp))
+            dr.eval(mi.render(scene, integrator=integrator, seed=seeds[1], spp=spp))
             dr.sync_thread()
             wall = time.perf_counter() - start
             history.extend(dr.kernel_history())

@@ -156,8 +156,9 @@ def memory(work: Work, chunk: int) -> dict[str, int]:
 
 def machine() -> str:
     """What constants hold for: this version and variant, and what computes: processor and threads, or graphics card."""
-    hardware = graphics_card() if mi.variant().startswith("cuda") else f"{processor()} · {dr.thread_count()} threads"
-    return f"{__version__} · {hardware} · {mi.variant()}"
+    variant = str(mi.variant())
+    hardware = graphics_card() if variant.startswith("cuda") else f"{processor()} · {dr.thread_count()} threads"
+    return f"{__version__} · {hardware} · {variant}"
 
 
 def graphics_card() -> str:

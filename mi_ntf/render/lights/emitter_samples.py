@@ -1,5 +1,7 @@
 """Lights drawn at random for each shading point, by Mitsuba's own emitter sampling."""
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 
@@ -49,8 +51,8 @@ class EmitterSamples:
             mi.UInt32([n for _, n in rows]),
             mi.Float([1 / of_emitter[i] for i, _ in rows]),
         )
-        self._lane = dr.arange(mi.UInt32, dr.width(points.x[0]))
-        self._shift = mi.sample_tea_32(self._lane, seed)
+        lane: Any = dr.arange(mi.UInt32, dr.width(points.x[0]))
+        self._lane, self._shift = lane, mi.sample_tea_32(lane, seed)
         self._seed = mi.UInt32(seed)
         dr.make_opaque(self._emitter, self._candidates, self._share, self._seed)
         dr.eval(self._lane, self._shift)

@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...core import spheres
 from ...core.errors import MiNtfError
 
 ROWS = 512
@@ -128,10 +129,8 @@ class Cells:
         A cell above the horizon gains weight · (1 − focus) · cos. One that the horizon may cut loses at most what a
         distribution with its mean and variance can have behind it (Scarf 1958).
         """
-        k = np.arange(normals) + 0.5
-        y, phi = 1 - 2 * k / normals, np.pi * (1 + np.sqrt(5)) * k
-        across = np.sqrt(1 - y * y)
-        cos = np.stack([across * np.cos(phi), y, across * np.sin(phi)], axis=1) @ self.direction.T
+        x, z, y = spheres.fibonacci(normals, 0.5).T
+        cos = np.stack([x, y, -z], axis=1) @ self.direction.T
         mean, variance = self.focus * np.abs(cos), 1 - self.focus**2
         behind = (np.sqrt(mean**2 + variance) - mean) / 2
         gained = np.maximum(cos, 0) * (1 - self.focus)
@@ -140,7 +139,8 @@ class Cells:
 
 def cells(image: np.ndarray, limit: int) -> Cells:
     """At most `limit` cells of a map (height, width, 3); they cover the sphere, those without light included."""
-    latitude, longitude = axes(*image.shape[:2], limit)
+    height, width = image.shape[:2]
+    latitude, longitude = axes(height, width, limit)
     blocks = integrate(image, latitude, longitude)
     (a, b, c), (one, sin, cos) = latitude.sums, longitude.sums
     even = np.stack([np.outer(a, one), np.outer(b, sin), np.outer(c, one), np.outer(b, cos)])
@@ -189,7 +189,8 @@ def power(texels, shape: tuple[int, int], cells: Cells):
 def _cut(light: np.ndarray, limit: int) -> list:
     """Bounds of at most `limit` cells of `light` (4, rows, columns): power and first moments of each block."""
     order = itertools.count()
-    waiting, whole = [(0.0, next(order), (0, light.shape[1], 0, light.shape[2]))], []
+    waiting = [(0.0, next(order), (0, light.shape[1], 0, light.shape[2]))]
+    whole: list = []
     while waiting and len(waiting) + len(whole) < limit:
         cell = heapq.heappop(waiting)[2]
         halves = _halves(light, cell)

@@ -2,6 +2,7 @@
 
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -24,7 +25,9 @@ class Discrete:
     @classmethod
     def of(cls, emitter, kind: str, environment_lights: int) -> "Discrete":
         """`environment_lights`: most rows of an environment, which has those without power, too."""
-        return cls(emitter, kind, *light_rows.kind(emitter).rows(emitter, kind, environment_lights))
+        rows = light_rows.kind(emitter).rows
+        assert rows is not None  # see is_discrete
+        return cls(emitter, kind, *rows(emitter, kind, environment_lights))
 
 
 class Lights:
@@ -94,7 +97,7 @@ class Lights:
         """What to sum over at `points` (in the coordinates of `frame`): pairs of a source, which has ``count`` and
         ``sample``, and whether its index is a row of `table`, which is what maps are made for. `draws`: least number
         of lights drawn."""
-        result = [(table, True)] if table.count else []
+        result: list[tuple[Any, bool]] = [(table, True)] if table.count else []
         if self.sampled:
             drawn = EmitterSamples(self.sampled, self._weights, frame, points, seed, self.light_samples, draws)
             result.append((drawn, False))
@@ -120,7 +123,7 @@ def _is_textured_spot(emitter) -> bool:
 def _shines(emitter) -> bool:
     """False with a warning for what Mitsuba's own emitter sampling never finds."""
     if kind(emitter) == "directionalarea":
-        mi.Log(
+        mi.Log(  # type: ignore[operator]  # an object in the stub
             mi.LogLevel.Warn,
             f"directionalarea emitter ({emitter.id()}) lights no field: only Mitsuba's particle tracers see its light",
         )

@@ -13,6 +13,7 @@ from collections import OrderedDict
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -27,7 +28,7 @@ FOLDER_LIMIT = 2 << 30
 SEAL = hashlib.sha256().digest_size
 """Bytes at the start of a file that depend on all others and on its name; float32 numbers follow."""
 
-_maps: OrderedDict[str, object] = OrderedDict()
+_maps: OrderedDict[str, Any] = OrderedDict()
 
 
 def mode() -> str:
@@ -50,8 +51,9 @@ def _program() -> str:
 
 def _libraries() -> tuple:
     """Versions of what runs the program in the current variant."""
-    compiler = dr.detail.cuda_version if mi.variant().startswith("cuda") else dr.detail.llvm_version
-    return mi.__version__, dr.__version__, np.__version__, compiler()
+    compiler = dr.detail.cuda_version if str(mi.variant()).startswith("cuda") else dr.detail.llvm_version
+    versions = mi.__version__, dr.__version__, np.__version__  # type: ignore[attr-defined]  # not in the stubs
+    return *versions, compiler()
 
 
 def key(medium, table, options, width: int, step: float) -> str:
@@ -64,7 +66,7 @@ def key(medium, table, options, width: int, step: float) -> str:
     )
     digest = hashlib.sha256(repr(facts).encode())
     for part in (table.where, table.is_point, grid.hull):
-        digest.update(np.ascontiguousarray(part))
+        digest.update(np.ascontiguousarray(part).data)
     return digest.hexdigest()
 
 
@@ -102,13 +104,20 @@ def _make_room(limit: float) -> None:
         _maps.popitem(last=False)
 
 
+def _folder() -> Path:
+    """The cache's, out of which or into which a file has just gone."""
+    where = user_cache.folder()
+    assert where is not None
+    return where
+
+
 def _file(name: str) -> str:
     return f"maps/{name}.map"
 
 
 def _seal(name: str, values: np.ndarray) -> bytes:
     digest = hashlib.sha256(name.encode())
-    digest.update(values)
+    digest.update(values.data)
     return digest.digest()
 
 
@@ -120,7 +129,7 @@ def _read(name: str, count: int):
     if content[:SEAL] != _seal(name, values):
         return None
     with suppress(OSError):
-        os.utime(user_cache.folder() / _file(name))
+        os.utime(_folder() / _file(name))
     return values
 
 
@@ -128,7 +137,7 @@ def _write(name: str, values: np.ndarray) -> None:
     values = np.ascontiguousarray(values, "<f4")
     if np.isfinite(values).all() and user_cache.write(_file(name), _seal(name, values), values):
         with suppress(OSError):  # of other processes that tidy up as well
-            _tidy(user_cache.folder() / "maps")
+            _tidy(_folder() / "maps")
 
 
 def _tidy(where: Path) -> None:

@@ -27,7 +27,7 @@ def write(path: Path, medium, table, options, maps) -> None:
     shapes = [_shape(row, options.map_resolution)
               for row in frames(table, medium.field.grid.hull, options.map_resolution)]
     window = np.zeros(2, np.int32), np.array(shapes, np.int32).max(0)[::-1] - 1
-    parts = []
+    parts: list = []
     for tmap in maps:
         for values in np.array(tmap.values).reshape(tmap.count, -1, tmap.width):
             k = len(parts)
@@ -127,7 +127,7 @@ def _texels(path: Path, k: int, part, width: int, shape: tuple[int, int]) -> np.
 
 
 def _digest(texels: np.ndarray) -> str:
-    return hashlib.sha256(np.ascontiguousarray(texels, "<f4")).hexdigest()
+    return hashlib.sha256(np.ascontiguousarray(texels, "<f4").data).hexdigest()
 
 
 def _compare(path: Path, k: int, found: dict, wanted: dict) -> None:

@@ -28,9 +28,9 @@ def emitter_class() -> type:
         (nested)        emitter the light: any emitter, another ``ntf`` for a second field; ``area`` where this emitter
                                 stands inside the shape that shines
         (nested)        medium  the ``nrf`` medium in its way, nested or by ``<ref>``
-        visibility      string  ``raymarch``, ``neural_transmittance``, ``visibility_mlp``, ``none``; of lights that are
-                                one point or direction also ``transmittance_map``, ``transmittance_volume``; ``auto`` is
-                                ``neural_transmittance`` (default: auto)
+        visibility      string  ``raymarch``, ``neural_transmittance``, ``transmittance_atlas``, ``visibility_mlp``,
+                                ``none``; of lights that are one point or direction also ``transmittance_map``,
+                                ``transmittance_volume``; ``auto`` is ``neural_transmittance`` (default: auto)
         sampling_weight float   as of any emitter: share of the samples drawn from all (default: 1)
         =============== ======= ====================================================================================
 
@@ -78,7 +78,7 @@ def emitter_class() -> type:
                         "many places; choose raymarch or neural_transmittance"
                     )
                 table = scene_lights.rows([(self.inner, kind)], 1).table(self.medium.frame)
-            self._method = build(method, self.medium, table, Options(STEP))
+            self._method = build(method, self.medium, table, Options(STEP, cache=True))
 
         def sample_direction(self, it, sample, active=True):
             inner = self.attached()

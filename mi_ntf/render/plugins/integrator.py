@@ -27,8 +27,9 @@ def integrator_class() -> type:
         parameter           type    meaning
         =================== ======= ===================================================================================
         visibility          string  how light reaches a point: ``raymarch``, ``transmittance_map``,
-                                    ``neural_transmittance``, ``transmittance_volume``, ``visibility_mlp``, ``none``,
-                                    or ``auto``, the cheaper of the first two (default: auto)
+                                    ``transmittance_atlas``, ``neural_transmittance``, ``transmittance_volume``,
+                                    ``visibility_mlp``, ``none``, or ``auto``, the cheaper of the first two (default:
+                                    auto)
         samples             integer steps across the unit sphere's diameter (default: 384)
         light_samples       integer lights per shading point, drawn from Mitsuba's emitter sampling and resampled, from
                                     any emitters; 0: all lights, cells of environments among them, and 2 drawn (1 of a
@@ -149,7 +150,7 @@ def _render(self, scene, sensor, seed: int, spp: int, develop: bool):
         composition.select(run)
         count = min(chunks.step, camera.count - first)
         # Another stream for each chunk and seed; opaque, so that no seed is compiled into a kernel.
-        stream = mi.sample_tea_32(_opaque(seed), dr.opaque(mi.UInt32, first))[0]
+        stream = mi.sample_tea_32(_opaque(seed), _opaque(first))[0]
         ray, weight, position = camera.rays(first, count, stream)
         sums = picture and picture.sums(dr.width(ray), run, composition.runs[run])
         with composition.lights.bare():
@@ -157,7 +158,7 @@ def _render(self, scene, sensor, seed: int, spp: int, develop: bool):
         alpha = [opacity] if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else []
         once = [*alpha, dr.ones(mi.Float, dr.width(ray))]
         pixels.add(first, position, [*(radiance * weight), *([None] * len(once) if run else once)])
-        if sums:
+        if picture and sums:
             picture.put(first, position, sums)
     if picture:
         picture.write_to(block)
@@ -182,7 +183,7 @@ def _stop(pixels: Reconstruction, run: int, first: int, runs: int) -> None:
     last = run == runs - 1
     if runs > 1:
         pixels.keep(first if last else 0)
-    mi.Log(
+    mi.Log(  # type: ignore[operator]  # an object in the stub
         mi.LogLevel.Warn,
         f"nrf integrator: stopped after {first if last else 0} of {pixels.camera.count} pixels"
         + ("" if last else f", in run {run + 1} of {runs} of the lights: more map_memory needs fewer runs"),
@@ -190,7 +191,8 @@ def _stop(pixels: Reconstruction, run: int, first: int, runs: int) -> None:
 
 
 def _opaque(seed):
-    """A seed, Python number (from Python) or array (from the stock program), as a value that no kernel contains."""
+    """A seed, Python number (from Python) or array (from the stock program), or the number of a pixel, as a value that
+    no kernel contains."""
     value = mi.UInt32(seed)
     dr.make_opaque(value)
     return value

@@ -45,7 +45,7 @@ def load_scene(path: Path, parameters: dict[str, str]):
     if mi.variant() is None:
         mi.set_variant("llvm_ad_rgb")
     register()
-    scene = mi.load_file(str(path), **parameters)
+    scene = mi.load_file(str(path), **parameters)  # type: ignore[arg-type]  # they are $names
     integrator = scene.integrator()
     if not hasattr(integrator, "map_resolution"):
         raise MiNtfError(f'{path}: its integrator is {integrator.class_name()}, expected <integrator type="nrf">')

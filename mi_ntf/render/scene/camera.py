@@ -1,6 +1,7 @@
 """From a sensor's samples to its film: camera rays a chunk of pixels at a time, and pixels that sum their samples."""
 
 import math
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -115,11 +116,15 @@ class Reconstruction:
         begin = dr.opaque(mi.UInt32, first)
         y = pixel // dr.opaque(mi.UInt32, width)
         x = pixel - y * dr.opaque(mi.UInt32, width)
-        centre = mi.Point2f(mi.Float(x), mi.Float(y)) + 0.5 + mi.Vector2f(self.block.offset())
+        corner: Any = mi.Point2f(mi.Float(x), mi.Float(y))
+        centre = corner + 0.5 + mi.Vector2f(self.block.offset())
         side = dr.opaque(mi.UInt32, 2 * self._reach + 1)
         # Wraps around below 0, which is then no column and no source pixel.
         shift = dr.opaque(mi.UInt32, (self.camera.border - self._reach) % 2**32)
         one = mi.Float(1)
+
+        def more_rows(i, j, k, sums, lost):
+            return j < side
 
         def body(i, j, k, sums, lost):
             column = x + shift + i
@@ -142,9 +147,10 @@ class Reconstruction:
 
         n = dr.width(pixel)
         zeros = [dr.zeros(mi.UInt32, n) for _ in range(3)]
+        state: Any = (*zeros, *([dr.zeros(mi.Float, n) for _ in values] for _ in range(2)))
         return dr.while_loop(
-            state=(*zeros, *([dr.zeros(mi.Float, n) for _ in values] for _ in range(2))),
-            cond=lambda i, j, k, sums, lost: j < side,
+            state=state,
+            cond=more_rows,
             body=body,
             label="reconstruction",
             max_iterations=-1 if dr.grad_enabled(values) else None,  # a sum

@@ -55,7 +55,7 @@ class Effects:
     @property
     def needs_visibility(self) -> bool:
         """Whether a visibility method has to be built."""
-        return self.lit and (not self.collocated or self.surfaces or self.bounces)
+        return self.lit and (not self.collocated or self.surfaces or bool(self.bounces))
 
 
 def describe(scene, integrator, sensor, spp: int, media: list, light) -> Effects:

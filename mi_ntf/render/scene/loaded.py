@@ -57,5 +57,5 @@ def _digest(header: Header, tensors: dict) -> str:
     digest = hashlib.sha256(repr(header.architecture).encode())
     for name, value in sorted(tensors.items()):
         digest.update(name.encode())
-        digest.update(np.ascontiguousarray(value))
+        digest.update(np.ascontiguousarray(value).data)
     return digest.hexdigest()

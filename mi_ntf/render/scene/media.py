@@ -8,7 +8,8 @@ from ...core.errors import MiNtfError
 
 def find_media(scene) -> list:
     """The scene's ``nrf`` media. Raises MiNtfError where there is none, or a bounding shape is wrong."""
-    media, bounds = [], []
+    media: list = []
+    bounds: list[list] = []
     for shape in scene.shapes():
         medium = _nrf_medium(shape)
         if medium is None:

@@ -1,5 +1,7 @@
 """Further bounces of light within fields, without noise: radiosity between patches of their skins."""
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -47,9 +49,9 @@ class Patches:
         both in its own coordinates, and their indices (k,)."""
         origins, ways = [], []
         for skin in self.skins:
-            o, d = radiosity.rays(skin.position, skin.normal, side, rng)
-            origins.append(np.array(skin.frame.point_to_world(_vector(o))))
-            ways.append(np.array(skin.frame.direction_to_world(_vector(d))))
+            begin, way = radiosity.rays(skin.position, skin.normal, side, rng)
+            origins.append(np.array(skin.frame.point_to_world(_vector(begin))))
+            ways.append(np.array(skin.frame.direction_to_world(_vector(way))))
         o, d = (mi.Vector3f(np.concatenate(v, 1)) for v in (origins, ways))
         n, nothing = dr.width(o), (np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, int))
         if not n:
@@ -66,7 +68,7 @@ class Patches:
                 result.append(nothing)
                 continue
             k = mi.UInt32(index)
-            along = dr.gather(mi.Vector3f, d, k)
+            along: Any = dr.gather(mi.Vector3f, d, k)
             x = dr.gather(mi.Vector3f, o, k) + dr.gather(mi.Float, t, k) * along
             place, way = skin.frame.point_to_field(mi.Point3f(x)), skin.frame.direction_to_field(along)
             dr.eval(place, way)

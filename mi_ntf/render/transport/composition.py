@@ -1,6 +1,7 @@
 """Fields, surfaces and lights of a scene in one picture: what hides, shades and dims what."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -26,11 +27,11 @@ class Part:
     the present run (`table`); visibility of the table's lights and of drawn ones and any other rays (None: no
     shadows)."""
 
-    medium: object
-    lights: object
-    table: object
-    mapped: object
-    drawn: object
+    medium: Any
+    lights: Any
+    table: Any
+    mapped: Any
+    drawn: Any
 
     @property
     def frame(self):
@@ -51,7 +52,7 @@ class Composition:
         self.effects = effects.describe(scene, integrator, sensor, spp, media, self.lights)
         self._media = [m for m in media if m.field.grid.majorant > 0]
         self._seen = [m for m, visible in zip(media, self.effects.in_view, strict=True) if visible]
-        self.runs, self.run = self._runs(), None
+        self.runs, self.run = self._runs(), -1  # none yet
         self.select(0)
         self.surfaces = None
         if self.effects.surfaces:
@@ -221,7 +222,8 @@ class Composition:
     def _field(self, i: int, part: Part, samples, unit: float, light, stream, sums) -> None:
         """Adds what the samples in the field `part`, strand `i`, reflect to `light`, an array of a float a sample for
         each channel."""
-        weight, kept = samples.weights[i], None
+        weight = samples.weights[i]
+        kept: Any = None
         index, t, view = samples.ray, samples.t, samples.view
         if len(self.in_view) > 1 and dr.width(index):
             kept = dr.compress(weight > 0)

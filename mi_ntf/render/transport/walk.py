@@ -1,6 +1,7 @@
 """More than one bounce: paths through fields and between surfaces, a wavefront a bounce."""
 
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -16,11 +17,11 @@ class Paths:
     """Rays on their way: `weight` of the light that they bring to their `pixel`; `pdf` of the BSDF sample that sent
     them, −1 for a specular one, 0 where they come from a field, whose light is summed at its points; random stream."""
 
-    ray: object
-    weight: object
-    pixel: object
-    pdf: object
-    rng: object
+    ray: Any
+    weight: Any
+    pixel: Any
+    pdf: Any
+    rng: Any
 
     def take(self, index) -> "Paths":
         """Those of the given indices."""
@@ -72,7 +73,7 @@ class Walk:
         onward = paths.take(dr.arange(mi.UInt32, n))
         onward = replace(onward, weight=dr.zeros(mi.Color3f, n))
         for i, part in enumerate(self.scene.parts):
-            index = dr.compress(hit & (which == i))
+            index: Any = dr.compress(hit & (which == i))
             if dr.width(index):
                 there = self.in_field(part, paths.take(index), dr.gather(mi.Float, t, index), depth)
                 onward.put(there, index)

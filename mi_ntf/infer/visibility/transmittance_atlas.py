@@ -1,0 +1,145 @@
+"""``transmittance_atlas``: per field, transmittance maps of directions all around; any ray is read from one of them.
+
+A ray from x along ω is read in two parts. Close to x, where a map of another direction would see the wrong piece of the
+skin that x lies in, σ is summed at a few places. The rest is one texel of one map: on the line along its direction d_k
+that crosses the ray at the pivot x + c ω, from `BEGIN` on:
+
+    τ(x, ω) ≈ exp(−Σ w_i σ(x + t_i ω)) · τ_k(x + c ω − (c − BEGIN) d_k)
+
+Which of the four nearest directions and which of the four nearest texels is drawn with their bilinear weights: the mean
+is the interpolated τ, and a pixel's many points average.
+"""
+
+from types import ModuleType
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from ...core import spheres
+from .. import octahedral, ops, profile
+from ..lights import LightTable
+from . import map_source, raymarch
+from .method import Method, Options, queries
+from .transmittance_map import TransmittanceMap, channels
+
+SIDE = 32
+"""Directions: as many squared, octahedral."""
+SOLID = 0.5
+"""Fields with fewer opaque skins than this share are smoke, whose rays one logistic cannot follow."""
+RESOLUTION = {1: 64, 2: 40}
+"""Texels along a map's side, by the logistics of each: 32 and 50 MiB. Smoke has no edges."""
+PLACES = (0.00264, 0.0122, 0.03068, 0.0529)
+WEIGHTS = (0.00637, 0.01328, 0.02291, 0.01736)
+"""Of the sum close to x, field units."""
+BEGIN = 0.08
+"""Where the map of an opaque thing is read from on: what lies between is neither's, or the skin of x would count
+twice."""
+REACH = 0.06
+"""Where the sum ends, and the map of smoke begins."""
+NEAREST_PIVOT = 0.16
+
+
+class TransmittanceAtlas:
+    """`density`: σ at a point; `maps`: the :class:`TransmittanceMap` of the directions, read from the distance `begin`
+    on; `march`: a :class:`mi_ntf.infer.visibility.raymarch.RayMarch` for lights inside the sphere, None where there are
+    none."""
+
+    def __init__(self, density, maps: TransmittanceMap, begin: float, march, dj: ModuleType):
+        self.density, self.maps, self.march, self.dj = density, maps, march, dj
+        self._begin = dr.opaque(dj.Float, begin)
+        self._side = dr.opaque(dj.Float, SIDE)
+
+    @property
+    def values(self):
+        return self.maps.values
+
+    def tau(self, x, wi, distance, index, active):
+        """The product of both parts; marched where the light lies inside the sphere."""
+        here = spheres.coordinate(x, wi)
+        if self.march is None:
+            return self._look_up(x, wi, here, active)
+        _, _, h = spheres.chord(ops, x, wi)
+
+        def march(x, wi, distance):
+            return self.march.tau(x, wi, distance, index, self.dj.Bool(True))
+
+        def look_up(x, wi, distance):
+            return self._look_up(x, wi, here, True)
+
+        return dr.if_stmt((x, wi, distance), active & (here + distance < h), march, look_up, label="light inside")
+
+    def _look_up(self, x, wi, here, active):
+        depth = 0
+        for t, w in zip(PLACES, WEIGHTS, strict=True):
+            depth += w * self.density(tuple(a + t * b for a, b in zip(x, wi, strict=True)))
+        return dr.exp(-depth) * self._far(x, wi, here, active)
+
+    def _far(self, x, wi, here, active):
+        u = _uniforms(self.dj, x, wi)
+        k, d = self._direction(wi, u[:2])
+        outside = dr.squared_norm(self.dj.Array3f(*x)) > 0.98
+        pivot = dr.select(outside, dr.maximum(-here, 0), dr.maximum(-0.5 * here, NEAREST_PIVOT))
+        back = dr.select(outside, pivot, pivot - self._begin)
+        y = tuple(a + pivot * b - back * c for a, b, c in zip(x, wi, d, strict=True))
+        return self.maps.tau_of_one(k, y, d, u[2:], active)
+
+    def _direction(self, wi, u):
+        """``(index, direction)`` of one of the four nearest."""
+        fu, fv = octahedral.place(wi, self._side)
+        iu, iv = octahedral.wrap(dr.floor(fu + u[0]), dr.floor(fv + u[1]), self._side)
+        return self.dj.UInt32(iv) * SIDE + self.dj.UInt32(iu), octahedral.direction(iu, iv, self._side)
+
+
+def _uniforms(dj, x, wi) -> list:
+    """Four numbers in [0, 1) of the bits of a ray: the same ray, the same numbers."""
+    state = dj.UInt32(0)
+    for c, factor in zip((*x, *wi), (0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D, 0x27D4EB2F, 0x165667B1, 0xD3A2646D),
+                         strict=True):
+        word: Any = dr.reinterpret_array(dj.UInt32, c)
+        state = (state ^ (word * factor)) * 0x2C1B3C6D
+        state ^= state >> 15
+    other = (state ^ 0x5BD1E995) * 0x297A2D39
+    other ^= other >> 15
+    return [dj.Float(bits & 0xFFFF) * 2.0**-16 for word in (state, other) for bits in (word, word >> 16)]
+
+
+def table(dj: ModuleType) -> LightTable:
+    """The directions as lights."""
+    v, u = np.divmod(np.arange(SIDE**2), SIDE)
+    d = np.stack(octahedral.direction(dj.Float(u.astype(np.float32)), dj.Float(v.astype(np.float32)), dj.Float(SIDE)))
+    where = np.array(d, np.float64).T
+    return LightTable(where, np.ones((SIDE**2, 3)), np.zeros(SIDE**2, bool), 1.0, dj)
+
+
+def build(medium, lights, options: Options, dj, keep) -> TransmittanceAtlas:
+    """See :class:`mi_ntf.infer.visibility.method.Method`."""
+    density, grid = medium.source.density, medium.field.grid
+    network = options.map_source == "network"
+    solid = medium.field.softness.solid >= SOLID
+    components = 1 if solid else 2
+    step = options.step * (profile.FOR_NETWORKS if network else profile.FOR_MAPS / components)
+    reader = profile.of(medium, step, dj)
+    source = (map_source.network_source(medium.field.network, reader, False) if network
+              else map_source.field_source(medium.source, reader, components))
+    directions, resolution = table(dj), RESOLUTION[min(source.components, 2)]
+
+    def make(values=None):
+        values = None if values is None else dj.Float(values)
+        return TransmittanceMap(directions, resolution, grid.hull, source, dj, values)
+
+    maps = keep(channels(source.components, source.weights), step, make, directions, resolution)
+    march = None
+    if lights is None or (lights.is_point & (np.linalg.norm(lights.where, axis=1) < 1)).any():
+        march = raymarch.build(medium, lights, options, dj, keep)
+    return TransmittanceAtlas(density, maps, BEGIN if solid else REACH, march, dj)
+
+
+METHOD = Method(
+    name="transmittance_atlas",
+    summary="per field, maps of directions all around: one texel and a few densities per point and light",
+    build=build,
+    pair=lambda work, prices: prices.atlas + len(PLACES) * queries(work, prices),
+    prices={"atlas": 25.0},
+    dials=("map_source",),
+)

@@ -1,0 +1,120 @@
+"""Write docs/plugins.md: every plugin and its parameters, further outputs, visibility methods.
+
+    python tools/plugin_reference.py
+
+All of it stands in the package: in the docstrings of the plugins' classes and of the outputs' module, whose tables are
+reStructuredText, and in the registry of visibility methods. Needs no variant of Mitsuba.
+"""
+
+import ast
+import re
+from pathlib import Path
+
+from mi_ntf.infer.visibility import REGISTRY
+from mi_ntf.infer.visibility.method import Method
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGE = ROOT / "docs" / "plugins.md"
+PACKAGE = ROOT / "mi_ntf" / "render"
+
+PLUGINS = {
+    "Integrator `nrf`": ("plugins/integrator.py", "NRFIntegrator"),
+    "Medium `nrf`": ("plugins/medium.py", "NRFMedium"),
+    "Emitter `ntf`": ("plugins/emitter.py", "NTFEmitter"),
+    "Phase function `nrf`": ("plugins/phase.py", "NRFPhase"),
+}
+"""Heading → file and class of a plugin."""
+OUTPUTS = "transport/aovs.py"
+
+INTRODUCTION = """# Plugins
+
+The parameters of every plugin. This page is made from the docstrings by `python tools/plugin_reference.py`: change
+those, then run it. How the parts play together is told in [rendering](rendering.md).
+"""
+METHODS = """## Visibility methods
+
+What `visibility` may name, and whether it makes a table for each light. Discrete lights are points, spots, directions
+and the cells of environments; others, such as areas, are drawn at random. More about each is told in
+[rendering](rendering.md#visibility).
+"""
+
+
+def page() -> str:
+    """The text of docs/plugins.md."""
+    parts = [INTRODUCTION]
+    for heading, (file, name) in PLUGINS.items():
+        parts.append(f"## {heading}\n\n{markdown(docstring(PACKAGE / file, name))}\n")
+    parts.append(f"## Further outputs (`aovs`)\n\n{markdown(docstring(PACKAGE / OUTPUTS))}\n")
+    return "\n".join([*parts, METHODS, methods(), ""])
+
+
+def docstring(file: Path, name: str | None = None) -> str:
+    """The docstring of the class `name` in `file`, wherever it is defined there, or that of the module."""
+    tree = ast.parse(file.read_text(encoding="utf-8"))
+    if name is None:
+        return ast.get_docstring(tree)
+    classes = (node for node in ast.walk(tree) if isinstance(node, ast.ClassDef))
+    return next(ast.get_docstring(node) for node in classes if node.name == name)
+
+
+def markdown(text: str) -> str:
+    """reStructuredText with simple tables as Markdown."""
+    blocks = (block.splitlines() for block in text.split("\n\n"))
+    return inline("\n\n".join(table(simple_table(b)) if is_border(b[0]) else "\n".join(b) for b in blocks))
+
+
+def inline(text: str) -> str:
+    """Literals and references as Markdown's code."""
+    return re.sub(r":\w+:`~?([^`]+)`", r"`\1`", text).replace("``", "`")
+
+
+def is_border(line: str) -> bool:
+    """Whether `line` is the first one of a simple table."""
+    return re.fullmatch(r"=+( +=+)+", line) is not None
+
+
+def simple_table(lines: list[str]) -> list[list[str]]:
+    """Cells of a simple table of reStructuredText, its head first. A line whose first column is empty goes on with the
+    row above."""
+    starts = [found.start() for found in re.finditer("=+", lines[0])]
+    rows = []
+    for line in lines:
+        if is_border(line):
+            continue
+        cells = [line[a:b].strip() for a, b in zip(starts, [*starts[1:], None], strict=True)]
+        if cells[0]:
+            rows.append(cells)
+        else:
+            rows[-1] = [f"{above} {cell}".strip() for above, cell in zip(rows[-1], cells, strict=True)]
+    return rows
+
+
+def table(rows: list[list[str]]) -> str:
+    """A Markdown table of `rows`, the head first. Names, which the first column holds, are set as code."""
+    head, *body = ([cell.replace("|", r"\|") for cell in row] for row in rows)
+    named = ([f"`{name}`" if name.isidentifier() else name, *rest] for name, *rest in body)
+    return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *named))
+
+
+def methods() -> str:
+    """The table of visibility methods."""
+    cheapest = ", ".join(f"`{method.name}`" for method in REGISTRY.values() if method.automatic)
+    auto = ["auto", f"of the integrator: the cheapest of {cheapest}, by the machine's measured prices", "", "", ""]
+    head = ["name", "what it does", "per light", "lights", "parameters that it reads"]
+    return table([head, *(described(method) for method in REGISTRY.values()), auto])
+
+
+def described(method: Method) -> list[str]:
+    """The row of a visibility method."""
+    return [
+        method.name,
+        method.summary,
+        "a table" if method.making else "nothing",
+        f"discrete, others by `{method.drawn}`" if method.drawn else "any",
+        ", ".join(f"`{dial}`" for dial in method.dials),
+    ]
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")
+    print(PAGE)
