@@ -56,7 +56,14 @@ def test_snippet(folder, language, code):
         check("python", "snippet.py", folder=folder)
 
 
-@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+def _marks(words) -> list:
+    """How shipped fields were trained takes minutes here too: `make hard-cases` runs that."""
+    shipped = "knot-photographs" in words or "scenes/skull/field.safetensors" in words
+    return [pytest.mark.slow] if shipped else []
+
+
+@pytest.mark.parametrize(
+    "words", [pytest.param(words, marks=_marks(words), id=" ".join(words)) for words in COMMANDS])
 def test_command(folder, words):
     """In their order: later ones use the files of earlier ones."""
     if words[0] == "make":  # they install, or run this suite

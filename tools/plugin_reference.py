@@ -100,7 +100,7 @@ def methods() -> str:
     """The table of visibility methods."""
     cheapest = ", ".join(f"`{method.name}`" for method in REGISTRY.values() if method.automatic)
     auto = ["auto", f"of the integrator: the cheapest of {cheapest}, by the machine's measured prices", "", "", ""]
-    head = ["name", "what it does", "per light", "lights", "parameters that it reads"]
+    head = ["name", "what it does", "holds per light", "lights", "parameters that it reads"]
     return table([head, *(described(method) for method in REGISTRY.values()), auto])
 
 
@@ -109,7 +109,7 @@ def described(method: Method) -> list[str]:
     return [
         method.name,
         method.summary,
-        "a table" if method.making else "nothing",
+        "nothing" if not method.making else "maps, for the field" if method.per_field else "a table",
         f"discrete, others by `{method.drawn}`" if method.drawn else "any",
         ", ".join(f"`{dial}`" for dial in method.dials),
     ]

@@ -133,8 +133,8 @@ class Exact:
         corners = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), -1).reshape(-1, 3)
         grid = SimpleNamespace(clearance=dr.zeros(mi.Float, CELLS**3), hull=corners, density=self.density)
         network = Balls(0).medium().field.network
-        return SimpleNamespace(source=SimpleNamespace(density=self.density, reflectance=self.reflectance),
-                               field=SimpleNamespace(network=network, grid=grid, softness=Softness(grid, mi)))
+        field = SimpleNamespace(network=network, grid=grid, softness=SimpleNamespace(solid=1.0))
+        return SimpleNamespace(source=SimpleNamespace(density=self.density, reflectance=self.reflectance), field=field)
 
 
 def _inside(x, d, radius):

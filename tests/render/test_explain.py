@@ -40,6 +40,15 @@ def test_point_light_by_name():
     assert "measured" not in report and report["constants"].startswith("built in")
 
 
+def test_what_is_held_for_a_field():
+    """Whatever the lights: 32² maps of 64² texels of two numbers."""
+    one, many = (explain(SCENE, {"visibility": "transmittance_atlas", "light": light, "res": "16"})
+                 for light in ("point", "env"))
+    assert one["memory_bytes"]["maps or volumes"] == many["memory_bytes"]["maps or volumes"] == 32 << 20
+    assert one["seconds"]["maps or volumes"] == many["seconds"]["maps or volumes"] > 0
+    assert not many["effects"]["transmittance maps"]["on"]
+
+
 def test_auto_chooses_by_the_number_of_shading_points():
     few = explain(SCENE, {"light": "env", "res": "16", "spp": "1"})
     many = explain(SCENE, {"light": "env", "res": "256", "spp": "64"})

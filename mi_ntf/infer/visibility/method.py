@@ -46,6 +46,7 @@ class Method:
     making       as `pair`, of what is held for a light; None for methods that hold nothing
     numbers      ``(medium, table, options)`` → float32 numbers that are held for each of the squared ``map_resolution``
                  rays of a light
+    per_field    `making` and `numbers` are of all that is held for a field, whatever the lights
     dials        properties of the integrator that it reads
     drawn        name of the method that serves lights which are drawn at random, and all other rays; "": itself
     derivatives  whether places of lights have derivatives
@@ -61,6 +62,7 @@ class Method:
     prices: dict[str, float] = field(default_factory=dict)
     making: Callable[[Any, Any], float] | None = None
     numbers: Callable[[Any, Any, Options], int] | None = None
+    per_field: bool = False
     dials: tuple[str, ...] = ()
     drawn: str = ""
     derivatives: bool = False

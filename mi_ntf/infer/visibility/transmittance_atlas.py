@@ -20,7 +20,7 @@ from ...core import spheres
 from .. import octahedral, ops, profile
 from ..lights import LightTable
 from . import map_source, raymarch
-from .method import Method, Options, queries
+from .method import FILLED, Method, Options, queries
 from .transmittance_map import TransmittanceMap, channels
 
 SIDE = 32
@@ -116,13 +116,12 @@ def build(medium, lights, options: Options, dj, keep) -> TransmittanceAtlas:
     """See :class:`mi_ntf.infer.visibility.method.Method`."""
     density, grid = medium.source.density, medium.field.grid
     network = options.map_source == "network"
-    solid = medium.field.softness.solid >= SOLID
-    components = 1 if solid else 2
+    components = logistics(medium, options)
     step = options.step * (profile.FOR_NETWORKS if network else profile.FOR_MAPS / components)
     reader = profile.of(medium, step, dj)
     source = (map_source.network_source(medium.field.network, reader, False) if network
               else map_source.field_source(medium.source, reader, components))
-    directions, resolution = table(dj), RESOLUTION[min(source.components, 2)]
+    directions, resolution = table(dj), RESOLUTION[min(components, 2)]
 
     def make(values=None):
         values = None if values is None else dj.Float(values)
@@ -132,7 +131,21 @@ def build(medium, lights, options: Options, dj, keep) -> TransmittanceAtlas:
     march = None
     if lights is None or (lights.is_point & (np.linalg.norm(lights.where, axis=1) < 1)).any():
         march = raymarch.build(medium, lights, options, dj, keep)
-    return TransmittanceAtlas(density, maps, BEGIN if solid else REACH, march, dj)
+    begin = BEGIN if medium.field.softness.solid >= SOLID else REACH
+    return TransmittanceAtlas(density, maps, begin, march, dj)
+
+
+def logistics(medium, options: Options) -> int:
+    """Of a texel."""
+    if options.map_source == "network":
+        return medium.field.network.components
+    return 1 if medium.field.softness.solid >= SOLID else 2
+
+
+def numbers(medium, lights, options: Options) -> int:
+    """float32 numbers of all maps."""
+    components = logistics(medium, options)
+    return SIDE**2 * RESOLUTION[min(components, 2)] ** 2 * channels(components)
 
 
 METHOD = Method(
@@ -141,5 +154,9 @@ METHOD = Method(
     build=build,
     pair=lambda work, prices: prices.atlas + len(PLACES) * queries(work, prices),
     prices={"atlas": 25.0},
+    making=lambda work, prices: (
+        FILLED * SIDE**2 * RESOLUTION[1] ** 2 * (work.samples * (prices.texel + queries(work, prices)))),
+    numbers=numbers,
+    per_field=True,
     dials=("map_source",),
 )

@@ -94,7 +94,8 @@ def _held(integrator, media: list, found, light) -> int:
     table, options = light.table(media[0].frame), building.options(integrator)
     first, last = building.parts(found.visibility, media, table, options)[0]
     sizes = [building.size_per_light(found.visibility, medium, table, options) for medium in media]
-    return (last - first) * sum(sizes)
+    own = [building.size_per_field(found.visibility, medium, table, options) for medium in media]
+    return (last - first) * sum(sizes) + sum(own)
 
 
 def _sum(stages) -> dict:
@@ -106,7 +107,7 @@ def _sum(stages) -> dict:
 
 def _effects(scene, found, integrator, count: int) -> dict:
     """Each effect: whether it takes part, and the reason."""
-    use_map = found.needs_visibility and REGISTRY[found.visibility].numbers is not None
+    use_map = found.needs_visibility and bool(REGISTRY[found.visibility].drawn)
     others = len(ordinary_shapes(scene))
     unlit = "no emitter has power" if found.emitters else "there is no emitter"
     answers = {

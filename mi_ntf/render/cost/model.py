@@ -127,10 +127,11 @@ def seconds(work: Work, c: Constants) -> dict[str, float]:
     """Predicted wall seconds of each stage, compilation left out; ``bounces`` where they are by radiosity."""
     query = c.density if work.network else 0
     pairs = work.points * work.lights
-    making = REGISTRY[work.method].making
+    method = REGISTRY[work.method]
+    made = method.making(work, c) * (1 if method.per_field else work.lights) if method.making else 0.0
     lit = c.shade + FACING * per_pair(work, c)
     stages = {
-        "maps or volumes": 1e-9 * work.lights * (making(work, c) if making else 0.0),
+        "maps or volumes": 1e-9 * made,
         "camera march": 1e-9 * work.rays * work.samples * (c.camera + NOT_SKIPPED * query),
         "reflectance": 1e-9 * work.points * (c.reflect + query),
         "lights": 1e-9 * pairs * lit,

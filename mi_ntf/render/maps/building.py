@@ -38,8 +38,16 @@ def parts(method: str, media, table, options: Options) -> list:
 
 def size_per_light(method: str, medium, table, options: Options) -> int:
     """Bytes of one light's map or volume; 0 for methods that hold nothing per light."""
-    numbers = REGISTRY[method].numbers
-    return 4 * numbers(medium, table, options) * options.map_resolution**2 if numbers else 0
+    found = REGISTRY[method]
+    if not found.numbers or found.per_field:
+        return 0
+    return 4 * found.numbers(medium, table, options) * options.map_resolution**2
+
+
+def size_per_field(method: str, medium, table, options: Options) -> int:
+    """Bytes of what is held for a field, whatever the lights."""
+    found = REGISTRY[method]
+    return 4 * found.numbers(medium, table, options) if found.numbers and found.per_field else 0
 
 
 def build(method: str, medium, table, options: Options):

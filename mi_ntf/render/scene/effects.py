@@ -110,7 +110,7 @@ def _bounces(name: str, media: list, method: str, surfaces: bool, gradients: boo
 def _method(integrator, rays: int, exhaustive: bool, media: list) -> tuple[str, str]:
     """The visibility method that runs, and why."""
     method, reason = integrator.visibility, "chosen by name"
-    if method != "auto" and REGISTRY[method].numbers and not exhaustive:
+    if method != "auto" and REGISTRY[method].drawn and not exhaustive:
         raise MiNtfError(
             f"light_samples is {integrator.light_samples}, but visibility={method} holds one map or volume for every "
             "light and sums all of them; remove light_samples or choose raymarch or neural_transmittance"
