@@ -12,7 +12,7 @@ SIZE, BLOCK = 32, 8
 OPTIONS = {
     "pixel_format": ("rgba", "rgb", "luminance", "luminance_alpha", "xyz", "xyza"),
     "rfilter": ("box", "tent", "gaussian", "mitchell", "catmullrom", "lanczos"),
-    "method": ("raymarch", "transmittance_map", "transmittance_volume", "neural_transmittance", "visibility_mlp",
+    "method": ("raymarch", "transmittance_map", "transmittance_volume", "ray_network", "visibility_mlp",
                "none"),
     "sampler": ("independent", "stratified", "multijitter", "orthogonal", "ldsampler"),
     "spp": (16, 4, 7, 49),

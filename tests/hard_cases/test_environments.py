@@ -209,7 +209,7 @@ def test_texels_that_are_no_numbers(blobs, value, mode):
         return
     options = {"light_samples": 2} if mode == "drawn" else {}
     scene = scenes.scene(blobs, scenes.nrf(**options), {"sky": skies.emitter(image)}, size=4, spp=1)
-    for visibility in ("raymarch", "none", "neural_transmittance", "visibility_mlp"):
+    for visibility in ("raymarch", "none", "ray_network", "visibility_mlp"):
         scene.integrator().visibility = visibility
         with pytest.raises(MiNtfError, match=r"\(sky\): 3 texels of data are NaN or infinite.*row 5, column 0"):
             scene.integrator().render(scene)

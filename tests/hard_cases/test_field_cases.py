@@ -15,7 +15,7 @@ from mi_ntf.core import field_file, microfacet, ops
 from mi_ntf.core.errors import MiNtfError
 
 METHODS = ("raymarch", "transmittance_volume", "transmittance_map", "transmittance_map, 2 logistics",
-           "neural_transmittance", "visibility_mlp", "none")  # fmt: skip
+           "ray_network", "visibility_mlp", "none")  # fmt: skip
 UP = np.array([0, 0, 1.0])
 
 
@@ -124,7 +124,7 @@ def test_reflectance_of_an_opaque_skin(file, albedo, roughness, specular, method
 
 
 FLAT = {"raymarch": 2e-3, "transmittance_volume": 2e-3, "transmittance_map": 0.03,
-        "transmittance_map, 2 logistics": 2.5e-3, "neural_transmittance": 0.13, "visibility_mlp": 1.4e-3,
+        "transmittance_map, 2 logistics": 2.5e-3, "ray_network": 0.13, "visibility_mlp": 1.4e-3,
         "none": 1.5e-3}
 """1.5 times what is measured; of the network that answers with the middle of each profile, 0.086."""
 

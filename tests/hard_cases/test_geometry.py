@@ -9,7 +9,7 @@ import pytest
 from helpers import fields, pictures
 
 METHODS = ("raymarch", "transmittance_volume", "transmittance_map", "transmittance_map, 2 logistics",
-           "neural_transmittance", "visibility_mlp")  # fmt: skip
+           "ray_network", "visibility_mlp")  # fmt: skip
 
 
 @pytest.fixture(scope="module")

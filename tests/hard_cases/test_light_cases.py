@@ -13,7 +13,7 @@ from mi_ntf.core.errors import MiNtfError
 from mi_ntf.render.lights import scene_lights
 
 CENTER, RADIUS = np.array(scenes.SIMILARITY.center), scenes.SIMILARITY.radius
-METHODS = ["raymarch", "transmittance_map", "neural_transmittance", "transmittance_volume", "visibility_mlp", "none"]
+METHODS = ["raymarch", "transmittance_map", "ray_network", "transmittance_volume", "visibility_mlp", "none"]
 TOWARDS = np.array([0.6, 0.64, 0.48])
 
 

@@ -93,7 +93,7 @@ distances."""
 def _depth_of(medium, name: str) -> float:
     """The light that the way to a light may cost: of a volume, a cell's; random networks' slopes are 665 at most."""
     length = 2 * rf.STEP if name == "transmittance_volume" else 2 * BESIDE
-    return 1e-3 + 1 - np.exp(-length * (665 if "net" in name or "neural" in name else medium.field.grid.majorant))
+    return 1e-3 + 1 - np.exp(-length * (665 if "net" in name  else medium.field.grid.majorant))
 
 
 @pytest.mark.parametrize("name", MARCHED)
@@ -153,7 +153,7 @@ def _to_world(frame: Frame, x: np.ndarray) -> np.ndarray:
     return x @ frame._matrix.T * frame.length + frame.origin
 
 
-DENSER = {"raymarch": 1e-4, "transmittance_volume": 2e-3, "neural_transmittance": 0.3, "map, field": 0.27,
+DENSER = {"raymarch": 1e-4, "transmittance_volume": 2e-3, "ray_network": 0.3, "map, field": 0.27,
           "map, field, 2": 0.03, "map, network": 0.25}
 """Measured 5e-6, 5e-4, 0.22, 0.195, 0.02, 0.16: one logistic of a thin ray and of an opaque one bend differently."""
 

@@ -35,7 +35,7 @@ METHODS = {
     "transmittance_map": ("transmittance_map", {}),
     "transmittance_map, 2 logistics": ("transmittance_map", {"map_components": 2}),
     "transmittance_map, network": ("transmittance_map", {"map_source": "network"}),
-    "neural_transmittance": ("neural_transmittance", {}),
+    "ray_network": ("ray_network", {}),
     "visibility_mlp": ("visibility_mlp", {}),
 }
 """What users can choose: name in the table → method and options. Networks are those of the field's file."""

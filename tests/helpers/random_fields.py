@@ -25,7 +25,7 @@ from mi_ntf.render.maps import building
 METHODS = {
     "raymarch": ("raymarch", {}),
     "transmittance_volume": ("transmittance_volume", {}),
-    "neural_transmittance": ("neural_transmittance", {}),
+    "ray_network": ("ray_network", {}),
     "map, field": ("transmittance_map", {}),
     "map, field, 2": ("transmittance_map", {"map_components": 2}),
     "map, network": ("transmittance_map", {"map_source": "network"}),

@@ -211,7 +211,7 @@ def _camera(kind: str, eye, centre, film: dict, spp: int, sampler: str, radius: 
 
 
 def _integrator(d: _Draw) -> dict:
-    method = d.pick("visibility", ("raymarch", "transmittance_map", "neural_transmittance", "transmittance_volume",
+    method = d.pick("visibility", ("raymarch", "transmittance_map", "ray_network", "transmittance_volume",
                                    "visibility_mlp", "none", "auto"), (3, 4, 3, 2, 1, 1, 2))  # fmt: skip
     options = {
         "samples": d.pick("samples", (8, 48, 128, 384)),

@@ -18,7 +18,7 @@ from mi_ntf.infer.network import NetworkField
 from mi_ntf.infer.profile import DepthProfile
 from mi_ntf.infer.visibility.light_rays import DIRECTIONAL, FRUSTUM, SPHERE, LightRays, frames
 from mi_ntf.infer.visibility.map_source import CLEAR, Source, field_source, network_source
-from mi_ntf.infer.visibility.neural_transmittance import NeuralTransmittance
+from mi_ntf.infer.visibility.ray_network import RayNetwork
 from mi_ntf.infer.visibility.raymarch import optical_depth
 from mi_ntf.infer.visibility.transmittance_map import TransmittanceMap
 
@@ -228,7 +228,7 @@ def test_light_deep_in_opaque_matter(components, rng):
     distance = np.concatenate([np.full(100, 3e-4), rng.uniform(3e-4, 0.02, 100), rng.uniform(0.4, 0.9, 100)])
     x = (o - distance * d).T
     wi, r = (where - x) / distance[:, None], mi.Float(distance)
-    truth = np.array(NeuralTransmittance(network, whole).tau(arrays(x), arrays(wi), r, mi.UInt32(0), True))
+    truth = np.array(RayNetwork(network, whole).tau(arrays(x), arrays(wi), r, mi.UInt32(0), True))
     found = np.array(tmap.tau(arrays(x), arrays(wi), r, mi.UInt32(0), True))
     # Slopes of some hundred times float32's 1e-6; where S = e^−8 stands for an exponential, 3e-4 of it.
     np.testing.assert_allclose(found, truth, atol=3e-3)

@@ -9,13 +9,13 @@ from helpers.jit import arrays
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.infer.lights import LightTable
 from mi_ntf.infer.visibility import raymarch
-from mi_ntf.infer.visibility.neural_transmittance import NeuralTransmittance
+from mi_ntf.infer.visibility.ray_network import RayNetwork
 from mi_ntf.infer.visibility.visibility_mlp import VisibilityMLP
 
 
-def test_neural_transmittance_is_a_transmittance(network, reader, rng):
+def test_ray_network_is_a_transmittance(network, reader, rng):
     """In [0, 1], growing towards the light; for a light inside the sphere 1 at the light."""
-    visibility = NeuralTransmittance(network, reader)
+    visibility = RayNetwork(network, reader)
     o, d = rng.uniform(-0.3, 0.3, (200, 3)), rng.normal(size=(200, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     t = np.linspace(-0.6, 0.6, 30)

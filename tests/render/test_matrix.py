@@ -12,7 +12,7 @@ from mi_ntf.infer.visibility import raymarch
 SCENES = Path(__file__).parents[2] / "scenes"
 TOLERANCE = {
     "raymarch": {"statue": 0.0031, "globe": 0.0031, "knot": 0.0025},
-    "neural_transmittance": {"statue": 0.0245, "globe": 0.0265, "knot": 0.0156},
+    "ray_network": {"statue": 0.0245, "globe": 0.0265, "knot": 0.0156},
     "transmittance_map": {"statue": 0.048, "globe": 0.05, "knot": 0.027},  # texels as wide as the finer shadows
     "transmittance_volume": {"statue": 0.066, "globe": 0.061, "knot": 0.034},  # where one skin outshines the next
     "visibility_mlp": {"statue": 0.35, "globe": 0.42, "knot": 0.34},  # a small network that knows the object by heart

@@ -10,6 +10,7 @@ unused. Construction does the work that depends on the lights alone.
 from . import (
     neural_transmittance,
     none,
+    ray_network,
     raymarch,
     transmittance_atlas,
     transmittance_map,
@@ -20,7 +21,7 @@ from . import (
 REGISTRY = {
     module.METHOD.name: module.METHOD
     for module in (raymarch, transmittance_volume, neural_transmittance, transmittance_map, transmittance_atlas,
-                   visibility_mlp, none)
+                   ray_network, visibility_mlp, none)
 }
 """Name → :class:`mi_ntf.infer.visibility.method.Method`. What is not in here does not exist."""
 

@@ -1,43 +1,33 @@
-"""``neural_transmittance``: one query of the ray network per point and light (Shafiei et al. 2021; method.md, section
-4)."""
+"""``neural_transmittance``: the ray network, asked once for each ray of an atlas, and remembered.
 
-import drjit as dr
+What is learned: the transmittance along any whole ray, as logistics (Shafiei et al. 2021; method.md, section 4). What
+is remembered: its answers for the rays of :mod:`mi_ntf.infer.visibility.transmittance_atlas`, two million of them.
+What it costs: those queries once per field, then an atlas lookup per point and light.
+"""
 
-from ...core import mixture, spheres
-from .. import ops, profile
-from .method import Method, Options
+from dataclasses import replace
 
-
-class NeuralTransmittance:
-    """`field`: a :class:`mi_ntf.infer.network.NetworkField`; `profile`: a
-    :class:`mi_ntf.infer.profile.DepthProfile` of the same field."""
-
-    def __init__(self, field, profile):
-        self.field, self.profile = field, profile
-
-    def tau(self, x, wi, distance, index, active):
-        """The ray's τ at x; for a light inside the sphere, over its value at the light, which is where τ is 1. What
-        lies behind such a light is kept from the network's eyes."""
-        here = spheres.coordinate(x, wi)
-        light = here + distance
-        hit, h, mix = self.field.ray_mixture(x, wi, lambda o, d: self.profile(o, d, begin=light))
-        t = dr.maximum(here, -h)
-        depth = mixture.optical_depth(ops, t, mix)
-        inside = light < h
-        beyond = mixture.optical_depth(ops, dr.select(inside, light, t), mix)
-        depth = dr.select(inside, dr.maximum(depth - beyond, 0), dr.maximum(depth, 0))
-        return dr.select(hit & (light > -h), dr.exp(-depth), 1)
+from . import transmittance_atlas
+from .method import FILLED, Method
 
 
-def build(medium, table, options: Options, dj, keep) -> NeuralTransmittance:
+def build(medium, table, options, dj, keep):
     """See :class:`mi_ntf.infer.visibility.method.Method`."""
-    return NeuralTransmittance(medium.field.network, profile.of(medium, options.step * profile.FOR_NETWORKS, dj))
+    return transmittance_atlas.build(medium, table, replace(options, map_source="network"), dj, keep)
+
+
+def numbers(medium, lights, options) -> int:
+    """float32 numbers of all maps."""
+    return transmittance_atlas.numbers(medium, lights, replace(options, map_source="network"))
 
 
 METHOD = Method(
     name="neural_transmittance",
-    summary="one query of the ray network per point and light",
+    summary="per field, the ray network's answers for the rays of an atlas, each asked once; looked up as in one",
     build=build,
-    pair=lambda work, prices: prices.ray,
-    prices={"ray": 600.0},
+    pair=transmittance_atlas.METHOD.pair,
+    making=lambda work, prices: FILLED * transmittance_atlas.RAYS * prices.ray,
+    numbers=numbers,
+    per_field=True,
+    dials=("map_file",),
 )

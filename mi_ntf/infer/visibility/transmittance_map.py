@@ -16,6 +16,7 @@ import numpy as np
 from ...core.ops import dot
 from .. import profile
 from ..lights import LightTable
+from ..texels import Texels, blank
 from . import map_source
 from .light_rays import LightRays
 from .map_source import Source
@@ -32,27 +33,40 @@ def channels(components: int, weights: bool | None = None) -> int:
 
 
 class TransmittanceMap:
-    """Maps of all lights of a table, at most m² texels each, one after the other in one array `values`.
+    """Maps of all lights of a table, at most m² texels each, one after the other in one Dr.Jit texture (`texels`).
 
-    `source`: a :class:`mi_ntf.infer.visibility.map_source.Source`; None where `values` are at hand. `hull` (k, 3):
-    points whose convex hull holds all density. Memory: 8 m² bytes a light for one logistic, whose weight is 1 and not
-    stored, 16 K m² for mixtures.
+    `source`: a :class:`mi_ntf.infer.visibility.map_source.Source`. `values`: what :attr:`values` of such a map were, if
+    they are at hand. `hull` (k, 3): points whose convex hull holds all density. Memory: 8 m² bytes a light for one
+    logistic, whose weight is 1 and not stored, 16 K m² for mixtures.
     """
 
     def __init__(self, lights: LightTable, resolution: int, hull: np.ndarray, source: Source, dj: ModuleType,
                  values=None):
-        self.dj, self.count = dj, lights.count
+        self.dj, self.lights, self.count = dj, lights, lights.count
         self.rays = LightRays(lights, hull, resolution, dj)
         self.width = channels(source.components, source.weights)
-        if values is None:
-            values = dr.zeros(dj.Float, lights.count * resolution**2 * self.width)
-            # A chunk of lights at a time bounds what a source holds per ray.
-            chunk = max(1, (1 << 22) // resolution**2)
-            for first in range(0, lights.count, chunk):
-                texel, o, d, end = self.rays.all_rays(first, min(chunk, lights.count - first))
-                self._store(values, texel, source.fit(o, d, end))
-                dr.eval(values)
-        self.values = values
+        self._parts = max(1, self.width // 4)
+        rows, columns = lights.count * resolution**2 * self._parts, self.width // self._parts
+        numbers = self._fit(source, rows, columns) if values is None else values
+        self.texels = Texels(numbers, rows, columns, dj)
+
+    def _fit(self, source: Source, rows: int, columns: int):
+        """The numbers of all texels."""
+        numbers = blank(rows, columns, self.dj)
+        # A chunk of lights at a time bounds what a source holds per ray.
+        chunk = max(1, (1 << 22) // self.rays.m**2)
+        for first in range(0, self.count, chunk):
+            texel, o, d, end = self.rays.all_rays(first, min(chunk, self.count - first))
+            for k, part in enumerate(source.fit(o, d, end)):
+                row = self.dj.Array2f(*part[1:]) if columns == 2 else self.dj.Array4f(*part, 0)
+                dr.scatter(numbers, row, texel * self._parts + k)
+            dr.eval(numbers)
+        return numbers
+
+    @property
+    def values(self) -> np.ndarray:
+        """`width` float32 numbers a texel, m² texels a light."""
+        return self.texels.numbers()
 
     def tau(self, x, wi, distance, index, active):
         """The square of bilinear √τ of the four nearest texel rays; 1 where light meets nothing."""
@@ -73,15 +87,9 @@ class TransmittanceMap:
 
     def _fetch(self, texel, active):
         if self.width == 2:
-            return ((1.0, *dr.gather(self.dj.Array2f, self.values, texel, active)),)
-        parts = self.width // 4
-        rows = [dr.gather(self.dj.Array4f, self.values, texel * parts + k, active) for k in range(parts)]
+            return ((1.0, *self.texels.row(texel, active)),)
+        rows = [self.texels.row(texel * self._parts + k, active) for k in range(self._parts)]
         return tuple((row[0], row[1], row[2]) for row in rows)
-
-    def _store(self, values, texel, mix):
-        for k, part in enumerate(mix):
-            row = self.dj.Array2f(*part[1:]) if self.width == 2 else self.dj.Array4f(*part, 0)
-            dr.scatter(values, row, texel if self.width == 2 else texel * len(mix) + k)
 
 
 def _root(t, mixture):
@@ -132,7 +140,6 @@ def build(medium, table, options: Options, dj, keep) -> TransmittanceMap:
         source = map_source.field_source(medium.source, reader, options.map_components)
 
     def make(values=None):
-        values = None if values is None else dj.Float(values)
         return TransmittanceMap(table, options.map_resolution, medium.field.grid.hull, source, dj, values)
 
     return keep(width(medium, table, options), step, make)

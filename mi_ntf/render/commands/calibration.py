@@ -61,8 +61,8 @@ def _jobs(method, medium, x) -> dict:
     built = building.build(method.name, medium, many, Options(step, resolution))
     jobs = {pair: (lambda: _tau(built, many, x), WIDTH * lights * method.pair(work, _alone(pair)))}
     if making:
-        def make():
-            return building.build(method.name, medium, few, Options(2 / SAMPLES, resolution)).values
+        def make() -> None:
+            building.build(method.name, medium, few, Options(2 / SAMPLES, resolution))
 
         jobs[making[0]] = make, FEW * method.making(work, _alone(making[0]))
     return jobs

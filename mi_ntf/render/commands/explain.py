@@ -38,13 +38,14 @@ def explain(scene: Path, parameters: dict[str, str], measure: bool = False) -> d
     light = scene_lights.Lights(loaded, media, integrator.light_samples, integrator.environment_lights)
     found = effects.describe(loaded, integrator, sensor, spp, media, light)
     count = light.table(media[0].frame).count
-    work = _works(integrator, media, found, width * height * spp, count, light)
+    drawn = effects.drawn(integrator, light)
+    work = _works(integrator, media, found, width * height * spp, count, drawn)
     report = {
         "scene": str(scene),
         "image": {"width": width, "height": height, "spp": spp},
         "fields": [{"file": m.path, "representation": m.representation, "center": m.frame.origin.tolist(),
                     "radius": m.frame.length} for m in media],
-        "lights": {"emitters": list(found.emitters), "count": count, "drawn": _drawn(integrator, light)},
+        "lights": {"emitters": list(found.emitters), "count": count, "drawn": drawn},
         "environments": [_environment(each) for each in light.discrete if each.cells],
         "visibility": found.visibility,
         "effects": _effects(loaded, found, integrator, count),
@@ -63,22 +64,17 @@ def _environment(light) -> dict:
             "radius_degrees": math.degrees(cells.radius), "irradiance_error_percent": 100 * cells.error()}
 
 
-def _works(integrator, media: list, found, rays: int, count: int, light) -> list[model.Work]:
+def _works(integrator, media: list, found, rays: int, count: int, drawn: int) -> list[model.Work]:
     """What each medium's part of the render comes to."""
     method = found.visibility if found.needs_visibility else "none"
-    pairs = count + _drawn(integrator, light)
     radiosity = found.bounces == "radiosity"
     works = []
     for medium, seen in zip(media, found.in_view, strict=True):
-        work = model.work(integrator, medium, method, rays if seen else 0, pairs if found.lit else 0)
+        others = effects.others(integrator, rays, found.surfaces, found.bounces) if found.lit else 0
+        work = model.work(integrator, medium, method, rays if seen else 0, count, drawn, others)
         work = replace(work, patches=model.patches(medium.field.grid) if radiosity else 0)
         works.append(work if found.lit else replace(work, points=0))
     return works
-
-
-def _drawn(integrator, light) -> int:
-    """Lights that are drawn for each point."""
-    return integrator.light_samples or 2 * len(light.sampled)
 
 
 def _memory(works: list[model.Work]) -> dict[str, int]:

@@ -6,9 +6,8 @@ bench` run; a render reads them from the user's cache, or takes those of two cor
 
 import ctypes
 import json
-import math
 import platform
-from dataclasses import asdict, dataclass, field, fields, make_dataclass
+from dataclasses import asdict, dataclass, field, fields, make_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +54,9 @@ class Work:
     """The size of a render.
 
     rays, points  camera rays, shading points
-    lights        of the table, and drawn ones a point
+    lights        of the table
+    drawn         lights drawn at random for each point
+    others        rays towards lights from surfaces and further bounces, which no light's own map serves
     texels        of a map: m²; `components`: logistics in each
     samples       cells across the unit sphere's diameter
     source        of maps: ``field`` or ``network``
@@ -74,6 +75,8 @@ class Work:
     network: bool = False
     voxels: int = 192
     patches: int = 0
+    drawn: int = 0
+    others: float = 0.0
 
 
 def per_pair(work: Work, c: Constants) -> float:
@@ -81,35 +84,47 @@ def per_pair(work: Work, c: Constants) -> float:
     return REGISTRY[work.method].pair(work, c)
 
 
-def break_even(work: Work, c: Constants) -> float:
-    """P*, the shading points from which on maps are cheaper than marches, whatever the number of lights:
+def per_drawn_pair(work: Work, c: Constants) -> float:
+    """The same of a light that is drawn at random."""
+    return REGISTRY[REGISTRY[work.method].for_drawn].pair(work, c)
 
-        P* = (π/4) m² q / (f (n c_s − c_l))
 
-    with q a texel's cost, n c_s a march's, c_l a lookup's, f the share of lights that a point faces."""
-    march, maps = REGISTRY["raymarch"], REGISTRY["transmittance_map"]
-    gain = march.pair(work, c) - maps.pair(work, c)
-    return maps.making(work, c) / (FACING * gain) if gain > 0 else math.inf
+def making(work: Work, c: Constants) -> float:
+    """ns that the method takes to be built."""
+    method = REGISTRY[work.method]
+    return method.making(work, c) * (1 if method.per_field else work.lights) if method.making else 0.0
+
+
+def visibility(work: Work, c: Constants) -> float:
+    """ns of all that depends on the method: what is made, and every light's τ at every point that faces it."""
+    random = (work.points * work.drawn + work.others) * per_drawn_pair(work, c)
+    return making(work, c) + FACING * (work.points * work.lights * per_pair(work, c) + random)
 
 
 def choose(work: Work, c: Constants | None = None) -> tuple[str, str]:
-    """``(method, reason)`` of ``visibility=auto``: ``transmittance_map`` from P* shading points on, else ``raymarch``.
-    ``work.method`` is not read."""
-    least = break_even(work, c or constants())
-    method = "transmittance_map" if work.points >= least else "raymarch"
-    limit = f"{least:.2g} on" if math.isfinite(least) else "no number"
-    return method, f"about {work.points:.2g} shading points, maps pay from {limit}"
+    """``(method, reason)`` of ``visibility=auto``: the cheapest, by :func:`visibility`, of the methods that serve what
+    there is. ``work.method`` is not read."""
+    prices = c or constants()
+    found = {}
+    for name, method in REGISTRY.items():
+        if method.automatic and (work.lights or not method.drawn):
+            found[name] = 1e-9 * visibility(replace(work, method=name), prices)
+    best = sorted(found, key=lambda name: found[name])
+    lights = " and ".join(f"{n} {kind}" for n, kind in (
+        (work.lights, "lights"), (work.drawn, "drawn ones")) if n) or "no light"
+    costs = ", ".join(f"{found[name]:.2g} s by {name}" for name in best)
+    return best[0], f"about {work.points:.2g} shading points with {lights}: {costs}"
 
 
-def work(integrator, medium, method: str, rays: int, lights: int = 1) -> Work:
-    """What it comes to that an ``nrf`` integrator traces `rays` camera rays through `medium` under `lights` lights.
-    Shading points are guessed: an opaque object in the picture."""
+def work(integrator, medium, method: str, rays: int, lights: int = 1, drawn: int = 0, others: float = 0.0) -> Work:
+    """What it comes to that an ``nrf`` integrator traces `rays` camera rays through `medium` under `lights` lights and
+    as many `drawn` ones, with as many rays of `others`. Shading points are guessed: an opaque object in the picture."""
     network = integrator.map_source == "network"
     return Work(
         rays=rays, points=rays * COVERAGE * POINTS_A_HIT * integrator.samples / 384, lights=lights, method=method,
         texels=integrator.map_resolution**2, samples=integrator.samples, source=integrator.map_source,
         components=medium.field.network.components if network else integrator.map_components,
-        network=medium.representation == "network", voxels=medium.field.grid.resolution,
+        network=medium.representation == "network", voxels=medium.field.grid.resolution, drawn=drawn, others=others,
     )
 
 
@@ -126,19 +141,17 @@ def patches(grid) -> int:
 def seconds(work: Work, c: Constants) -> dict[str, float]:
     """Predicted wall seconds of each stage, compilation left out; ``bounces`` where they are by radiosity."""
     query = c.density if work.network else 0
-    pairs = work.points * work.lights
-    method = REGISTRY[work.method]
-    made = method.making(work, c) * (1 if method.per_field else work.lights) if method.making else 0.0
-    lit = c.shade + FACING * per_pair(work, c)
+    pairs = work.points * (work.lights + work.drawn) + work.others
     stages = {
-        "maps or volumes": 1e-9 * made,
+        "maps or volumes": 1e-9 * making(work, c),
         "camera march": 1e-9 * work.rays * work.samples * (c.camera + NOT_SKIPPED * query),
         "reflectance": 1e-9 * work.points * (c.reflect + query),
-        "lights": 1e-9 * pairs * lit,
+        "lights": 1e-9 * (pairs * c.shade + visibility(work, c) - making(work, c)),
     }
     if work.patches:
         rays = radiosity.CHORDS + work.patches * (radiosity.FEW**2 + radiosity.SIDE**2)
         ray = c.between + radiosity.STEPS * NOT_SKIPPED * query
+        lit = c.shade + FACING * per_drawn_pair(work, c)
         stages["bounces"] = 1e-9 * (rays * ray + work.patches * work.lights * lit)
     return stages
 

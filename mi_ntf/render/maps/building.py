@@ -1,7 +1,6 @@
 """Visibility methods for the renderer: integrator and ``ntf`` emitter build theirs here. What is held per light is in
 parts that fit into memory, and found again in files and caches."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import mitsuba as mi
@@ -57,17 +56,17 @@ def build(method: str, medium, table, options: Options):
     and whose moving lights a march follows more finely; None serves the others.
     """
 
-    def keep(width: int, step: float, make, directions=None, resolution: int = 0):
-        lights, side = directions or table, resolution or options.map_resolution
-        if options.map_file and not directions:
+    def keep(width: int, step: float, make, directions=None, own: Options = options):
+        lights = directions or table
+        if own.map_file:
             resolver = mi.file_resolver()  # type: ignore[operator]  # an object in the stub
-            path = Path(str(resolver.resolve(options.map_file)))
-            return make(map_file.read(path, medium, table, options, width))
-        if not options.cache:
+            path = Path(str(resolver.resolve(own.map_file)))
+            return make(map_file.read(path, medium, lights, own, width))
+        if not own.cache:
             return make()
-        name = map_cache.key(medium, lights, replace(options, map_resolution=side), width, step)
+        name = map_cache.key(medium, lights, own, width, step)
         # Of several runs of lights, each needs all of the memory, and none of their maps comes again in this picture.
-        limit = options.map_memory * 2**20 if lights.count == lights.total else 0
-        return map_cache.cached(name, make, lights.count * side**2 * width, limit)
+        limit = own.map_memory * 2**20 if lights.count == lights.total else 0
+        return map_cache.cached(name, make, lights.count * own.map_resolution**2 * width, limit)
 
     return REGISTRY[method].build(medium, table, options, mi, keep)

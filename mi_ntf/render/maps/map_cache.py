@@ -87,7 +87,7 @@ def cached(name: str, make, count: int, limit: float):
     values = _read(name, count) if where == "on" else None
     result = make() if values is None else make(values)
     if where == "on" and values is None and 4 * count <= LARGEST_FILE:
-        _write(name, result.values.numpy())
+        _write(name, result.values)
     if 4 * count <= limit:
         _maps[name] = result
     return result
@@ -100,7 +100,7 @@ def forget() -> None:
 
 def _make_room(limit: float) -> None:
     """Drop the maps used longest ago until the others take `limit` bytes at most."""
-    while _maps and sum(4 * len(m.values) for m in _maps.values()) > limit:
+    while _maps and sum(m.texels.nbytes for m in _maps.values()) > limit:
         _maps.popitem(last=False)
 
 

@@ -29,7 +29,7 @@ def write(path: Path, medium, table, options, maps) -> None:
     window = np.zeros(2, np.int32), np.array(shapes, np.int32).max(0)[::-1] - 1
     parts: list = []
     for tmap in maps:
-        for values in np.array(tmap.values).reshape(tmap.count, -1, tmap.width):
+        for values in tmap.values.reshape(tmap.count, -1, tmap.width):
             k = len(parts)
             lines, columns = shapes[k]
             texels = values[: lines * columns].reshape(lines, columns, tmap.width)

@@ -28,9 +28,10 @@ def emitter_class() -> type:
         (nested)        emitter the light: any emitter, another ``ntf`` for a second field; ``area`` where this emitter
                                 stands inside the shape that shines
         (nested)        medium  the ``nrf`` medium in its way, nested or by ``<ref>``
-        visibility      string  ``raymarch``, ``neural_transmittance``, ``transmittance_atlas``, ``visibility_mlp``,
-                                ``none``; of lights that are one point or direction also ``transmittance_map``,
-                                ``transmittance_volume``; ``auto`` is ``neural_transmittance`` (default: auto)
+        visibility      string  ``raymarch``, ``transmittance_atlas``, ``neural_transmittance``, ``ray_network``,
+                                ``visibility_mlp``, ``none``; of lights that are one point or direction also
+                                ``transmittance_map``, ``transmittance_volume``; ``auto`` is ``transmittance_map`` for
+                                those and ``transmittance_atlas`` for others (default: auto)
         sampling_weight float   as of any emitter: share of the samples drawn from all (default: 1)
         =============== ======= ====================================================================================
 
@@ -66,16 +67,18 @@ def emitter_class() -> type:
             self._prepare()
 
         def _prepare(self):
-            method = "neural_transmittance" if self.visibility == "auto" else self.visibility
-            table = None
             light_checks.check(self.inner, scene_lights.kind(self.inner), drawn=True)
             environment.check_unscaled(self.inner)
-            if REGISTRY[method].for_drawn != method:
+            one, table = _is_one(self.inner), None
+            # The shadow of one light is sharp: its own map sees it better, and is made in a moment.
+            auto = "transmittance_map" if one else "transmittance_atlas"
+            method = auto if self.visibility == "auto" else self.visibility
+            if REGISTRY[method].drawn:
                 kind = scene_lights.kind(self.inner)
-                if not light_rows.kind(self.inner).single or not scene_lights.is_discrete(self.inner):
+                if not one:
                     raise MiNtfError(
                         f"ntf emitter: visibility is {method}, which is made for one light, but {kind} shines from "
-                        "many places; choose raymarch or neural_transmittance"
+                        "many places; choose raymarch or transmittance_atlas"
                     )
                 table = scene_lights.rows([(self.inner, kind)], 1).table(self.medium.frame)
             self._method = build(method, self.medium, table, Options(STEP, cache=True))
@@ -139,6 +142,11 @@ def emitter_class() -> type:
             return f"NTFEmitter[\n  visibility = {self.visibility},\n  emitter = {self.inner}\n]"
 
     return NTFEmitter
+
+
+def _is_one(inner) -> bool:
+    """Whether a light shines from one point or direction."""
+    return light_rows.kind(inner).single and scene_lights.is_discrete(inner)
 
 
 def _is_far(emitter) -> bool:

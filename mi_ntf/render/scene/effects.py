@@ -69,7 +69,8 @@ def describe(scene, integrator, sensor, spp: int, media: list, light) -> Effects
     collocated = lit and not gradients and integrator.visibility != "none" and _at_camera(light, sensor, media)
     surfaces = len(ordinary_shapes(scene)) > 0
     width, height = sensor.film().crop_size()
-    method, reason = _method(integrator, width * height * spp, exhaustive, media)
+    bounces = _bounces(integrator, media, surfaces, gradients) if lit and not 0 <= depth <= 2 else ""
+    method, reason = _method(integrator, width * height * spp, media, light, surfaces, bounces)
     if collocated:
         reason += "; not needed where the camera's own transmittance is the light's"
     rims = [m.field.header.architecture.fresnel for m in media]
@@ -85,19 +86,22 @@ def describe(scene, integrator, sensor, spp: int, media: list, light) -> Effects
         surfaces=surfaces,
         specular=any(rims) or any(m.field.grid.gloss > MIN_GLOSS for m in media),
         fresnel=any(rims),
-        bounces=_bounces(integrator.bounces, media, method, surfaces, gradients) if lit and not 0 <= depth <= 2 else "",
+        bounces=bounces,
         gradients=gradients,
     )
 
 
+UNLIMITED = 4
+"""Bounces that paths without a limit have, about."""
 SOLID = 0.5
 """Fields with fewer opaque skins than this share are smoke, whose bounces radiosity does not know."""
 
 
-def _bounces(name: str, media: list, method: str, surfaces: bool, gradients: bool) -> str:
-    """How further bounces are found: `name`, or the fast way where it knows all that takes part."""
+def _bounces(integrator, media: list, surfaces: bool, gradients: bool) -> str:
+    """How further bounces are found: as told, or the fast way where it knows all that takes part."""
+    name = integrator.bounces
     unknown = [what for what, there in (
-        ("surfaces", surfaces), ("derivatives", gradients), ("visibility=none", method == "none"),
+        ("surfaces", surfaces), ("derivatives", gradients), ("visibility=none", integrator.visibility == "none"),
         ("smoke", any(m.field.softness.solid < SOLID for m in media if m.field.grid.majorant > 0))) if there]
     if name == "radiosity" and unknown:
         raise MiNtfError(
@@ -107,19 +111,30 @@ def _bounces(name: str, media: list, method: str, surfaces: bool, gradients: boo
     return name if name != "auto" else "paths" if unknown else "radiosity"
 
 
-def _method(integrator, rays: int, exhaustive: bool, media: list) -> tuple[str, str]:
+def drawn(integrator, light) -> int:
+    """Lights that are drawn for each point."""
+    return integrator.light_samples or 2 * len(light.sampled)
+
+
+def others(integrator, rays: int, surfaces: bool, bounces: str) -> float:
+    """Rays towards lights from surfaces and from further bounces, about."""
+    further = (integrator.max_depth - 2 if integrator.max_depth > 0 else UNLIMITED) if bounces == "paths" else 0
+    return float(rays * (surfaces + further))
+
+
+def _method(integrator, rays: int, media: list, light, surfaces: bool, bounces: str) -> tuple[str, str]:
     """The visibility method that runs, and why."""
-    method, reason = integrator.visibility, "chosen by name"
-    if method != "auto" and REGISTRY[method].drawn and not exhaustive:
-        raise MiNtfError(
-            f"light_samples is {integrator.light_samples}, but visibility={method} holds one map or volume for every "
-            "light and sums all of them; remove light_samples or choose raymarch or neural_transmittance"
-        )
-    if method == "auto":
-        if not exhaustive:
-            return "raymarch", "random lights have no maps"
-        return model.choose(model.work(integrator, media[0], method, rays))
-    return method, reason
+    method = integrator.visibility
+    if method != "auto":
+        if REGISTRY[method].drawn and integrator.light_samples:
+            raise MiNtfError(
+                f"light_samples is {integrator.light_samples}, but visibility={method} holds one map or volume for "
+                "every light and sums all of them; remove light_samples or choose raymarch or transmittance_atlas"
+            )
+        return method, "chosen by name"
+    return model.choose(model.work(
+        integrator, media[0], method, rays, len(light.rows.power), drawn(integrator, light),
+        others(integrator, rays, surfaces, bounces)))
 
 
 def _at_camera(light, sensor, media) -> bool:
