@@ -57,9 +57,11 @@ def test_snippet(folder, language, code):
 
 
 def _marks(words) -> list:
-    """How shipped fields were trained takes minutes here too: `make hard-cases` runs that."""
-    shipped = "knot-photographs" in words or "scenes/skull/field.safetensors" in words
-    return [pytest.mark.slow] if shipped else []
+    """How shipped fields were trained takes minutes here too, and three trainings differ by their options alone: `make
+    hard-cases` runs those."""
+    slow = "knot-photographs" in words or "scenes/skull/field.safetensors" in words or words[:3] == [
+        "mi-ntf", "train", "mine"]
+    return [pytest.mark.slow] if slow else []
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import json
 import os
 import time
 from collections.abc import Callable
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 
@@ -16,11 +17,12 @@ from rich.console import Console
 from rich.table import Table
 
 from ..core import files
+from ..infer.visibility import transmittance_atlas
 from ..render import register
 from ..render.commands import calibration
 from ..render.cost import model
 from ..render.cost.measurement import maps_made_anew
-from . import bench_image, bench_paper, bench_product
+from . import bench_culled, bench_field, bench_image, bench_lights, bench_product
 from .bench_measure import FULL, QUICK, Row, Sizes
 
 
@@ -37,9 +39,11 @@ def bench(quick: bool = False, out: Path | None = None, say: Callable[[str], Non
     register()
     sizes = QUICK if quick else FULL
     start = time.perf_counter()
+    say(f"{0:5} s  the machine's constants")
+    sections = _sections(sizes)  # prices are those of whole atlases
     rows = []
-    with maps_made_anew():
-        for title, work in _sections(sizes).items():
+    with maps_made_anew(), _atlas(sizes.atlas):
+        for title, work in sections.items():
             say(f"{time.perf_counter() - start:5.0f} s  {title}")
             rows += work()
     report = {"machine": machine(), "quick": quick, "seconds": time.perf_counter() - start,
@@ -58,13 +62,28 @@ def _sections(sizes: Sizes) -> dict[str, Callable[[], list[Row]]]:
     medium = bench_image.medium_of(scene)
     calibration.calibrate(medium)
     return {
-        "the paper's networks": lambda: bench_paper.rows(scene, medium, sizes),
+        "the paper's networks": lambda: bench_culled.rows(scene, medium, sizes),
         "map lookup": lambda: bench_product.lookup_rows(medium, sizes),
         "error of the maps": lambda: bench_product.error_rows(bench_image.under_sky(sizes.error_image), sizes),
+        "error under single lights": lambda: bench_lights.rows(scene, medium, sizes),
+        "every method on the same field": lambda: bench_field.same_field_rows(scene, medium, sizes),
+        "a field of voxels and a field of networks": lambda: bench_field.setting_rows(medium, sizes),
         "one light at the camera": lambda: bench_product.collocated_rows(sizes),
         "1 to 500 lights": lambda: bench_product.scaling_rows(sizes),
+        "first picture": lambda: bench_product.first_rows(sizes),
         "8192 lights": lambda: bench_product.many_lights_rows(sizes),
     }
+
+
+@contextmanager
+def _atlas(resolution: int | None):
+    """Within, the maps of an atlas have `resolution`² texels: two million rays take seconds, and --quick makes many."""
+    before = transmittance_atlas.RESOLUTION
+    transmittance_atlas.RESOLUTION = resolution or before
+    try:
+        yield
+    finally:
+        transmittance_atlas.RESOLUTION = before
 
 
 def machine() -> dict:

@@ -37,7 +37,7 @@ def _speed_up(axes, rows: list[dict]) -> None:
     for r in rows:
         d = r["details"]
         volume, tmap = (d[k + "_fixed_seconds"] + lights * d[k + "_lights_seconds"] for k in ("volume", "map"))
-        axes.plot(lights, volume / tmap, label=r["what"].split(", ", 2)[2].replace(", volume over map", ""))
+        axes.plot(lights, volume / tmap, label=r["what"].split(", ", 2)[2].replace("volume over map, ", ""))
     axes.axhline(92.2, color="0.6", linestyle=":", label="the paper's 92 at 500 lights")
     axes.set(xlabel="lights", yscale="log", ylabel="times faster", title="whole image, volume over map (extrapolated)")
     axes.legend(fontsize=7)

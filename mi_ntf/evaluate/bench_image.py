@@ -1,13 +1,14 @@
 """Whole images of the shipped statue under an environment of many lights, by the product as users call it.
 
-    python -m mi_ntf.evaluate.bench_image --size 600 --columns 50 --rows 10 [--repeats 3]
+    python -m mi_ntf.evaluate.bench_image --size 600 --columns 50 --rows 10 [--repeats 3] [--first]
 
-prints JSON: seconds per render after a small one that compiles, and the peak memory of the process, which is why
-measurements of memory run in a process of their own.
+prints JSON: seconds per render after a small one that compiles (none with --first: the process's first picture), and
+the peak memory of the process, which is why measurements of memory run in a process of their own.
 """
 
 import argparse
 import json
+import os
 import resource
 import subprocess
 import sys
@@ -75,15 +76,25 @@ def timed(scene, integrator_, repeats: int, first: bool = True) -> list[float]:
     return found[first:]
 
 
-def in_own_process(size: int, columns: int, rows: int, repeats: int) -> dict:
-    """``seconds`` (list) and ``peak_bytes`` of such renders in a fresh process."""
+def in_own_process(size: int, columns: int, rows: int, repeats: int, home: Path | None = None) -> dict:
+    """``seconds`` (list) and ``peak_bytes`` of such renders in a fresh process, and ``process_seconds``, its own.
+
+    `home`: the folder of all that it finds and leaves for later processes, Dr.Jit's kernels and our maps; with it, the
+    first picture is the process's first. None: the user's, without maps if the caller makes them anew.
+    """
     words = [sys.executable, "-m", "mi_ntf.evaluate.bench_image", "--size", str(size), "--columns", str(columns),
              "--rows", str(rows), "--repeats", str(repeats), "--variant", str(mi.variant())]
-    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    environment = dict(os.environ)
+    if home is not None:
+        words.append("--first")
+        environment |= {"HOME": str(home), "XDG_CACHE_HOME": str(home / ".cache"), "MI_NTF_MAP_CACHE": "on"}
+    start = time.perf_counter()
+    done = subprocess.run(words, capture_output=True, text=True, check=False, env=environment)
+    process = time.perf_counter() - start
     if done.returncode:
         raise MiNtfError(f"{' '.join(words)}\nfailed with exit code {done.returncode}; its output ends with\n"
                          f"{(done.stdout + done.stderr)[-4000:]}")
-    return json.loads(done.stdout.splitlines()[-1])
+    return json.loads(done.stdout.splitlines()[-1]) | {"process_seconds": process}
 
 
 def main() -> None:
@@ -92,12 +103,15 @@ def main() -> None:
     for name, value in (("size", 600), ("columns", 50), ("rows", 10), ("repeats", 3)):
         parser.add_argument(f"--{name}", type=int, default=value)
     parser.add_argument("--variant", default="llvm_ad_rgb")
+    parser.add_argument("--first", action="store_true")
     options = parser.parse_args()
     mi.set_variant(options.variant)
     from .. import render
 
     render.register()
-    timed(under_sky(32, 4, 2), integrator(4, 2), 1)  # compiles: kernels hold neither the image's size nor the lights
+    if not options.first:
+        # Compiles: kernels hold neither the image's size nor the lights.
+        timed(under_sky(32, 4, 2), integrator(4, 2), 1)
     scene, nrf = under_sky(options.size, options.columns, options.rows), integrator(options.columns, options.rows)
     found = timed(scene, nrf, options.repeats, first=False)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)

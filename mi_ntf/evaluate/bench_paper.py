@@ -5,7 +5,9 @@ A query costs the same whatever its answer, so the networks have random weights 
 (:data:`mi_ntf.core.architecture.PAPER`). What the camera sees, and with it how many points are shaded, is the shipped
 field: :class:`PaperField` adds a vanishing part of each query to the shipped field's value.
 
-Costs are measured per network query and composed; both sides of a ratio march, shade and query in kernels of one size.
+Costs are measured per network query, and the shares of queries that culling leaves on the shipped grid; the rows are
+composed of them in :mod:`mi_ntf.evaluate.bench_culled`. Both sides of a ratio march, shade and query in kernels of one
+size.
 """
 
 from collections.abc import Callable
@@ -20,11 +22,12 @@ import numpy as np
 from ..core import spheres
 from ..core.architecture import PAPER, Architecture, Header
 from ..infer import march, ops, shade
-from ..infer.bundle import Strand
+from ..infer.bundle import Strand, clear_distance, safe_inverse
 from ..infer.network import NetworkField
 from ..infer.profile import DepthProfile
+from ..infer.visibility.raymarch import MAX_OPTICAL_DEPTH
 from ..render.commands.calibration import seconds, table_of
-from .bench_measure import Row, Sizes, row
+from .bench_measure import Sizes
 
 LIGHTS = 500
 SIDE = 600
@@ -78,9 +81,9 @@ def light_rays(lights: int, count: int):
     return rays
 
 
-def tabulate(density, o, d, samples: int):
-    """τ at `samples` points along each ray from the light, flat: the work of a transmittance volume, all queries of a
-    ray side by side."""
+def samples_of(o, d, samples: int):
+    """``(p, step)``: the middles of `samples` even steps of each ray's chord, from the light on, all samples of a ray
+    side by side; the steps' length."""
     count = dr.opaque(mi.UInt32, samples)
     index = dr.arange(mi.UInt32, dr.width(o[0]) * samples)
     ray = index // count
@@ -88,14 +91,38 @@ def tabulate(density, o, d, samples: int):
     _, m, h = spheres.chord(ops, o, d)
     step = 2 * h / mi.Float(count)
     t = h - (mi.Float(index - ray * count) + 0.5) * step
-    depth = density(tuple(mi_ + t * di for mi_, di in zip(m, d, strict=True))) * step
-    return dr.exp(-dr.block_prefix_reduce(dr.ReduceOp.Add, depth, samples, exclusive=False))
+    return tuple(mi_ + t * di for mi_, di in zip(m, d, strict=True)), step
+
+
+def tabulate(density, o, d, samples: int):
+    """τ at `samples` points along each ray from the light, flat: the work of a transmittance volume, all queries of a
+    ray side by side."""
+    p, step = samples_of(o, d, samples)
+    return dr.exp(-dr.block_prefix_reduce(dr.ReduceOp.Add, density(p) * step, samples, exclusive=False))
+
+
+def culled_shares(grid, sizes: Sizes) -> dict[str, float]:
+    """What culling leaves of :func:`light_rays` of all lights, on the shipped grid: ``share/256`` and ``share/192``,
+    the samples of a ray that lie in occupied space and before τ passes e^−12; ``share/rays``, the rays that meet any
+    occupied space, which are those that a map asks of."""
+    shares = {}
+    for n in (IMAGE_SAMPLES, STAGE_SAMPLES):
+        o, d = light_rays(LIGHTS, max(LIGHTS, sizes.queries // 8))
+        p, step = samples_of(o, d, n)
+        inverse = safe_inverse(tuple(dr.repeat(c, n) for c in d))
+        occupied = dr.select(clear_distance(grid, p, inverse) <= 0, mi.Float(1), 0)
+        before = dr.block_prefix_reduce(dr.ReduceOp.Add, grid.density(p) * step, n, exclusive=True)
+        asked = dr.select(before < MAX_OPTICAL_DEPTH, occupied, 0)
+        shares[f"share/{n}"] = float(dr.mean(asked)[0])
+        shares["share/rays"] = float(dr.mean(dr.block_reduce(dr.ReduceOp.Max, occupied, n))[0])
+    return shares
 
 
 def stage_costs(medium, network: NetworkField, sizes: Sizes) -> dict[str, float]:
     """Seconds a ray of a light's table: ``volume/256`` and ``volume/192`` samples, ``map`` by the paper's network,
-    ``ours`` by the shipped one, its look at the shipped grid included. As many queries a kernel on either side.
-    ``voxels``: seconds to bake such a grid from the paper's field."""
+    ``ours`` by the shipped one, its look at the shipped grid, a culled march, included. As many queries a kernel on
+    either side. ``query``: seconds to ask for a point's reflectance, and with it for its density, which the paper's
+    network gives at once. ``voxels``: seconds to bake such a grid from the paper's field."""
     grid = medium.field.grid
     profile = DepthProfile(grid.density, grid, dr.opaque(mi.Float, 2 / 384))
     many = light_rays(sizes.slow_lights, sizes.queries)
@@ -110,6 +137,7 @@ def stage_costs(medium, network: NetworkField, sizes: Sizes) -> dict[str, float]
         work[f"volume/{n}"] = partial(tabulate, network.density, o, d, n)
     for name, net in (("map", network), ("ours", medium.field.network)):
         work[name] = partial(mixture, net)
+    work["query"] = lambda: network.reflectance(many[0])
     found = seconds(work, sizes.repeats)
     rays = {f"volume/{n}": count for n, count in counts.items()}
     costs = {name: value / rays.get(name, sizes.queries) for name, value in found.items()}
@@ -117,26 +145,10 @@ def stage_costs(medium, network: NetworkField, sizes: Sizes) -> dict[str, float]
     return costs | {"voxels": voxels}
 
 
-def stage_rows(costs: dict[str, float], sizes: Sizes) -> list[Row]:
-    """The transmittance stage: 500 directional lights, 64 + 192 samples a ray, m = 600² on both sides. Our network
-    pays for the voxels that it reads, baked from the paper's field once."""
-    rays = max(1, sizes.queries // STAGE_SAMPLES)
-    rest: dict[str, Any] = {"extrapolated": f"volume: {sizes.slow_lights} lights, {rays} rays in all",
-                            "details": {"costs": costs}}
-    m = max(sizes.paper_maps)
-    slow, theirs, ours = (LIGHTS * m**2 * costs[name] for name in (f"volume/{STAGE_SAMPLES}", "map", "ours"))
-    what = f"transmittance stage, {LIGHTS} lights, m = {m}², volume over map, "
-    return [
-        row(what + "paper's network", slow / theirs, "×", least=230, weights="field, network: random", **rest),
-        row(what + "our network", slow / (ours + costs["voxels"]), "×", least=1000,
-            weights="field: random; network: trained", **rest),
-    ]
-
-
 def camera_cost(sensor, medium, paper: PaperField, sizes: Sizes):
     """Seconds to march the rays of all pixels, empty space skipped, and to read the reflectance of what they meet; and
     these shading points."""
-    o, d, far = _view_rays(sensor, medium.frame, sizes.pixels)
+    o, d, far = view_rays(sensor, medium.frame, sizes.pixels)
     middle = dr.full(mi.Float, 0.5, dr.width(far))
     step = dr.opaque(mi.Float, 2 / IMAGE_SAMPLES)
     strand = Strand(paper.density, medium.field.grid, o, d, step)
@@ -153,7 +165,7 @@ def camera_cost(sensor, medium, paper: PaperField, sizes: Sizes):
     return seconds({"camera": view}, sizes.repeats)["camera"], last[0]
 
 
-def _view_rays(sensor, frame, side: int):
+def view_rays(sensor, frame, side: int):
     """``(o, d, length)``, field coordinates: rays through the middles of `side`² pixels of the whole picture."""
     index = dr.arange(mi.UInt32, side * side)
     y = index // dr.opaque(mi.UInt32, side)
@@ -166,50 +178,26 @@ def _view_rays(sensor, frame, side: int):
 
 
 def shading_costs(medium, points, sizes: Sizes) -> dict[str, float]:
-    """``shade/volume`` and ``shade/map``: seconds a point and light to look up and to shade. What the tables hold does
-    not matter, so they are filled from the shipped grid."""
+    """``shade/volume`` and ``shade/map``: seconds a point and light to look up and to shade, under all lights. What the
+    tables hold does not matter, so they are filled from the shipped grid."""
     from ..render.maps import building
 
-    count = sizes.slow_lights
+    count, *sides = sizes.tables
     table = table_of(spheres.fibonacci(count))
-    options = building.Options(2 / IMAGE_SAMPLES, sizes.map)
-    built = {name: building.build(f"transmittance_{name}", medium, table, options) for name in ("volume", "map")}
+    built = {name: building.build(f"transmittance_{name}", medium, table, building.Options(2 / IMAGE_SAMPLES, side))
+             for name, side in zip(("volume", "map"), sides, strict=True)}
     found = seconds({f"shade/{n}": partial(shade.reflect, points, table, v) for n, v in built.items()}, sizes.repeats)
+    built.clear()
+    dr.flush_malloc_cache()  # gigabytes
     return {n: v / max(dr.width(points.x[0]) * count, 1) for n, v in found.items()}
 
 
-def per_light(costs: dict[str, float], table: str, texels: int) -> float:
-    """Seconds of a light in the whole picture: its table of `texels` rays at the cost `table`, and shading."""
-    lookup = costs["shade/volume" if table.startswith("volume") else "shade/map"]
-    return texels * costs[table] + SIDE**2 * costs["points"] * lookup
-
-
-def image_rows(costs: dict[str, float], sizes: Sizes) -> list[Row]:
-    """The whole 600 × 600 picture under 500 lights, 192 samples, volume over map, each map resolution."""
-    found, fixed = [], SIDE**2 * costs["camera"]
-    for m in sizes.paper_maps:
-        slow_light = per_light(costs, f"volume/{IMAGE_SAMPLES}", m * m)
-        for table, name, least in (("map", "paper's network", 92), ("ours", "our network", 192)):
-            fast_light = per_light(costs, table, m * m)
-            voxels = costs["voxels"] if table == "ours" else 0
-            slow, fast = fixed + LIGHTS * slow_light, fixed + voxels + LIGHTS * fast_light
-            asked = {"least": least} if m == max(sizes.paper_maps) else {}
-            found.append(row(
-                f"whole {SIDE}² image, {LIGHTS} lights, m = {m}², volume over map, {name}", slow / fast, "×", **asked,
-                weights="field: random; network: " + ("random" if table == "map" else "trained"),
-                extrapolated=f"both sides: {sizes.slow_lights} lights, {sizes.pixels}² pixels",
-                details={"volume_seconds": slow, "map_seconds": fast, "volume_fixed_seconds": fixed,
-                         "map_fixed_seconds": fixed + voxels, "volume_lights_seconds": slow_light,
-                         "map_lights_seconds": fast_light}))
-    return found
-
-
-def rows(scene, medium, sizes: Sizes) -> list[Row]:
-    """All rows of this file."""
+def costs_of(scene, medium, sizes: Sizes) -> dict[str, float]:
+    """All that the rows are composed of: seconds (:func:`stage_costs`, :func:`shading_costs`; ``camera``, a pixel),
+    ``points``, shaded ones a pixel, and shares (:func:`culled_shares`)."""
     network = random_network(sizes.hidden)
     costs = stage_costs(medium, network, sizes)
     camera, points = camera_cost(scene.sensors()[0], medium, PaperField(medium.field.grid, network), sizes)
     pixels = sizes.pixels**2
     costs |= {"camera": camera / pixels, "points": dr.width(points.x[0]) / pixels}
-    costs |= shading_costs(medium, points, sizes)
-    return stage_rows(costs, sizes) + image_rows(costs, sizes)
+    return costs | shading_costs(medium, points, sizes) | culled_shares(medium.field.grid, sizes)

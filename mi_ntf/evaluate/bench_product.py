@@ -1,8 +1,10 @@
 """The shipped statue, rendered as users render it: whole images, many lights, one lookup, the map's error."""
 
 import statistics
+import tempfile
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
@@ -24,6 +26,20 @@ def many_lights_rows(sizes: Sizes) -> list[Row]:
     details = {"seconds": found["seconds"], "process": "its own, after a small render that compiles"}
     return [row(what, found["seconds"][-1], "s", most=200, details=details),
             row(what + ", peak memory", found["peak_bytes"] / 2**30, "GiB", most=4)]
+
+
+def first_rows(sizes: Sizes) -> list[Row]:
+    """The first picture of a process: without kernels and maps of earlier ones, and with them."""
+    columns, rows = sizes.lights[-1]
+    with tempfile.TemporaryDirectory() as home:
+        found = {name: bench_image.in_own_process(sizes.image, columns, rows, 1, Path(home))
+                 for name in ("cold caches", "kernels and maps at hand")}
+    what = f"{sizes.image}² image, transmittance_map, {columns * rows} lights, first picture of a process, "
+    result = []
+    for name, f in found.items():
+        details = {"process_seconds": f["process_seconds"], "process": "Python, the field baked, the picture"}
+        result.append(row(what + name, f["seconds"][0], "s", details=details))
+    return result
 
 
 def scaling_rows(sizes: Sizes) -> list[Row]:

@@ -10,7 +10,7 @@ COLUMNS = 4096
 
 
 class Texels:
-    """`count` rows of `channels` (1, 2 or 4) float32 numbers, read one at a time and as they are: what lies between two
+    """`count` rows of `channels` float32 numbers, read one at a time and as they are: what lies between two
     is the reader's to know. `numbers`: rows one after the other; a Dr.Jit array that :func:`blank` made is taken as it
     is, one of NumPy is copied."""
 
@@ -36,8 +36,8 @@ class Texels:
 
     @property
     def nbytes(self) -> int:
-        """Of the texture."""
-        return 4 * _lines(self.count) * COLUMNS * self.channels
+        """Of all rows."""
+        return 4 * self.count * self.channels
 
 
 def blank(count: int, channels: int, dj: ModuleType):

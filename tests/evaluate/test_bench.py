@@ -9,7 +9,7 @@ import pytest
 from helpers import fields, hard_cases
 from helpers.variants import VARIANT
 
-from mi_ntf.evaluate import bench, bench_figure, bench_image, bench_measure, bench_paper
+from mi_ntf.evaluate import bench, bench_culled, bench_figure, bench_image, bench_measure, bench_paper
 from mi_ntf.render.cost import model
 
 
@@ -26,12 +26,18 @@ def test_every_line_runs(tmp_path, capsys):
     assert json.loads((tmp_path / "bench.json").read_text())["rows"] == report["rows"]
     assert (tmp_path / "bench.png").stat().st_size > 10_000
     asked = [r["asked"] for r in report["rows"] if r["asked"]]
-    assert [a for a in ("≥ 230 ×", "≥ 1000 ×", "≥ 92 ×", "≥ 192 ×", "≤ 12 s", "≤ 200 s", "≤ 4 GiB", "≥ 3 ×", "linear")
+    assert [a for a in ("≥ 230 ×", "≥ 1000 ×", "≥ 92 ×", "≤ 12 s", "≤ 200 s", "≤ 4 GiB", "≥ 3 ×", "linear")
             if a not in asked] == []
+    titles = [r["what"] for r in report["rows"]]
+    assert len(set(titles)) == len(titles)
+    for part in (", culled on both sides", "unculled on both sides", "what culling leaves", "alone, worst",
+                 "cold caches", "raymarch over ray_network", "transmittance_volume over transmittance_map",
+                 "voxels, ray_network", "shipped networks, neural_transmittance"):
+        assert any(part in title for title in titles), part
     for r in report["rows"]:
         assert np.isfinite(r["measured"]) and r["unit"], r["what"]
         assert r["met"] is not None or not r["asked"]
-        assert ("random" in r["weights"]) == ("volume" in r["what"])
+        assert ("random" in r["weights"]) == ("volume over map" in r["what"] or "paper's size" in r["what"]), r["what"]
     constants = model.measured()
     assert constants and min(asdict(constants).values()) > 0
     assert "without meaning" in text and "extrapolated" in text
@@ -69,16 +75,54 @@ def test_sky_of_one_pixel_per_light():
     assert image.shape == (10, 50, 3) and image.min() > 0
 
 
-def test_speed_up_is_a_ratio_of_lines():
-    """Per light, tables and shading add; the ratio at 500 lights is the row's."""
-    costs = {"camera": 1e-6, "points": 2.0, "volume/192": 192e-6, "map": 1e-6, "ours": 1e-7, "shade/volume": 2e-9,
-             "shade/map": 1e-9, "voxels": 7.0}
-    rows = bench_paper.image_rows(costs, bench_measure.FULL)
-    m2, shade = 360_000, 360_000 * 2
-    slow = 0.36 + 500 * (m2 * 192e-6 + shade * 2e-9)
-    fast = 0.36 + 500 * (m2 * 1e-6 + shade * 1e-9)
-    assert rows[0].measured == pytest.approx(slow / fast)
-    assert rows[1].measured == pytest.approx(slow / (7 + 0.36 + 500 * (m2 * 1e-7 + shade * 1e-9)))
-    d = rows[0].details
+COSTS = {"camera": 1e-6, "points": 2.0, "query": 3e-6, "volume/192": 192e-6, "volume/256": 256e-6, "map": 1e-6,
+         "ours": 1e-7, "shade/volume": 2e-9, "shade/map": 1e-9, "voxels": 7.0, "share/192": 0.1, "share/256": 0.2,
+         "share/rays": 0.5}
+PIXELS = 360_000
+
+
+def measured(rows, *words):
+    return next(r for r in rows if all(w in r.what for w in words))
+
+
+def test_unculled_speed_up_is_a_ratio_of_lines():
+    """Per light, tables and shading of all samples add; the ratio at 500 lights is the row's."""
+    rows = bench_culled.image_rows(COSTS, bench_measure.FULL)
+    camera, shade = PIXELS * 192 * 3e-6, PIXELS * 192
+    slow = camera + 500 * (PIXELS * 192e-6 + shade * 2e-9)
+    fast = camera + 500 * (PIXELS * 1e-6 + shade * 1e-9)
+    row = measured(rows, "m = 600²", "unculled on both sides")
+    assert row.measured == pytest.approx(slow / fast) and row.asked == "≥ 92 ×"
+    d = row.details
     assert d["volume_fixed_seconds"] + 500 * d["volume_lights_seconds"] == pytest.approx(slow)
     assert bench_figure.LIGHTS == 500
+
+
+def test_culled_speed_up_leaves_out_queries_on_both_sides():
+    """A volume's samples, a map's rays; the voxels that say which are baked on both sides."""
+    rows = bench_culled.image_rows(COSTS, bench_measure.FULL)
+    shade = PIXELS * 2
+    slow = 7 + 0.36 + 500 * (PIXELS * 0.1 * 192e-6 + shade * 2e-9)
+    for network, ray in (("paper's", 0.5e-6), ("our", 1e-7)):
+        row = measured(rows, "m = 600²", ", culled on both sides", network)
+        assert row.measured == pytest.approx(slow / (7 + 0.36 + 500 * (PIXELS * ray + shade * 1e-9)))
+        assert not row.asked
+
+
+def test_transmittance_stage_culled_and_unculled():
+    rows = bench_culled.stage_rows(COSTS, bench_measure.FULL)
+    assert measured(rows, "unculled on both sides").measured == pytest.approx(256)
+    rays = 500 * PIXELS
+    culled = (7 + rays * 0.2 * 256e-6) / (7 + rays * 0.5e-6)
+    assert measured(rows, ", culled on both sides", "paper's").measured == pytest.approx(culled)
+    assert len({r.what for r in rows}) == len(rows) == 4
+
+
+def test_shares_of_a_ball():
+    """Rays through a disc of radius 0.9 around an opaque ball of radius r: (r/0.9)² of them meet it."""
+    grid = hard_cases.baked(*fields.blobs([(0, 0, 0)], [0.5], log_density=6.0), resolution=64).field.grid
+    shares = bench_paper.culled_shares(grid, bench_measure.FULL)
+    half = float(np.abs(np.array(grid.bounds)).mean())
+    assert (0.8 * half / 0.9) ** 2 < shares["share/rays"] < ((half + 0.06) / 0.9) ** 2
+    assert 0 < shares["share/256"] < 0.5 * shares["share/rays"]
+    assert shares["share/192"] == pytest.approx(shares["share/256"], rel=0.05)

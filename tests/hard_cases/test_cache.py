@@ -354,6 +354,11 @@ def held():
     return sum(4 * len(m.values) for m in map_cache._maps.values())
 
 
+def kept(size: int):
+    """What stands for a map of `size` bytes."""
+    return SimpleNamespace(values=np.zeros(size // 4, np.float32), texels=SimpleNamespace(nbytes=size))
+
+
 def test_kept_maps_and_the_one_in_the_making_fit_into_map_memory(cache, monkeypatch):
     """Lights that move each frame: a new map each time, in a memory for two and a half."""
     monkeypatch.setenv("MI_NTF_MAP_CACHE", "memory")
@@ -361,12 +366,12 @@ def test_kept_maps_and_the_one_in_the_making_fit_into_map_memory(cache, monkeypa
 
     def make(values=None):
         most.append(held() + size)
-        return SimpleNamespace(values=mi.Float(np.zeros(size // 4)))
+        return kept(size)
 
     for k in range(6):
         map_cache.cached(str(k), make, size // 4, limit)
     assert max(most) <= limit and max(most) == 2000 and held() == 2000
-    map_cache.cached("larger than all", lambda values=None: SimpleNamespace(values=mi.Float(np.zeros(700))), 700, limit)
+    map_cache.cached("larger than all", lambda values=None: kept(2800), 700, limit)
     assert held() == 0, "what exceeds the memory alone is not kept beside"
 
 

@@ -20,8 +20,11 @@ from mi_ntf.infer.bundle import Strand
 KINDS = ("plane", "sphere", "bumps")
 COSINES = (1.0, 0.7, 0.5, 0.3, 0.2, 0.1, 0.05)
 QUICK = (1.0, 0.3, 0.1)
-METHODS = ("raymarch", "transmittance_volume", "transmittance_map", "transmittance_map, 2 logistics")
+METHODS = ("raymarch", "transmittance_volume", "transmittance_map", "transmittance_map, 2 logistics",
+           "transmittance_atlas")
 BOUND = 0.01
+ATLAS = 0.037
+"""Its directions are 6° apart, and three places stand for a skin: 1.5 times what is measured."""
 
 
 @cache
@@ -70,7 +73,8 @@ def truth(kind: str, cosine: float):
 def test_skin_by_angle(kind, cosine, method, check):
     light, x, tau = truth(kind, cosine)
     found = hard_cases.transmittance(method, matter(kind)[1], (light, False), x)
-    check(f"skin of {kind}, light at cosine {cosine}", method, "mean signed error of τ", (found - tau).mean(), BOUND)
+    bound = ATLAS if method == "transmittance_atlas" else BOUND
+    check(f"skin of {kind}, light at cosine {cosine}", method, "mean signed error of τ", (found - tau).mean(), bound)
 
 
 LEARNED = {

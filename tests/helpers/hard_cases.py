@@ -13,7 +13,7 @@ from mi_ntf.infer.grid import GridField
 from mi_ntf.infer.lights import LightTable
 from mi_ntf.infer.network import MIN_DENSITY, NetworkField
 from mi_ntf.infer.skin import Softness
-from mi_ntf.infer.visibility import outside
+from mi_ntf.infer.visibility import REGISTRY, outside
 from mi_ntf.render.maps import building
 
 SCENES = Path(__file__).parents[2] / "scenes"
@@ -35,6 +35,8 @@ METHODS = {
     "transmittance_map": ("transmittance_map", {}),
     "transmittance_map, 2 logistics": ("transmittance_map", {"map_components": 2}),
     "transmittance_map, network": ("transmittance_map", {"map_source": "network"}),
+    "transmittance_atlas": ("transmittance_atlas", {}),
+    "neural_transmittance": ("neural_transmittance", {}),
     "ray_network": ("ray_network", {}),
     "visibility_mlp": ("visibility_mlp", {}),
 }
@@ -58,11 +60,23 @@ def seen_from(x: np.ndarray, light) -> tuple:
     return d / np.maximum(r, 1e-300)[:, None], r if is_point else np.full(len(x), np.inf)
 
 
+_atlases: dict = {}
+
+
+def atlas(name: str, medium):
+    """Made in seconds, and the same for all lights: the last one is kept."""
+    if (name, id(medium)) not in _atlases:
+        _atlases.clear()
+        _atlases[name, id(medium)] = medium, building.build(name, medium, None, building.Options(2 / 384))
+    return _atlases[name, id(medium)][1]
+
+
 def transmittance(method: str, medium, light, x: np.ndarray) -> np.ndarray:
     """τ (n,) of one light at the points `x`, field coordinates, by a method of METHODS with the renderer's defaults."""
     name, options = METHODS[method]
     table = LightTable([light[0]], np.ones((1, 3)), [light[1]], 1.0, mi)
-    found = building.build(name, medium, table, building.Options(2 / 384, **options))
+    options = building.Options(2 / 384, **options)
+    found = atlas(name, medium) if REGISTRY[name].per_field else building.build(name, medium, table, options)
     wi, distance = seen_from(x, light)
     active = dr.full(mi.Bool, True, len(x))
     tau = outside.tau(found, arrays(x), arrays(wi), mi.Float(distance), mi.UInt32(0), active)

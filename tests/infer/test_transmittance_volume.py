@@ -1,12 +1,15 @@
 """Transmittance volumes against the march and closed forms."""
 
+from types import SimpleNamespace
+
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import fields
 from helpers.jit import arrays
 
-from mi_ntf.infer.grid import GridField
+from mi_ntf.infer.grid import CELLS, GridField
 from mi_ntf.infer.lights import LightTable
 from mi_ntf.infer.network import NetworkField
 from mi_ntf.infer.visibility.raymarch import optical_depth
@@ -16,6 +19,12 @@ CUBE = np.stack(np.meshgrid(*[[-0.55, 0.55]] * 3), -1).reshape(-1, 3)
 WHERE = np.array([[0.48, 0.6, 0.64], [1.5, 1.0, 2.0], [0.1, 0.5, -0.15]])
 IS_POINT = np.array([False, True, True])
 DEPTHS = 256
+
+
+@pytest.fixture
+def everywhere():
+    """A grid without empty space around the cube."""
+    return SimpleNamespace(hull=CUBE, clearance=dr.zeros(mi.Float, CELLS**3))
 
 
 @pytest.fixture
@@ -35,10 +44,10 @@ def ball(p):
 
 
 @pytest.mark.parametrize("k", range(3), ids=["directional", "point", "inside"])
-def test_uniform_ball_in_closed_form(lights, k, rng):
+def test_uniform_ball_in_closed_form(lights, everywhere, k, rng):
     """e^−(4 · length inside): entry k holds τ at the far edge of its cell, and an offset by a cell, 1/134, would show
     as a mean error of 4/134 · τ."""
-    volume = TransmittanceVolume(lights, 96, DEPTHS, CUBE, ball, mi)
+    volume = TransmittanceVolume(lights, 96, DEPTHS, everywhere, ball, mi)
     x = rng.normal(size=(2000, 3))
     x *= rng.uniform(0, 0.35, (2000, 1)) / np.linalg.norm(x, axis=1, keepdims=True)
     d = WHERE[k] - x * IS_POINT[k]
@@ -53,9 +62,9 @@ def test_uniform_ball_in_closed_form(lights, k, rng):
     assert abs(error.mean()) < 1.5e-3 and np.abs(error).max() < 0.03
 
 
-def test_entries_fall_along_every_ray(lights):
+def test_entries_fall_along_every_ray(lights, everywhere):
     """τ in [0, 1], from 1 at the light downwards."""
-    volume = TransmittanceVolume(lights, 32, DEPTHS, CUBE, ball, mi)
+    volume = TransmittanceVolume(lights, 32, DEPTHS, everywhere, ball, mi)
     values = np.array(volume.values).reshape(3, 32 * 32, DEPTHS)
     assert values.max() == 1 and values.min() > 0
     assert np.diff(values, axis=2).max() <= 0
@@ -68,7 +77,7 @@ def test_volume_follows_the_march(lights, rng):
     """Opaque blobs, points in the skin and in shadow."""
     grid = GridField(NetworkField(*fields.blobs([(-0.3, 0, 0), (0.35, 0.2, 0.1)], [0.4, 0.25], log_density=4.5), mi),
                      96, mi)
-    volume = TransmittanceVolume(lights, 128, 384, grid.hull, grid.density, mi)
+    volume = TransmittanceVolume(lights, 128, 384, grid, grid.density, mi)
     x = rng.uniform(-0.6, 0.6, (3000, 3))
     for k in range(3):
         wi, _, distance = lights.sample(mi.UInt32(k), arrays(x), True)
@@ -77,3 +86,14 @@ def test_volume_follows_the_march(lights, rng):
         error = look(volume, lights, x, k) - truth
         # Bilinear texels of 1/100 (octahedral: 1/50) over skins that are as thin: a few silhouettes blur.
         assert np.abs(error).mean() < (8e-3 if k == 2 else 5e-3) and np.sqrt((error**2).mean()) < 0.03
+
+
+def test_culling_changes_no_entry(lights, everywhere):
+    """Beyond e^−12, where the march of a ray ends."""
+    grid = GridField(NetworkField(*fields.blobs([(-0.3, 0, 0), (0.35, 0.2, 0.1)], [0.4, 0.25], log_density=4.5), mi),
+                     96, mi)
+    whole = SimpleNamespace(hull=grid.hull, clearance=everywhere.clearance)
+    culled, unculled = (np.array(TransmittanceVolume(lights, 32, DEPTHS, g, grid.density, mi).values)
+                        for g in (grid, whole))
+    np.testing.assert_allclose(culled, unculled, rtol=1e-4, atol=np.exp(-12))
+    assert (unculled < np.exp(-12)).any() and np.array(grid.clearance).any()

@@ -13,6 +13,8 @@ from helpers import scenes
 from mi_ntf import cli
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.infer.lights import LightTable
+from mi_ntf.infer.visibility import transmittance_atlas
+from mi_ntf.render.commands.bake import bake
 from mi_ntf.render.lights import scene_lights as lights_module
 from mi_ntf.render.maps import building, map_cache, map_file
 from mi_ntf.render.scene.media import find_media
@@ -60,6 +62,33 @@ def test_file_gives_the_same_map(medium, tmp_path, options):
         np.testing.assert_array_equal(np.array(back.tau(x, wi, distance, mi.UInt32(k), True)), expected)
         if k:
             np.testing.assert_array_equal(np.array(last.tau(x, wi, distance, mi.UInt32(k - 1), True)), expected)
+
+
+@pytest.mark.parametrize("method", ["transmittance_atlas", "neural_transmittance"])
+def test_an_atlas_is_baked_and_read(path, medium, tmp_path, method, monkeypatch):
+    """By the command, from a scene that names the method: the same bits; not as a map of lights, nor as the other."""
+    monkeypatch.setattr(transmittance_atlas, "SIDE", 4)
+    monkeypatch.setattr(transmittance_atlas, "RESOLUTION", 12)
+    similar = scenes.SIMILARITY
+    scene = tmp_path / "scene.xml"
+    scene.write_text(f"""<scene version="3.9.0"><default name="visibility" value="auto"/>
+        <integrator type="nrf"><string name="visibility" value="$visibility"/><integer name="samples" value="128"/>
+        </integrator><sensor type="perspective"/><shape type="sphere">
+        <point name="center" x="{similar.center[0]}" y="{similar.center[1]}" z="{similar.center[2]}"/>
+        <float name="radius" value="{similar.radius}"/><bsdf type="null"/><medium type="nrf" name="interior">
+        <string name="filename" value="{path}"/><integer name="resolution" value="64"/></medium></shape></scene>""")
+    about = bake(scene, tmp_path / "atlas.exr", {"visibility": method})
+    assert (about["lights"], about["resolution"], about["components"]) == (16, 12, 2)
+    named = dataclasses.replace(OPTIONS, map_file=str(tmp_path / "atlas.exr"))
+    x, wi = np.random.default_rng(1).uniform(-0.5, 0.5, (2, 3, 500)).astype(np.float32)
+    about = tuple(map(mi.Float, x)), tuple(map(mi.Float, wi / np.linalg.norm(wi, axis=0))), mi.Float(np.inf)
+    made, read = (building.build(method, medium, None, o).tau(*about, mi.UInt32(0), True) for o in (OPTIONS, named))
+    np.testing.assert_array_equal(np.array(made), np.array(read))
+    with pytest.raises(MiNtfError, match="holds 16 lights, the scene has 3"):
+        build(medium, table(), named)
+    other = "neural_transmittance" if method == "transmittance_atlas" else "transmittance_atlas"
+    with pytest.raises(MiNtfError, match="map_source is "):
+        building.build(other, medium, None, named)
 
 
 def test_file_of_something_else_is_refused(medium, tmp_path):

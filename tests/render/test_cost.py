@@ -10,13 +10,13 @@ from helpers.variants import VARIANT
 
 import mi_ntf.render
 from mi_ntf.core.errors import MiNtfError
-from mi_ntf.infer.visibility import REGISTRY
+from mi_ntf.infer.visibility import REGISTRY, transmittance_atlas
 from mi_ntf.infer.visibility.raymarch import light_steps
 from mi_ntf.render.commands import calibration
 from mi_ntf.render.cost import model
 
 # Of research/transmittance.md, section 5, "knot": 576 ns a texel, 1.6 ns a step, 4.5 ns a lookup.
-KNOT = model.Constants(texel=576 / 384, march=1.6, lookup=4.5)
+KNOT = model.Constants(texel=576 / 384, march=1.6, lookup=4.5, atlas=23.0)
 WORK = model.Work(rays=65536, points=300_000, lights=50, method="raymarch", texels=128**2, samples=384)
 
 
@@ -27,12 +27,30 @@ def cache(variant, monkeypatch, tmp_path):
     return tmp_path / "mi-ntf" / "cost.json"
 
 
-def test_break_even_by_hand():
-    march = light_steps(384) * 1.6
-    assert model.break_even(WORK, KNOT) == pytest.approx(0.785398 * 16384 * 576 / (0.5 * (march - 4.5)))
-    # Four times the texels, four times the points; any number of lights.
-    assert model.break_even(replace(WORK, texels=256**2), KNOT) == pytest.approx(4 * model.break_even(WORK, KNOT))
-    assert model.break_even(replace(WORK, lights=1), KNOT) == model.break_even(WORK, KNOT)
+MARCH, LOOKUP, ATLAS = light_steps(384) * 1.6, 4.5, 23.0
+"""ns of a point and light."""
+MAP = 0.785398 * 16384 * 576
+"""ns of a light's map."""
+
+
+def spent(work, method: str) -> float:
+    return model.visibility(replace(work, method=method), KNOT)
+
+
+def test_what_methods_spend_by_hand():
+    """Half of the points face a light: marches, a map for each light, one atlas."""
+    pairs = 0.5 * 300_000 * 50
+    assert spent(WORK, "raymarch") == pytest.approx(pairs * MARCH)
+    assert spent(WORK, "transmittance_map") == pytest.approx(50 * MAP + pairs * LOOKUP, rel=1e-6)
+    atlas = 0.785398 * transmittance_atlas.RAYS * 2 * 576
+    assert spent(WORK, "transmittance_atlas") == pytest.approx(atlas + pairs * ATLAS, rel=1e-6)
+
+
+def test_what_no_map_serves_is_marched_beside_maps():
+    more = replace(WORK, drawn=2, others=1e6)
+    rest = 0.5 * (300_000 * 2 + 1e6)
+    assert spent(more, "transmittance_map") - spent(WORK, "transmittance_map") == pytest.approx(rest * MARCH)
+    assert spent(more, "transmittance_atlas") - spent(WORK, "transmittance_atlas") == pytest.approx(rest * ATLAS)
 
 
 def test_volumes_hold_one_and_a_half_entries_a_sample():
@@ -47,31 +65,29 @@ def test_steps_of_a_light_march():
     assert light_steps(96) < light_steps(384) < light_steps(1536)
 
 
-def test_auto_changes_sides_at_the_break_even():
-    least = model.break_even(WORK, KNOT)
-    assert model.choose(replace(WORK, points=1.01 * least), KNOT)[0] == "transmittance_map"
-    method, reason = model.choose(replace(WORK, points=0.99 * least), KNOT)
-    assert method == "raymarch" and "shading points, maps pay from" in reason
+@pytest.mark.parametrize(("work", "best"), [
+    (replace(WORK, points=1e3, lights=1), "raymarch"),
+    (replace(WORK, points=1e6, lights=1), "transmittance_map"),
+    (replace(WORK, points=1e5, lights=500), "transmittance_atlas"),
+    (replace(WORK, points=1e8, lights=500), "transmittance_map"),
+    (replace(WORK, points=1e6, lights=0, drawn=8), "raymarch"),
+    (replace(WORK, points=1e8, lights=0, drawn=8), "transmittance_atlas"),
+    (replace(WORK, points=1e6, lights=1, others=1e9), "transmittance_atlas"),
+])
+def test_auto_takes_the_cheapest(work, best):
+    """Few points are marched; many have a map if there are few lights, an atlas if there are many, or drawn ones."""
+    method, reason = model.choose(work, KNOT)
+    assert method == best
+    serve = ["raymarch", "transmittance_atlas", *(["transmittance_map"] if work.lights else [])]
+    assert spent(work, best) == min(spent(work, name) for name in serve)
+    assert "shading points with" in reason and f"s by {best}, " in reason
 
 
 def test_maps_pay_at_once_where_each_step_is_a_query():
-    """The paper's regime: a march of network queries against one query of the ray network (P* of some hundred)."""
+    """The paper's regime: a march of network queries against one query of the ray network."""
     slow = replace(KNOT, density=5700, ray=5700)
-    assert model.break_even(replace(WORK, network=True, source="network"), slow) < 1000
-
-
-def test_maps_never_pay_where_a_lookup_costs_more_than_a_march():
-    assert model.choose(replace(WORK, points=1e12), replace(KNOT, lookup=1000.0)) == (
-        "raymarch",
-        "about 1e+12 shading points, maps pay from no number",
-    )
-
-
-def test_the_chosen_method_is_the_cheaper_one():
-    """The rule and the stages' predictions are one model: at P* both cost the same."""
-    at = replace(WORK, points=model.break_even(WORK, KNOT))
-    march, tmap = (sum(model.seconds(replace(at, method=m), KNOT).values()) for m in ("raymarch", "transmittance_map"))
-    assert march == pytest.approx(tmap, rel=1e-6)
+    paper = replace(WORK, points=1000, lights=1, network=True, source="network")
+    assert model.choose(paper, slow)[0] == "transmittance_map"
 
 
 @pytest.mark.parametrize("method", list(REGISTRY))

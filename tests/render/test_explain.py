@@ -41,31 +41,38 @@ def test_point_light_by_name():
 
 
 def test_what_is_held_for_a_field():
-    """Whatever the lights: 32² maps of 64² texels of two numbers."""
+    """Whatever the lights: 32² maps of 44² texels of two logistics, four numbers each."""
     one, many = (explain(SCENE, {"visibility": "transmittance_atlas", "light": light, "res": "16"})
                  for light in ("point", "env"))
-    assert one["memory_bytes"]["maps or volumes"] == many["memory_bytes"]["maps or volumes"] == 32 << 20
+    assert one["memory_bytes"]["maps or volumes"] == many["memory_bytes"]["maps or volumes"] == 4 * 32**2 * 44**2 * 8
     assert one["seconds"]["maps or volumes"] == many["seconds"]["maps or volumes"] > 0
     assert not many["effects"]["transmittance maps"]["on"]
 
 
 def test_auto_chooses_by_the_number_of_shading_points():
-    few = explain(SCENE, {"light": "env", "res": "16", "spp": "1"})
-    many = explain(SCENE, {"light": "env", "res": "256", "spp": "64"})
-    assert few["visibility"] == "raymarch" and "shading points, maps pay from" in few["effects"]["visibility"]["why"]
+    few, some, many = (explain(SCENE, {"light": "env", "res": res, "spp": spp})
+                       for res, spp in (("16", "1"), ("64", "4"), ("256", "64")))
+    assert few["visibility"] == "raymarch" and some["visibility"] == "transmittance_atlas"
+    assert "s by transmittance_atlas, " in some["effects"]["visibility"]["why"]
     assert many["visibility"] == "transmittance_map" and many["effects"]["transmittance maps"]["on"]
     assert many["lights"]["count"] <= 512
     assert many["memory_bytes"]["maps or volumes"] == 8 * 192**2 * many["lights"]["count"]
     assert many["seconds"]["maps or volumes"] > 0
 
 
+def test_auto_gives_drawn_lights_an_atlas_where_that_pays(tmp_path):
+    scene = with_integrator(tmp_path, '<integer name="light_samples" value="8"/>')
+    few, many = (explain(scene, {"res": res, "spp": "16"}) for res in ("16", "512"))
+    assert few["visibility"] == "raymarch" and many["visibility"] == "transmittance_atlas"
+    assert "with 8 drawn ones" in many["effects"]["visibility"]["why"]
+
+
 def test_auto_follows_the_measured_machine():
-    """Where a lookup costs more than a march, maps never pay."""
+    """Where lookups cost more than a march, nothing is held."""
     explain(SCENE, {"light": "env", "res": "256", "spp": "64"})  # registers the plugins
-    model.remember(model.Constants(lookup=1e6))
+    model.remember(model.Constants(lookup=1e6, atlas=1e6))
     report = explain(SCENE, {"light": "env", "res": "256", "spp": "64"})
     assert report["visibility"] == "raymarch" and report["constants"] == "measured on this machine"
-    assert "maps pay from no number" in report["effects"]["visibility"]["why"]
 
 
 def test_maps_of_mixtures_take_four_times_the_memory(tmp_path):

@@ -11,6 +11,7 @@ are octahedral (Engelhardt and Dachsbacher 2008), neighbours across the seams in
     f        place in the table, in cells: fu = ⟨û, x⟩/depth + u0, depth = 1 + k ⟨axis, x⟩; likewise fv
 """
 
+import itertools
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -36,9 +37,20 @@ class Light(NamedTuple):
     v: tuple
     v0: object
     axis: tuple
-    columns: object
+    columns: Any
     position: Any = None
     kind: object = None
+
+
+class Place(NamedTuple):
+    """Where a light sees a point: `f` in cells; whether `inside` the table; `depth` as above; ⟨û, x⟩ and ⟨v̂, x⟩;
+    whether the light looks everywhere (None where no light of the table does)."""
+
+    f: tuple
+    inside: Any
+    depth: Any
+    projected: tuple
+    sphere: Any = None
 
 
 class LightRays:
@@ -124,61 +136,70 @@ class LightRays:
         cuts the ray.
         """
         light = self.light(index, active, self.full)
-        ux, vx = dot(light.u, x), dot(light.v, x)
-        depth = 1 if self.parallel else 1 + dot(light.axis, x)
+        place = self._place(light, x, wi, active)
+        size = place.depth * dr.rsqrt(dot(light.u, light.u))
+        if self.full:
+            size = dr.select(place.sphere, 3.5 * distance / light.columns, size)  # √(4π)/m radians
+        corners = self._corners(light, place, x, wi, distance)
+        base, width = self.dj.UInt32(index) * self._texels, self.dj.UInt32(light.columns)
+        return place.inside, size, [
+            (weight, base + self.dj.UInt32(tv) * width + self.dj.UInt32(tu), t) for weight, tu, tv, t in corners]
+
+    def _place(self, light: Light, x, wi, active) -> "Place":
+        """Where in its table light `light` sees `x`."""
+        projected = dot(light.u, x), dot(light.v, x)
+        depth: Any = 1 if self.parallel else 1 + dot(light.axis, x)
         inverse = 1 if self.parallel else dr.rcp(dr.maximum(depth, NEAREST_DEPTH / 2))
-        fu, fv = ux * inverse + light.u0, vx * inverse + light.v0
-        columns, lines = light.columns, self.lines(light)
-        inside = active & (fu > -0.5) & (fv > -0.5) & (fu < columns - 0.5) & (fv < lines - 0.5)
+        fu, fv = projected[0] * inverse + light.u0, projected[1] * inverse + light.v0
+        inside = active & (fu > -0.5) & (fv > -0.5) & (fu < light.columns - 0.5) & (fv < self.lines(light) - 0.5)
         if not self.parallel:
             inside &= depth > NEAREST_DEPTH / 2
-        if self.full:
-            sphere = light.kind == SPHERE
-            su, sv = octahedral.place(tuple(-c for c in wi), self._side())
-            fu, fv, inside = dr.select(sphere, su, fu), dr.select(sphere, sv, fv), inside | (active & sphere)
+        if not self.full:
+            return Place((fu, fv), inside, depth, projected)
+        sphere = light.kind == SPHERE
+        su, sv = octahedral.place(tuple(-c for c in wi), self._side())
+        f = dr.select(sphere, su, fu), dr.select(sphere, sv, fv)
+        return Place(f, inside | (active & sphere), depth, projected, sphere)
+
+    def _corners(self, light: Light, place: "Place", x, wi, distance) -> list:
+        """``(weight, column, line, t)`` of the four cells around `place`."""
+        (fu, fv), along = place.f, dot(x, wi)
         iu, iv = dr.floor(fu), dr.floor(fv)
         wu, wv = fu - iu, fv - iv
-        base = self.dj.UInt32(index) * self._texels
-        u, v = (dr.maximum(iu, 0), dr.minimum(iu + 1, columns - 1)), (dr.maximum(iv, 0), dr.minimum(iv + 1, lines - 1))
-        along = dot(x, wi)
-        place = None if self.parallel else self._frustum_place(light, x, wi, distance, depth, (fu, fv), (ux, vx), along)
-        width = self.dj.UInt32(columns)
-        size = depth * dr.rsqrt(dot(light.u, light.u))
-        if self.full:
-            size = dr.select(sphere, 3.5 * distance / columns, size)  # √(4π)/m radians
+        u = dr.maximum(iu, 0), dr.minimum(iu + 1, light.columns - 1)
+        v = dr.maximum(iv, 0), dr.minimum(iv + 1, self.lines(light) - 1)
+        t_of = (lambda *_: along) if self.parallel else self._frustum_place(light, x, wi, distance, place, along)
         found = []
-        for j in (0, 1):
-            row = base + self.dj.UInt32(v[j]) * width
-            for i in (0, 1):
-                texel = row + self.dj.UInt32(u[i])
-                t = along if self.parallel else place(u[i], v[j])
-                if self.full:
-                    tu, tv = octahedral.wrap(iu + i, iv + j, self._side())
-                    texel = dr.select(sphere, base + self.dj.UInt32(tv) * width + self.dj.UInt32(tu), texel)
-                    t = dr.select(sphere, self._sphere_place(x, wi, distance, tu, tv), t)
-                found.append(((wu if i else 1 - wu) * (wv if j else 1 - wv), texel, t))
-        return inside, size, found
+        for j, i in itertools.product((0, 1), repeat=2):
+            tu, tv, t = u[i], v[j], t_of(u[i], v[j])
+            if self.full:
+                around = octahedral.wrap(iu + i, iv + j, self._side())
+                t = dr.select(place.sphere, self._sphere_place(x, wi, distance, *around), t)
+                tu, tv = (dr.select(place.sphere, a, b) for a, b in zip(around, (tu, tv), strict=True))
+            found.append(((wu if i else 1 - wu) * (wv if j else 1 - wv), tu, tv, t))
+        return found
 
-    def _frustum_place(self, light, x, wi, distance, depth, f, projected, along):
+    def _frustum_place(self, light, x, wi, distance, place: "Place", along):
         """t of the ray through cell (tu, tv), as a function.
 
         The ray's direction is ω_i + g, normalised, with g across: −(δu û/û² + δv v̂/v̂²) · depth/r, δ the distance in
         cells. Written in differences from ω_i, so that a light 10⁴ radii away keeps all its digits: coordinates on the
         ray, ⟨light, d⟩ − r/⟨d, ω_i⟩, would lose four.
         """
+        f, depth, projected = place.f, place.depth, place.projected
         kappa = depth / distance  # 0 for directional lights
         u2, v2 = dr.rcp(dot(light.u, light.u)), dr.rcp(dot(light.v, light.v))
         pu, pv = projected[0] * u2, projected[1] * v2
         qu, qv = dot(light.u, wi) * u2, dot(light.v, wi) * v2
 
-        def place(tu, tv):
+        def t(tu, tv):
             du, dv = tu - f[0], tv - f[1]
             xg, wg = kappa * (du * pu + dv * pv), du * qu + dv * qv
             g2 = du * du * u2 + dv * dv * v2
             drop = kappa * depth * (g2 - wg * wg) * dr.rcp(1 - kappa * wg)
             return (along - xg - drop) * dr.rsqrt(1 + kappa * (kappa * g2 - 2 * wg))
 
-        return place
+        return t
 
     def _sphere_place(self, x, wi, distance, tu, tv):
         d = tuple(-c for c in octahedral.direction(tu, tv, self._side()))

@@ -49,6 +49,7 @@ class Method:
     per_field    `making` and `numbers` are of all that is held for a field, whatever the lights
     dials        properties of the integrator that it reads
     drawn        name of the method that serves lights which are drawn at random, and all other rays; "": itself
+    candidates   draws that a random light is resampled from: as many as are cheap beside one visibility
     derivatives  whether places of lights have derivatives
     automatic    whether ``auto`` may choose it
     needs        ``(medium)`` → whether the field can serve it
@@ -65,6 +66,7 @@ class Method:
     per_field: bool = False
     dials: tuple[str, ...] = ()
     drawn: str = ""
+    candidates: int = 8
     derivatives: bool = False
     automatic: bool = False
     needs: Callable[[Any], bool] = lambda medium: True

@@ -8,7 +8,7 @@ What it costs: those queries once per field, then an atlas lookup per point and 
 from dataclasses import replace
 
 from . import transmittance_atlas
-from .method import FILLED, Method
+from .method import Method
 
 
 def build(medium, table, options, dj, keep):
@@ -26,8 +26,9 @@ METHOD = Method(
     summary="per field, the ray network's answers for the rays of an atlas, each asked once; looked up as in one",
     build=build,
     pair=transmittance_atlas.METHOD.pair,
-    making=lambda work, prices: FILLED * transmittance_atlas.RAYS * prices.ray,
+    making=transmittance_atlas.making,
     numbers=numbers,
     per_field=True,
+    candidates=2,
     dials=("map_file",),
 )

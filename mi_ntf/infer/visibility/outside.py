@@ -8,9 +8,16 @@ from .. import ops
 
 def tau(method, x, wi, distance, index, active):
     """``method.tau`` (:mod:`mi_ntf.infer.visibility`) from where the ray from `x` enters the sphere, `x` itself inside
-    it. Tables know their rays inside the sphere alone: carried on behind it, a logistic that fits smoke falls to 0."""
+    it. Tables know their rays inside the sphere alone: carried on behind it, a logistic that fits smoke falls to 0.
+    Rays that pass by ask no method."""
     hit, m, h = spheres.chord(ops, x, wi)
-    way = dr.select(hit, dr.maximum(-h - spheres.coordinate(x, wi), 0), 0)
+    here = spheres.coordinate(x, wi)
+    way = dr.select(hit, dr.maximum(-h - here, 0), 0)
     entered = tuple(dr.select(way > 0, mi - h * di, xi) for mi, di, xi in zip(m, wi, x, strict=True))
-    before = way < distance
-    return dr.select(before, method.tau(entered, wi, distance - way, index, active & before), 1)
+
+    def through(x, wi, distance, index):
+        return method.tau(x, wi, distance, index, True)
+
+    return dr.if_stmt(
+        (entered, tuple(wi), distance - way, index), active & hit & (here < h) & (way < distance), through,
+        lambda *_: type(h)(1), label="outside")

@@ -22,7 +22,7 @@ from .. import octahedral, ops, profile
 from ..lights import LightTable
 from . import map_source, raymarch
 from .method import FILLED, Method, Options, queries
-from .transmittance_map import TransmittanceMap, channels, per_ray
+from .transmittance_map import TransmittanceMap, channels
 
 SIDE = 32
 """Directions: as many squared, octahedral."""
@@ -42,6 +42,8 @@ twice."""
 REACH = 0.06
 """Where the sum ends, and the map of smoke begins."""
 NEAREST_PIVOT = 0.16
+OUTSIDE = 0.98
+"""Squared distance from the origin where points lie in no skin: maps are read from the sphere on."""
 COARSE = 2.0
 """Steps of the march that fills the maps of an opaque thing, in those of a transmittance map: what a texel blurs hides
 more (error of τ alike up to 3)."""
@@ -75,15 +77,20 @@ class TransmittanceAtlas:
         return dr.if_stmt((x, wi, distance), active & (here + distance < h), march, look_up, label="light inside")
 
     def _look_up(self, x, wi, here, active):
-        depth = 0
-        for t, w in zip(PLACES, WEIGHTS, strict=True):
-            depth += w * self.density(tuple(a + t * b for a, b in zip(x, wi, strict=True)))
-        return dr.exp(-depth) * self._far(x, wi, here, active)
+        outside = dr.squared_norm(self.dj.Array3f(*x)) > OUTSIDE
 
-    def _far(self, x, wi, here, active):
+        def near(x, wi):
+            depth = 0
+            for t, w in zip(PLACES, WEIGHTS, strict=True):
+                depth += w * self.density(tuple(a + t * b for a, b in zip(x, wi, strict=True)))
+            return dr.exp(-depth)
+
+        close = dr.if_stmt((tuple(x), tuple(wi)), active & ~outside, near, lambda x, wi: self.dj.Float(1), label="near")
+        return close * self._far(x, wi, here, outside, active)
+
+    def _far(self, x, wi, here, outside, active):
         u = _uniforms(self.dj, x, wi)
         k, d = self._direction(wi, u[:2])
-        outside = dr.squared_norm(self.dj.Array3f(*x)) > 0.98
         pivot = dr.select(outside, dr.maximum(-here, 0), dr.maximum(-0.5 * here, NEAREST_PIVOT))
         back = dr.select(outside, pivot, pivot - self._begin)
         y = tuple(a + pivot * b - back * c for a, b, c in zip(x, wi, d, strict=True))
@@ -150,16 +157,21 @@ def numbers(medium, lights, options: Options) -> int:
     return RAYS * channels(medium.field.network.components if network else LOGISTICS)
 
 
+def making(work, prices) -> float:
+    """ns of all maps: a ray costs two texels of a light's map, as half of the steps and two logistics to fit."""
+    return FILLED * RAYS * 2 * work.samples * (prices.texel + queries(work, prices))
+
+
 METHOD = Method(
     name="transmittance_atlas",
     summary="per field, maps of directions all around: one texel and a few densities per point and light",
     build=build,
     pair=lambda work, prices: prices.atlas + len(PLACES) * queries(work, prices),
     prices={"atlas": 25.0},
-    making=lambda work, prices: (
-        FILLED * RAYS * per_ray(work, prices)),
+    making=making,
     numbers=numbers,
     per_field=True,
+    candidates=2,
     dials=("map_source", "map_file"),
     automatic=True,
 )

@@ -45,21 +45,19 @@ class TransmittanceMap:
         self.dj, self.lights, self.count = dj, lights, lights.count
         self.rays = LightRays(lights, hull, resolution, dj)
         self.width = channels(source.components, source.weights)
-        self._parts = max(1, self.width // 4)
-        rows, columns = lights.count * resolution**2 * self._parts, self.width // self._parts
-        numbers = self._fit(source, rows, columns) if values is None else values
-        self.texels = Texels(numbers, rows, columns, dj)
+        count = lights.count * resolution**2
+        self.texels = Texels(self._fit(source, count) if values is None else values, count, self.width, dj)
 
-    def _fit(self, source: Source, rows: int, columns: int):
+    def _fit(self, source: Source, count: int):
         """The numbers of all texels."""
-        numbers = blank(rows, columns, self.dj)
+        numbers, parts = blank(count, self.width, self.dj), max(1, self.width // 4)
         # A chunk of lights at a time bounds what a source holds per ray.
         chunk = max(1, (1 << 22) // self.rays.m**2)
         for first in range(0, self.count, chunk):
             texel, o, d, end = self.rays.all_rays(first, min(chunk, self.count - first))
             for k, part in enumerate(source.fit(o, d, end)):
-                row = self.dj.Array2f(*part[1:]) if columns == 2 else self.dj.Array4f(*part, 0)
-                dr.scatter(numbers, row, texel * self._parts + k)
+                row = self.dj.Array2f(*part[1:]) if self.width == 2 else self.dj.Array4f(*part, 0)
+                dr.scatter(numbers, row, texel * parts + k)
             dr.eval(numbers)
         return numbers
 
@@ -86,10 +84,10 @@ class TransmittanceMap:
         return dr.select(inside, dr.minimum(root * root, 1), 1)
 
     def _fetch(self, texel, active):
+        row = self.texels.row(texel, active)
         if self.width == 2:
-            return ((1.0, *self.texels.row(texel, active)),)
-        rows = [self.texels.row(texel * self._parts + k, active) for k in range(self._parts)]
-        return tuple((row[0], row[1], row[2]) for row in rows)
+            return ((1.0, row[0], row[1]),)
+        return tuple((row[k], row[k + 1], row[k + 2]) for k in range(0, self.width, 4))
 
 
 def _root(t, mixture):

@@ -8,10 +8,6 @@ import mitsuba as mi
 from ...infer import scatter
 from ..scene.frame import Frame
 
-CANDIDATES = 8
-"""Candidates of a resampled light: seven more draws are cheap beside one visibility."""
-SHARE = 1 / (3 * CANDIDATES)
-"""Of each colour of a candidate in their mean."""
 SAMPLES = 2
 """Resampled lights a point for each emitter with an extent, where all discrete lights are summed."""
 STRIDE = 3242174889, 2447445414
@@ -28,19 +24,20 @@ class EmitterSamples:
     count     lights per point, each from an emitter drawn by weight; 0: of every emitter SAMPLES lights, or 1 where
               it has no extent
     least     at least so many, of all emitters together or of each with an extent
+    resampled candidates of each light that is resampled
 
-    A light is the one that resampling keeps of CANDIDATES draws, with chances in proportion to the light that each
+    A light is the one that resampling keeps of a few draws, with chances in proportion to the light that each
     would scatter to the viewer, were nothing in the way (Talbot et al. 2005): of the many that could, the few worth a
     visibility. It is weighted so that the mean over all draws is the sum over all emitters.
     """
 
     def __init__(self, emitters: list, weights: list[float], frame: Frame, points, seed, count: int = 0,
-                 least: int = 0):
+                 least: int = 0, resampled: int = 8):
         self.frame, self.points = frame, points
         self._emitters = mi.EmitterPtr(emitters)
         self._choice = mi.DiscreteDistribution(weights) if count and len(emitters) > 1 else None
-        rows = [(0, CANDIDATES)] * (count and max(count, least)) or [
-            (i, 1) if mi.has_flag(e.flags(), mi.EmitterFlags.DeltaPosition) else (i, CANDIDATES)
+        rows = [(0, resampled)] * (count and max(count, least)) or [
+            (i, 1) if mi.has_flag(e.flags(), mi.EmitterFlags.DeltaPosition) else (i, resampled)
             for i, e in enumerate(emitters)
             for _ in range(1 if mi.has_flag(e.flags(), mi.EmitterFlags.DeltaPosition) else max(SAMPLES, least))
         ]
@@ -53,8 +50,8 @@ class EmitterSamples:
         )
         lane: Any = dr.arange(mi.UInt32, dr.width(points.x[0]))
         self._lane, self._shift = lane, mi.sample_tea_32(lane, seed)
-        self._seed = mi.UInt32(seed)
-        dr.make_opaque(self._emitter, self._candidates, self._share, self._seed)
+        self._seed, self._most = mi.UInt32(seed), mi.UInt32(resampled)
+        dr.make_opaque(self._emitter, self._candidates, self._share, self._seed, self._most)
         dr.eval(self._lane, self._shift)
 
     def sample(self, index, x, active):
@@ -71,15 +68,15 @@ class EmitterSamples:
         """The candidate kept for light `index`, and the weight of its irradiance in the estimate."""
         candidates = dr.gather(mi.UInt32, self._candidates, index, active)
         share = dr.gather(mi.Float, self._share, index, active)
-        p = self.points
+        p, fraction = self.points, dr.rcp(3 * mi.Float(candidates))
 
         def body(k, kept, of_kept, total):
             ds, irradiance = self._draw(index, k, it, active)
             value, _ = scatter.evaluate(self.frame.direction_to_field(ds.d), p.wo, p.reflectance)
             # Light may be negative. Scaled, so that the sum of the brightest that floats hold is still one.
-            target = dr.abs(sum(SHARE * e * v for e, v in zip(irradiance, value, strict=True)))
+            target = dr.abs(sum(fraction * e * v for e, v in zip(irradiance, value, strict=True)))
             total = total + target
-            u = mi.sample_tea_float32(self._lane ^ self._seed, index * CANDIDATES + k)
+            u = mi.sample_tea_float32(self._lane ^ self._seed, index * self._most + k)
             keep = u * total < target
             return k + 1, dr.select(keep, k, kept), dr.select(keep, target, of_kept), total
 
@@ -94,7 +91,7 @@ class EmitterSamples:
 
     def _draw(self, index, k, it, active):
         """Candidate `k` of light `index`: Mitsuba's sample, and its irradiance over its density."""
-        n = index * CANDIDATES + k
+        n = index * self._most + k
         # Evenly spread over a point's candidates, each uniform by itself: 24 bits of a float's mantissa.
         u = [mi.Float((shift + n * stride) >> 8) * 2**-24 for shift, stride in zip(self._shift, STRIDE, strict=True)]
         emitter, weight = dr.gather(mi.UInt32, self._emitter, index, active), 1

@@ -27,14 +27,14 @@ def integrator_class() -> type:
         parameter           type    meaning
         =================== ======= ===================================================================================
         visibility          string  how light reaches a point: ``raymarch``, ``transmittance_map``,
-                                    ``transmittance_atlas``, ``neural_transmittance``, ``transmittance_volume``,
-                                    ``visibility_mlp``, ``none``, or ``auto``, the cheaper of the first two (default:
-                                    auto)
+                                    ``transmittance_atlas``, ``neural_transmittance``, ``ray_network``,
+                                    ``transmittance_volume``, ``visibility_mlp``, ``none``, or ``auto``, the cheapest of
+                                    the first three (default: auto)
         samples             integer steps across the unit sphere's diameter (default: 384)
         light_samples       integer lights per shading point, drawn from Mitsuba's emitter sampling and resampled, from
                                     any emitters; 0: all lights, cells of environments among them, and 2 drawn (1 of a
                                     projector or textured spot) of each emitter that is no finite set of lights, such
-                                    as an area; these need no map and are marched under ``transmittance_map``
+                                    as an area; no map serves these: they are marched under ``transmittance_map``
                                     (default: 0)
         environment_lights  integer most directional lights that stand for an environment (default: 512)
         map_resolution      integer texels per side of a light's transmittance map (default: 192)
@@ -43,7 +43,7 @@ def integrator_class() -> type:
                                     and on what is not opaque, and take four times the memory (default: 1)
         map_memory          float   MiB that maps or volumes may take: more lights are rendered in several runs
                                     (default: 1024)
-        map_file            string  EXR of ``mi-ntf bake`` that holds the maps (default: none)
+        map_file            string  EXR of ``mi-ntf bake`` that holds the maps or the atlas (default: none)
         max_depth           integer longest path in edges: 1 shows emitters alone, 2 is single scattering, more is
                                     multiple scattering in fields and between surfaces, −1 has no limit and ends paths
                                     by Russian roulette from depth 5 on (default: 2)
@@ -123,7 +123,7 @@ def integrator_class() -> type:
 
 
 def _render(self, scene, sensor, seed: int, spp: int, develop: bool):
-    """Camera rays in chunks of pixels → radiance and opacity → film."""
+    """Camera rays → radiance and opacity → film."""
     if dr.flag(dr.JitFlag.FreezingScope):
         raise MiNtfError(
             "nrf integrator: dr.freeze cannot record a render whose number of shading points is known only while it "
@@ -140,8 +140,20 @@ def _render(self, scene, sensor, seed: int, spp: int, develop: bool):
     film.prepare(picture.names if picture else [])
     block = film.create_block()
     block.set_offset(film.crop_offset())
-    pixels = Reconstruction(block, camera)
-    # Lights in runs whose maps fit into memory, and for each the same camera rays.
+    _trace(self, composition, Reconstruction(block, camera), picture, seed, start)
+    if picture:
+        picture.write_to(block)
+    film.put_block(block)
+    if not develop:
+        return mi.TensorXf()
+    image = film.develop()
+    return image + _no_slope(scene) if composition.effects.gradients and not dr.grad_enabled(image) else image
+
+
+def _trace(self, composition, pixels: Reconstruction, picture, seed: int, start: float) -> None:
+    """Camera rays in chunks of pixels: lights in runs whose maps fit into memory, and for each the same rays."""
+    camera = pixels.camera
+    alpha = mi.has_flag(camera.film.flags(), mi.FilmFlags.Alpha)
     chunks = range(0, camera.count, max(1, CHUNK // camera.spp))
     for run, first in itertools.product(range(len(composition.runs)), chunks):
         if self.should_stop() or (self.timeout > 0 and time.monotonic() - start > self.timeout):
@@ -155,18 +167,10 @@ def _render(self, scene, sensor, seed: int, spp: int, develop: bool):
         sums = picture and picture.sums(dr.width(ray), run, composition.runs[run])
         with composition.lights.bare():
             radiance, opacity = composition.trace(ray, camera.quadrature(count), stream, sums)
-        alpha = [opacity] if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else []
-        once = [*alpha, dr.ones(mi.Float, dr.width(ray))]
+        once = [*([opacity] if alpha else []), dr.ones(mi.Float, dr.width(ray))]
         pixels.add(first, position, [*(radiance * weight), *([None] * len(once) if run else once)])
         if picture and sums:
             picture.put(first, position, sums)
-    if picture:
-        picture.write_to(block)
-    film.put_block(block)
-    if not develop:
-        return mi.TensorXf()
-    image = film.develop()
-    return image + _no_slope(scene) if composition.effects.gradients and not dr.grad_enabled(image) else image
 
 
 def _no_slope(scene):
