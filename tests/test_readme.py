@@ -60,7 +60,7 @@ def _marks(words) -> list:
     """How shipped fields were trained takes minutes here too, and three trainings differ by their options alone: `make
     hard-cases` runs those."""
     slow = "knot-photographs" in words or "scenes/skull/field.safetensors" in words or words[:3] == [
-        "mi-ntf", "train", "mine"]
+        "mi-ntf", "train", "skull_flash"]
     return [pytest.mark.slow] if slow else []
 
 

@@ -2,7 +2,7 @@
 
     python -m mi_ntf.evaluate.transmittance [SCENE.xml ...] [--size 128] [--spp 4] [--lights 50]
 
-Per scene: relative RMSE of the image lit through `neural_transmittance`, and through maps of 128² and 256² texels made
+Per scene: relative RMSE of the image lit through `ray_network`, and through maps of 128² and 256² texels made
 by field and network, against `raymarch` on the same field; and nanoseconds a query of the network on random rays, the
 median of five runs of a million after a warm-up.
 """
@@ -23,7 +23,7 @@ from ..core.spheres import fibonacci
 from .metrics import relative_rmse
 
 VARIANTS: dict[str, dict[str, Any]] = {
-    "neural_transmittance": {"visibility": "neural_transmittance"},
+    "ray_network": {"visibility": "ray_network"},
     "map, field, 128²": {"visibility": "transmittance_map", "map_resolution": 128},
     "map, field, 256²": {"visibility": "transmittance_map", "map_resolution": 256},
     "map, network, 128²": {"visibility": "transmittance_map", "map_source": "network", "map_resolution": 128},

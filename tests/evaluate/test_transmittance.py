@@ -18,5 +18,5 @@ def test_study_of_the_statue():
     found = transmittance.study(STATUE, 32, 2, 3)
     assert found.pop("ns") > 0
     assert set(found) == set(transmittance.VARIANTS)
-    assert 0.001 < found["neural_transmittance"] < 0.08
+    assert 0.001 < found["ray_network"] < 0.08
     assert 0.001 < min(found.values()) and max(found.values()) < 0.10
