@@ -103,14 +103,14 @@ def _loops(medium, x, tables: bool, sizes: Sizes) -> tuple[dict[str, float], dic
         built = building.build(name, medium, table, options)
         dr.sync_thread()
         making[name] = time.perf_counter() - start
-        work[name] = partial(calibration._tau, built, table, x)
+        work[name] = partial(calibration.look_up, built, table, x)
     found = seconds(work, min(sizes.repeats, 3))
     return {name: 1e9 * value / (dr.width(x) * table.count) for name, value in found.items()}, making
 
 
 def _seen(medium, count: int):
     """`count` points, side by side, where parallel camera rays meet the voxels."""
-    x = calibration._points(medium).x
+    x = calibration.seen_points(medium).x
     first = (dr.width(x) - count) // 2
     part = tuple(dr.gather(mi.Float, c, first + dr.arange(mi.UInt32, count)) for c in x)
     dr.eval(part)

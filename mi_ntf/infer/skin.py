@@ -10,15 +10,23 @@ from . import ops
 from .bundle import clear_distance, density_where, onward, safe_inverse
 from .grid import REFLECTANCE_RESOLUTION
 
+OPAQUE = 0.5
+"""Fields with fewer opaque skins than this share are smoke."""
+
 
 class Softness:
     """The softness of the skins of `grid` (a :class:`mi_ntf.infer.grid.GridField`), at its reflectance's voxel centres,
-    trilinear between; 0 for flat skins, and for smoke. `solid`: the share of them that are opaque."""
+    trilinear between; 0 for flat skins, and for smoke. `solid`: the share of them that are opaque; `opaque`: whether
+    most are."""
 
     def __init__(self, grid, dj: ModuleType):
         self.dj = dj
         values, self.solid = _measure(grid, min(grid.resolution, REFLECTANCE_RESOLUTION), dj)
         self._texture = dj.Texture3f(dj.TensorXf(values[..., None]), use_accel=False, wrap_mode=dr.WrapMode.Clamp)
+
+    @property
+    def opaque(self) -> bool:
+        return self.solid >= OPAQUE
 
     def __call__(self, p):
         """At the field points `p`."""

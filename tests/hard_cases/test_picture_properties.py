@@ -9,11 +9,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mi_ntf.core import field_file
+from mi_ntf.infer.visibility import transmittance_atlas
 
 METHODS = {name: {"visibility": method, **options} for name, (method, options) in random_fields.METHODS.items()}
 every_method = pytest.mark.parametrize("name", METHODS)
 tied = pytest.mark.parametrize("name", [n for n in METHODS if n != "visibility_mlp"])
 """Without the baseline's network, which may take the whole depth of a skin for lit."""
+@pytest.fixture(scope="module", autouse=True)
+def small_atlas():
+    """Two million rays take seconds, and here each picture has its own."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(transmittance_atlas, "SIDE", 16)
+        patch.setattr(transmittance_atlas, "RESOLUTION", 24)
+        yield
+
+
 FEW = settings(settings.get_profile("hard"), max_examples=3)
 SMALL = {"environment_lights": 32, "map_resolution": 32, "samples": 128}
 

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import pytest
 from scipy.special import erf
 
 from helpers import fields
@@ -20,6 +21,7 @@ from mi_ntf.infer.grid import CELLS, GridField
 from mi_ntf.infer.lights import LightTable
 from mi_ntf.infer.network import NetworkField
 from mi_ntf.infer.skin import Softness
+from mi_ntf.infer.visibility import transmittance_atlas
 from mi_ntf.render.maps import building
 
 METHODS = {
@@ -30,6 +32,8 @@ METHODS = {
     "map, field, 2": ("transmittance_map", {"map_components": 2}),
     "map, network": ("transmittance_map", {"map_source": "network"}),
     "visibility_mlp": ("visibility_mlp", {}),
+    "atlas, field": ("transmittance_atlas", {}),
+    "atlas, network": ("neural_transmittance", {}),
     "none": ("none", {}),
 }
 STEP = 2 / 256
@@ -133,7 +137,7 @@ class Exact:
         corners = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), -1).reshape(-1, 3)
         grid = SimpleNamespace(clearance=dr.zeros(mi.Float, CELLS**3), hull=corners, density=self.density)
         network = Balls(0).medium().field.network
-        field = SimpleNamespace(network=network, grid=grid, softness=SimpleNamespace(solid=1.0))
+        field = SimpleNamespace(network=network, grid=grid, softness=SimpleNamespace(opaque=True))
         return SimpleNamespace(source=SimpleNamespace(density=self.density, reflectance=self.reflectance), field=field)
 
 
@@ -175,7 +179,10 @@ def places(seed: int, table: LightTable, n: int = 256) -> np.ndarray:
 def build(name: str, medium, table: LightTable, resolution: int = RESOLUTION, step: float = STEP):
     """The method `name` of METHODS; None for ``none``."""
     method, extra = METHODS[name]
-    return building.build(method, medium, table, building.Options(step, map_resolution=resolution, **extra))
+    with pytest.MonkeyPatch.context() as patch:  # an atlas of two million rays takes seconds
+        patch.setattr(transmittance_atlas, "SIDE", 8)
+        patch.setattr(transmittance_atlas, "RESOLUTION", 16)
+        return building.build(method, medium, table, building.Options(step, map_resolution=resolution, **extra))
 
 
 def look(method, table: LightTable, x: np.ndarray, index=None) -> np.ndarray:

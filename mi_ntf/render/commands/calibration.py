@@ -29,7 +29,7 @@ MANY = 256
 def calibrate(medium) -> model.Constants:
     """Constants of this machine, by `medium`'s field; kept in the cache. Takes some seconds, compilation mostly."""
     grid, network = medium.field.grid, medium.field.network
-    points, many = _points(medium), _table(MANY)
+    points, many = seen_points(medium), _table(MANY)
     skin = bounced.Skin(medium, np.random.default_rng(0))
     jobs = {
         "camera": (lambda: _camera(grid).t, WIDTH * SAMPLES),
@@ -59,7 +59,7 @@ def _jobs(method, medium, x) -> dict:
     # What is in many maps does not matter to lookups: those are marched in a few steps.
     step = 2 / SAMPLES if lights == FEW else 1 / 4
     built = building.build(method.name, medium, many, Options(step, resolution))
-    jobs = {pair: (lambda: _tau(built, many, x), WIDTH * lights * method.pair(work, _alone(pair)))}
+    jobs = {pair: (lambda: look_up(built, many, x), WIDTH * lights * method.pair(work, _alone(pair)))}
     if making:
         def make() -> None:
             building.build(method.name, medium, few, Options(2 / SAMPLES, resolution))
@@ -103,7 +103,7 @@ def _timed(run: Callable[[], Any]) -> float:
     return time.perf_counter() - start
 
 
-def _points(medium) -> shade.Points:
+def seen_points(medium) -> shade.Points:
     """Where random camera rays meet the field, WIDTH points."""
     grid = medium.field.grid
     found = _camera(grid)
@@ -134,7 +134,7 @@ def _rays(grid):
     return o, d
 
 
-def _tau(method, table, x):
+def look_up(method, table, x):
     """Σ over the table's lights of τ at `x`."""
     uint = mi.UInt32
     count = dr.opaque(uint, table.count)

@@ -32,7 +32,7 @@ class EmitterSamples:
     """
 
     def __init__(self, emitters: list, weights: list[float], frame: Frame, points, seed, count: int = 0,
-                 least: int = 0, resampled: int = 8):
+                 least: int = 0, *, resampled: int):
         self.frame, self.points = frame, points
         self._emitters = mi.EmitterPtr(emitters)
         self._choice = mi.DiscreteDistribution(weights) if count and len(emitters) > 1 else None

@@ -93,8 +93,6 @@ def describe(scene, integrator, sensor, spp: int, media: list, light) -> Effects
 
 UNLIMITED = 4
 """Bounces that paths without a limit have, about."""
-SOLID = 0.5
-"""Fields with fewer opaque skins than this share are smoke, whose bounces radiosity does not know."""
 
 
 def _bounces(integrator, media: list, surfaces: bool, gradients: bool) -> str:
@@ -102,7 +100,7 @@ def _bounces(integrator, media: list, surfaces: bool, gradients: bool) -> str:
     name = integrator.bounces
     unknown = [what for what, there in (
         ("surfaces", surfaces), ("derivatives", gradients), ("visibility=none", integrator.visibility == "none"),
-        ("smoke", any(m.field.softness.solid < SOLID for m in media if m.field.grid.majorant > 0))) if there]
+        ("smoke", any(not m.field.softness.opaque for m in media if m.field.grid.majorant > 0))) if there]
     if name == "radiosity" and unknown:
         raise MiNtfError(
             f"nrf integrator: bounces=radiosity is light between the opaque skins of fields, but here are "

@@ -155,8 +155,7 @@ class Composition:
         """Radiance that `points` of `part` reflect from all lights; `view`: their transmittance, if lights share it;
         `surface`: whether they are diffuse points of a surface above the skin; `draws`: least number of those drawn."""
         total = [dr.zeros(mi.Float, dr.width(points.x[0])) for _ in range(3)]
-        known = REGISTRY[self.effects.visibility]
-        candidates = REGISTRY[known.for_drawn].candidates
+        candidates = REGISTRY[REGISTRY[self.effects.visibility].for_drawn].candidates
         for source, mapped in self.lights.sources(part.table, part.frame, points, stream, draws, candidates):
             if self.run and not mapped:
                 continue
