@@ -90,8 +90,8 @@ def test_one_at_the_light(name, balls, seed):
 
 AT_LIGHT = {"map, field": 0.5, "map, field, 2": 0.35, "visibility_mlp": 1.0, "atlas, field": 1.0, "atlas, network": 1}
 """Measured 0.37 and 0.26: a logistic cannot start at 1 in the midst of matter and fall at once. The baseline knows no
-distances. The atlas marches to lights within the sphere; of a light on the sphere, seen along it, one of its directions,
-22° apart here, may pass through what it stands beside (measured 0.64)."""
+distances. The atlas marches to lights within the sphere; of a light on the sphere, seen along it, one of its
+directions, 22° apart here, may pass through what it stands beside (measured 0.64)."""
 
 
 def _depth_of(medium, name: str) -> float:
