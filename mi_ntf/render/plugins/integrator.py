@@ -9,7 +9,7 @@ import mitsuba as mi
 from ...core.errors import MiNtfError, root
 from ...infer.visibility import names
 from ..scene.camera import Camera, Reconstruction
-from ..transport import aovs
+from ..transport import aovs, camera_light
 from ..transport.composition import Composition
 from . import properties
 
@@ -166,7 +166,7 @@ def _trace(self, composition, pixels: Reconstruction, picture, seed: int, start:
         ray, weight, position = camera.rays(first, count, stream)
         sums = picture and picture.sums(dr.width(ray), run, composition.runs[run])
         with composition.lights.bare():
-            radiance, opacity = composition.trace(ray, camera.quadrature(count), stream, sums)
+            radiance, opacity = camera_light.trace(composition, ray, camera.quadrature(count), stream, sums)
         once = [*([opacity] if alpha else []), dr.ones(mi.Float, dr.width(ray))]
         pixels.add(first, position, [*(radiance * weight), *([None] * len(once) if run else once)])
         if picture and sums:
