@@ -17,6 +17,7 @@ import tyro
 from tyro.conf import Positional, UseAppendAction, arg, subcommand
 
 from mi_ntf.core import errors
+from mi_ntf.evaluate.limits import Limits, broken, given
 
 Output = Annotated[Path, arg(aliases=("-o",), metavar="FILE")]
 
@@ -183,19 +184,31 @@ class Render:
 
 @dataclass
 class Compare:
-    """Measure an image against a reference."""
+    """Measure an image against a reference. Exit code 1 where a limit is broken."""
 
     image: Positional[Path]
-    """Image to judge, EXR."""
+    """Image to judge, EXR or PNG."""
     reference: Positional[Path]
-    """Image taken as truth, EXR."""
+    """Image taken as truth, EXR or PNG."""
+    output: Annotated[Path | None, arg(aliases=("-o",), metavar="FILE")] = None
+    """PNG to write: both images, their difference, HDR-FLIP."""
+    limits: Annotated[Any, arg(name="", constructor=Limits)] = field(default_factory=Limits)
+    masked: bool = False
+    """Limits judge the object's own pixels, where the reference's alpha is above 0.5, not the whole picture."""
     json: bool = False
     """Print JSON in place of a table."""
 
-    def run(self) -> None:
+    def run(self) -> int:
+        if self.masked and not given(self.limits):
+            raise UsageError("--masked says what limits judge; give one, as --max-relative-rmse 0.05")
         from mi_ntf.evaluate.compare import compare, print_table
 
-        _report(compare(self.image, self.reference), self.json, print_table)
+        result = compare(self.image, self.reference, self.output)
+        failures = broken(result, self.limits, self.masked)
+        _report(result | ({"exceeded": failures} if given(self.limits) else {}), self.json, print_table)
+        for failure in failures:
+            print(f"mi-ntf: {failure['says']}", file=sys.stderr)
+        return 1 if failures else 0
 
 
 @dataclass

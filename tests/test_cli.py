@@ -96,7 +96,8 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list:
             {"size": 64, "masks": Path("m"), "background": "black", "flash_offset": (-1.0, 0.0, 2.0)},
         ),
         ("swap s.xml f.safetensors -o out.xml", (Path("s.xml"), Path("f.safetensors"), Path("out.xml")), {}),
-        ("compare a.exr b.exr", (Path("a.exr"), Path("b.exr")), {}),
+        ("compare a.exr b.exr", (Path("a.exr"), Path("b.exr"), None), {}),
+        ("compare a.exr b.exr -o c.png", (Path("a.exr"), Path("b.exr"), Path("c.png")), {}),
         ("explain s.xml -D spp=4 -D light=env", (Path("s.xml"), {"spp": "4", "light": "env"}, False), {}),
         ("explain s.xml --measure", (Path("s.xml"), {}, True), {}),
         ("info f.safetensors", (Path("f.safetensors"),), {}),
@@ -114,6 +115,22 @@ def test_json(calls: list, line: str, capsys: pytest.CaptureFixture[str]):
     assert json.loads(capsys.readouterr().out) == {"psnr": 30.5, "inner": {"a": 1}}
 
 
+def test_limits_of_compare_decide_the_exit_code(calls: list, capsys: pytest.CaptureFixture[str]):
+    assert cli.main("compare a b --min-psnr 30.5".split()) == 0
+    assert capsys.readouterr() == ("table 30.5\n", "")
+    assert cli.main("compare a b --min-psnr 31 --max-flip 0.5".split()) == 1
+    out, err = capsys.readouterr()
+    assert out == "table 30.5\n"
+    assert err == ("mi-ntf: PSNR is 30.5 dB, less than --min-psnr 31 allows\n"
+                   "mi-ntf: HDR-FLIP was not measured, so --max-flip 0.5 cannot be judged: "
+                   "it is not among the figures\n")
+    assert cli.main("compare a b --min-psnr 31 --json".split()) == 1
+    [failure] = json.loads(capsys.readouterr().out)["exceeded"]
+    assert (failure["metric"], failure["value"], failure["limit"]) == ("psnr", 30.5, 31)
+    assert cli.main("compare a b --min-psnr 20 --json".split()) == 0
+    assert json.loads(capsys.readouterr().out)["exceeded"] == []
+
+
 @pytest.mark.parametrize(
     "line",
     [
@@ -126,6 +143,9 @@ def test_json(calls: list, line: str, capsys: pytest.CaptureFixture[str]):
         "train data -o f --flash-offset up",
         "capture s.xml data --flash-offset estimate",
         "inspect data --flash-offset estimate",
+        "compare a.exr b.exr --masked",
+        "compare a.exr b.exr --max-psnr 30",
+        "compare a.exr b.exr --max-flip little",
         "explain s.xml -D spp",
         "render",
         "render -D spp scene.xml",

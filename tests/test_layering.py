@@ -125,7 +125,7 @@ def test_third_parties_are_declared_where_they_are_used_and_nowhere_else():
     project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text())["project"]
     kinds = {"": project["dependencies"], **project["optional-dependencies"]}
     declared = {kind: {re.split("[=<>[]", name)[0].lower() for name in names} for kind, names in kinds.items()}
-    shipped = declared[""] | declared["train"] | declared["eval"]
+    shipped = set().union(*(declared[kind] for kind in kinds if kind != "dev"))
     tops = {name.split(".")[0] for file in FILES for name in imports_of(file)} - {"mi_ntf"} - sys.stdlib_module_names
     # tensorboard is used by way of torch.utils.tensorboard.
     assert {PACKAGE_OF.get(name, name.lower()) for name in tops} | {"tensorboard"} == shipped

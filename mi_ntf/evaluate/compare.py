@@ -6,16 +6,8 @@ import numpy as np
 
 from mi_ntf.core.errors import MiNtfError
 
-from . import metrics
-
-EXPLAINED = {
-    "relative_rmse": ("relative RMSE", "√(mean (a−b)² / mean b²), linear"),
-    "psnr": ("PSNR, dB", "sRGB, clipped to [0, 1]"),
-    "ssim": ("SSIM", "sRGB, clipped, Gaussian 11×11"),
-    "flip": ("HDR-FLIP", "mean, 67 pixels a degree"),
-    "max_abs": ("largest error", "linear, any channel"),
-}
-
+from . import compare_picture, metrics, perceptual
+from .limits import METRICS
 
 VARIANTS = {"aligned": "aligned", "masked": "object", "masked_aligned": "object, aligned"}
 """Beside the raw figures: name and title."""
@@ -23,41 +15,60 @@ INSIDE = 0.5
 """Pixels of the reference with more alpha than this are the object."""
 
 
-def compare(image: Path, reference: Path) -> dict:
-    """The metrics of :mod:`.metrics` by name, both images composited on black; see :func:`compare_arrays`.
+def compare(image: Path, reference: Path, picture: Path | None = None) -> dict:
+    """All metrics by name, both images composited on black; see :func:`compare_arrays`.
 
-    EXR is read as linear and premultiplied, its AOV layers are dropped; PNG as sRGB with straight alpha. Raises
-    :class:`MiNtfError` where a file is missing or unreadable, sizes differ, or a pixel is not finite.
+    EXR is read as linear and premultiplied, its AOV layers are dropped; PNG as sRGB with straight alpha. `picture`: PNG
+    to write, see :func:`.compare_picture.draw`; its name is returned as ``picture``. Raises :class:`MiNtfError` where a
+    file is missing or unreadable, sizes differ, a pixel is not finite, or the picture cannot be written.
     """
+    if picture is not None:
+        compare_picture.check(picture)
     a, b = read_image(image), read_image(reference)
     if a.shape != b.shape:
         raise MiNtfError(f"{image} has {_size(a)} pixels, {reference} has {_size(b)}; render both at one size")
-    return compare_arrays(a[..., :3], b[..., :3], b[..., 3])
+    result = compare_arrays(a[..., :3], b[..., :3], b[..., 3], lpips=True)
+    if picture is not None:
+        compare_picture.draw(picture, a[..., :3], b[..., :3], result)
+        result["picture"] = str(picture)
+    return result
 
 
-def compare_arrays(image: np.ndarray, reference: np.ndarray, alpha: np.ndarray | None = None) -> dict:
+def compare_arrays(image: np.ndarray, reference: np.ndarray, alpha: np.ndarray | None = None,
+                   lpips: bool = False) -> dict:
     """:func:`compare` for linear RGB arrays (h, w, 3), composited on black, and the reference's alpha (h, w).
 
     The raw figures by their names. Below ``aligned`` the same after one factor a channel, which stand there as
     ``factors``: published comparisons of relit objects take out the scale of the albedo that way. Below ``masked`` and
     ``masked_aligned`` those of the object's own pixels, a share ``coverage`` of the picture, where `alpha` tells the
-    object from a background.
+    object from a background. A figure that picture or machine do not allow is None, with ``reason`` and ``remedy``
+    below ``not_measured``. `lpips`: LPIPS, too, which imports PyTorch where it is installed.
     """
-    result = _figures(image, reference, None) | {"aligned": _aligned(image, reference, None)}
+    names = [name for name in METRICS if lpips or name != "lpips"]
+    missing: dict[str, dict[str, str]] = {}
+
+    def figures(image, mask) -> dict:
+        return {name: _figure(name, image, reference, mask, missing) for name in names}
+
+    def aligned(mask) -> dict:
+        factors = metrics.alignment(image, reference, mask)
+        return figures(image * factors, mask) | {"factors": [float(f) for f in factors]}
+
+    result = figures(image, None) | {"aligned": aligned(None)}
     inside = None if alpha is None else alpha > INSIDE
     if inside is not None and 0 < inside.sum() < inside.size:
-        result["masked"] = _figures(image, reference, inside) | {"coverage": float(inside.mean())}
-        result["masked_aligned"] = _aligned(image, reference, inside)
-    return result
+        result["masked"] = figures(image, inside) | {"coverage": float(inside.mean())}
+        result["masked_aligned"] = aligned(inside)
+    return result | ({"not_measured": missing} if missing else {})
 
 
-def _figures(image, reference, mask) -> dict:
-    return {name: getattr(metrics, name)(image, reference, mask) for name in EXPLAINED}
-
-
-def _aligned(image, reference, mask) -> dict:
-    factors = metrics.alignment(image, reference, mask)
-    return _figures(image * factors, reference, mask) | {"factors": [float(f) for f in factors]}
+def _figure(name: str, image, reference, mask, missing: dict) -> float | None:
+    """One figure; None, with an entry in `missing`, where it cannot be measured."""
+    try:
+        return getattr(perceptual if name == "lpips" else metrics, name)(image, reference, mask)
+    except metrics.NotMeasured as error:
+        missing[name] = {"reason": error.reason, "remedy": error.remedy}
+        return None
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -85,16 +96,27 @@ def print_table(result: dict) -> None:
     from rich.table import Table
 
     variants = {title: result[name] for name, title in VARIANTS.items() if name in result}
+    missing = result.get("not_measured", {})
     table = Table("metric", "raw", *variants, "on")
-    for name, (title, definition) in EXPLAINED.items():
-        table.add_row(title, *(f"{figures[name]:.4g}" for figures in (result, *variants.values())), definition)
+    for name, metric in METRICS.items():
+        if name in result:
+            values = [figures[name] for figures in (result, *variants.values())]
+            said = f"not measured: {missing[name]['reason']}" if name in missing else metric.definition
+            title = ", ".join(filter(None, [metric.title, metric.unit]))
+            table.add_row(title, *("–" if v is None else f"{v:.4g}" for v in values), said)
     console = Console()
     console.print(table)
+    for name, why in missing.items():
+        if why["remedy"]:  # never wrapped, so that commands can be copied
+            line = f"to measure {METRICS[name].title}: {why['remedy']}"
+            console.print(line, soft_wrap=True, markup=False, highlight=False)
     for title, figures in variants.items():
         if "factors" in figures:
             console.print(f"{title}: red, green, blue times " + ", ".join(f"{f:.4f}" for f in figures["factors"]))
         if "coverage" in figures:
             console.print(f"{title}: {figures['coverage']:.1%} of the pixels, alpha above {INSIDE:g} in the reference")
+    if "picture" in result:
+        console.print(f"picture: {result['picture']}", soft_wrap=True, markup=False, highlight=False)
 
 
 def _size(pixels: np.ndarray) -> str:

@@ -1,8 +1,8 @@
 """Image metrics. Images are float arrays (h, w, 3), linear RGB, premultiplied by alpha: that is, composited on black.
 
 All metrics take ``(image, reference, mask)``, the first two of equal shape, and return one float. `mask` (h, w), bool:
-the pixels that count, None: all of them; what lies beside them is still seen by the windows of `ssim` and `flip`, which
-need the extra ``eval``.
+the pixels that count, None: all of them; what lies beside them is still seen by the windows of `ssim`, `ms_ssim` and
+the two FLIPs, which need the extra ``eval``. LPIPS, which needs PyTorch, is in :mod:`.perceptual`.
 """
 
 import numpy as np
@@ -12,6 +12,19 @@ from mi_ntf.core import srgb as curve
 from mi_ntf.core.errors import MiNtfError
 
 SSIM_WINDOW = 11
+SCALES = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
+"""Exponents of MS-SSIM from full to 1/16 resolution (Wang, Simoncelli, Bovik 2003, section 3.2)."""
+
+
+class NotMeasured(MiNtfError):
+    """A metric that this picture or this machine does not allow; the other metrics are not concerned.
+
+    `reason`: why, without a full stop. `remedy`: what to do, empty if nothing helps.
+    """
+
+    def __init__(self, reason: str, remedy: str = ""):
+        super().__init__("; ".join(filter(None, [reason, remedy])))
+        self.reason, self.remedy = reason, remedy
 
 
 def srgb(linear: np.ndarray) -> np.ndarray:
@@ -36,6 +49,15 @@ def relative_rmse(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | N
     return float(np.sqrt(np.mean(np.square(image - reference)) / power))
 
 
+def rmse(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
+    """√(mean (a − b)²) over all pixels and channels, linear, without clipping, in units of radiance. 0 is perfect.
+
+    The *rMSE* of Shafiei et al. 2021, table 2: its caption spells it *root mean squared error*, not relative. They do
+    not say whether their pixels are linear.
+    """
+    return float(np.sqrt(np.mean(np.square(_masked(image, mask) - _masked(reference, mask)))))
+
+
 def max_abs(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
     """Largest |a − b| of any pixel and channel, linear, without clipping."""
     return float(np.abs(_masked(image, mask) - _masked(reference, mask)).max())
@@ -51,31 +73,72 @@ def ssim(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = Non
     """Structural similarity (Wang et al. 2004) of the sRGB-encoded, clipped images, mean of channels. 1 is perfect.
 
     Gaussian weights of σ = 1.5 over 11×11 pixels, K = (0.01, 0.03), data range 1, population covariance, as in the
-    paper.
+    paper. Raises :class:`NotMeasured` below 11×11 pixels.
     """
     from skimage.metrics import structural_similarity
 
-    if min(image.shape[:2]) < SSIM_WINDOW:
-        raise MiNtfError(f"image of {image.shape[1]}×{image.shape[0]} pixels: SSIM's window needs at least "
-                         f"{SSIM_WINDOW}×{SSIM_WINDOW}; render larger")
+    need_pixels(image, SSIM_WINDOW)
     mean, each = structural_similarity(srgb(image), srgb(reference), data_range=1, channel_axis=2, full=True,
                                        gaussian_weights=True, sigma=1.5, use_sample_covariance=False)
     return float(mean if mask is None else each[mask].mean())  # the mean leaves out a border of half a window
 
 
+def ms_ssim(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
+    """Multi-scale SSIM (Wang, Simoncelli, Bovik 2003) of the sRGB-encoded, clipped images. 1 is perfect, 0 the worst.
+
+    Five scales, each of half the size (means of 2×2 pixels; the last row or column of an odd size counts twice). Each
+    contributes its mean contrast-structure term, the coarsest the whole SSIM, to the power of its entry of `SCALES`;
+    their product is taken for each channel, then the mean of channels. Windows and constants are those of
+    :func:`ssim`. Mean terms below 0 count as 0. With a mask, means are weighted by how much of it a pixel covers.
+
+    Raises :class:`NotMeasured` below 176×176 pixels: the window must fit into the coarsest scale.
+    """
+    need_pixels(image, SSIM_WINDOW << (len(SCALES) - 1))
+    a, b = (srgb(np.asarray(i, np.float64)) for i in (image, reference))
+    share = None if mask is None else np.asarray(mask, np.float64)[..., None]
+    product = np.ones(a.shape[-1])
+    for scale, exponent in enumerate(SCALES, 1):
+        luminance, structure = _ssim_terms(a, b)
+        term = luminance * structure if scale == len(SCALES) else structure
+        if share is None:
+            border = SSIM_WINDOW // 2
+            mean = term[border:-border, border:-border].mean((0, 1))  # as in `ssim`: whole windows alone
+        else:
+            mean = (term * share).sum((0, 1)) / share.sum()
+            share = _halved(share)
+        product *= np.maximum(mean, 0) ** exponent
+        a, b = _halved(a), _halved(b)
+    return float(product.mean())
+
+
 def flip(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Mean HDR-FLIP (Andersson et al. 2021), 67 pixels a degree, 0 is perfect and 1 the worst.
+    """Mean HDR-FLIP (Andersson et al. 2021), 67 pixels a degree, 0 is perfect and 1 the worst; see :func:`flip_map`."""
+    return float(_masked(flip_map(image, reference), mask).mean())
+
+
+def ldr_flip(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
+    """Mean LDR-FLIP (Andersson et al. 2020) of the sRGB-encoded, clipped images, 67 pixels a degree, 0 is perfect and 1
+    the worst."""
+    import flip_evaluator
+
+    encoded = [np.ascontiguousarray(srgb(i), np.float32) for i in (reference, image)]
+    each = flip_evaluator.evaluate(*encoded, "LDR", applyMagma=False)[0]
+    return float(_masked(np.asarray(each), mask).mean())
+
+
+def flip_map(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """HDR-FLIP of each pixel, (h, w), [0, 1].
 
     Negative values (of a reconstruction filter) are clipped. Exposures are chosen from the reference's lit pixels: a
-    black background would otherwise set them.
+    black background would otherwise set them. Raises :class:`MiNtfError` for a black reference.
     """
     import flip_evaluator
 
     start, stop = _exposures(reference)
     clean = [np.ascontiguousarray(np.maximum(i, 0), np.float32) for i in (reference, image)]
     parameters = {"startExposure": start, "stopExposure": stop}
-    each, mean, _ = flip_evaluator.evaluate(*clean, "HDR", applyMagma=False, parameters=parameters)
-    return float(mean if mask is None else np.asarray(each)[mask].mean())
+    each = flip_evaluator.evaluate(*clean, "HDR", applyMagma=False, parameters=parameters)[0]
+    return np.asarray(each)[..., 0]
 
 
 def alignment(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
@@ -84,6 +147,33 @@ def alignment(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None 
     a, b = _masked(image, mask).reshape(-1, 3), _masked(reference, mask).reshape(-1, 3)
     power = (a * a).sum(0)
     return np.where(power > 0, (a * b).sum(0) / np.where(power > 0, power, 1), 1.0)
+
+
+def need_pixels(image: np.ndarray, side: int) -> None:
+    """Raise :class:`NotMeasured` for an image narrower or lower than `side` pixels."""
+    height, width = image.shape[:2]
+    if min(height, width) < side:
+        raise NotMeasured(f"needs {side}×{side} pixels, the image has {width}×{height}", "render larger")
+
+
+def _ssim_terms(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Luminance and contrast-structure terms of SSIM of encoded images, of each pixel and channel (h, w, 3)."""
+    from skimage.filters import gaussian
+
+    def mean(x):  # over the window of `ssim`: five pixels to each side
+        return gaussian(x, sigma=1.5, truncate=3.5, mode="reflect", channel_axis=2, preserve_range=True)
+
+    ma, mb = mean(a), mean(b)
+    va, vb, covariance = mean(a * a) - ma * ma, mean(b * b) - mb * mb, mean(a * b) - ma * mb
+    c1, c2 = 0.01**2, 0.03**2
+    return (2 * ma * mb + c1) / (ma * ma + mb * mb + c1), (2 * covariance + c2) / (va + vb + c2)
+
+
+def _halved(image: np.ndarray) -> np.ndarray:
+    """Means of 2×2 pixels; the last row or column of an odd size is repeated."""
+    height, width = image.shape[:2]
+    padded = np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+    return padded.reshape((height + 1) // 2, 2, (width + 1) // 2, 2, -1).mean((1, 3))
 
 
 def _masked(image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:

@@ -8,7 +8,8 @@ from skimage import io
 
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.evaluate import metrics
-from mi_ntf.evaluate.compare import EXPLAINED, compare, compare_arrays, print_table, read_image
+from mi_ntf.evaluate.compare import compare, compare_arrays, print_table, read_image
+from mi_ntf.evaluate.limits import METRICS
 
 
 @pytest.fixture
@@ -32,7 +33,8 @@ def test_exr_round_trip_and_comparison(tmp_path, rgba):
     np.testing.assert_array_equal(read_image(tmp_path / "a.exr"), rgba)
     write_exr(tmp_path / "b.exr", rgba[..., :3] * 1.1)
     result = compare(tmp_path / "b.exr", tmp_path / "a.exr")
-    assert list(result)[: len(EXPLAINED)] == list(EXPLAINED)
+    assert list(result)[: len(METRICS)] == list(METRICS)
+    assert result["rmse"] == pytest.approx(0.1 * np.sqrt(np.mean(rgba[..., :3] ** 2)), rel=1e-5)
     assert result["relative_rmse"] == pytest.approx(0.1, rel=1e-5)
     assert result["max_abs"] == pytest.approx(0.1 * rgba[..., :3].max(), rel=1e-5)
     assert result["psnr"] == pytest.approx(metrics.psnr(rgba[..., :3] * 1.1, rgba[..., :3]), rel=1e-5)
@@ -125,9 +127,34 @@ def test_black_channels_stay_black(rng):
     assert compare_arrays(truth / 2, truth)["aligned"]["factors"] == pytest.approx([2, 1, 2])
 
 
-def test_table_shows_every_metric(capsys):
-    figures = dict.fromkeys(EXPLAINED, 0.125)
-    print_table(figures | {"aligned": figures | {"factors": [0.5, 1.0, 2.0]}, "masked": figures | {"coverage": 0.25}})
+def test_one_factor_takes_out_of_every_metric_what_it_can(rng):
+    """Raw figures and aligned ones of a large enough picture: all metrics but LPIPS."""
+    truth = rng.uniform(0.1, 0.4, (176, 176, 3))
+    result = compare_arrays(truth * 2, truth)
+    assert result["rmse"] == pytest.approx(np.sqrt(np.mean(truth**2))) and result["aligned"]["rmse"] < 1e-12
+    assert result["ms_ssim"] < 0.98 and result["aligned"]["ms_ssim"] == pytest.approx(1)
+    assert result["ldr_flip"] > 0.05 and result["aligned"]["ldr_flip"] < 1e-5
+    assert "not_measured" not in result and "lpips" not in result
+
+
+def test_small_pictures_lack_what_needs_larger_ones(rng, capsys):
+    truth = rng.uniform(size=(10, 12, 3))
+    result = compare_arrays(truth, truth, np.arange(12) * np.ones((10, 1)) > 5)
+    assert result["ms_ssim"] is result["ssim"] is result["masked"]["ms_ssim"] is result["aligned"]["ssim"] is None
+    assert result["not_measured"] == {
+        "ssim": {"reason": "needs 11×11 pixels, the image has 12×10", "remedy": "render larger"},
+        "ms_ssim": {"reason": "needs 176×176 pixels, the image has 12×10", "remedy": "render larger"}}
+    assert result["psnr"] == np.inf and result["ldr_flip"] == result["flip"] == 0
+    print_table(result)
     text = capsys.readouterr().out
-    assert text.count("0.125") == 3 * len(EXPLAINED) and "HDR-FLIP" in text
+    assert "not measured:" in text and "176×176" in text and "to measure MS-SSIM: render larger" in text
+
+
+def test_table_shows_every_metric(capsys):
+    figures = dict.fromkeys(METRICS, 0.125)
+    print_table(figures | {"aligned": figures | {"factors": [0.5, 1.0, 2.0]}, "masked": figures | {"coverage": 0.25},
+                           "picture": "a.png"})
+    text = capsys.readouterr().out
+    assert text.count("0.125") == 3 * len(METRICS) and "HDR-FLIP" in text and "PSNR, dB" in text
     assert "aligned: red, green, blue times 0.5000, 1.0000, 2.0000" in text and "object: 25.0%" in text
+    assert "picture: a.png" in text
