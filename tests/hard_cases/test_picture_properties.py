@@ -122,7 +122,7 @@ def test_chunks_and_bits(blobs, name, monkeypatch):
     """The same seed, the same bits; a chunk of few pixels at a time, other random numbers and the same picture."""
     whole = [picture(blobs, name, LIGHTS, seed=seed) for seed in range(4)]
     np.testing.assert_array_equal(picture(blobs, name, LIGHTS, seed=2), whole[2])
-    monkeypatch.setattr("mi_ntf.render.plugins.integrator.CHUNK", 16 * 40)
+    monkeypatch.setattr("mi_ntf.render.transport.rendering.CHUNK", 16 * 40)
     chunks = [picture(blobs, name, LIGHTS, seed=seed) for seed in range(4)]
     ztest.check([i[..., :3] for i in whole], [i[..., :3] for i in chunks], f"chunks {name}", block=4)
     np.testing.assert_allclose(np.mean(whole, (0, 1, 2)), np.mean(chunks, (0, 1, 2)), rtol=0.01)

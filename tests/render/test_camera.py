@@ -39,7 +39,7 @@ def test_pixel_formats_of_a_box_filter(blobs, pixel_format, visibility):
 @pytest.mark.parametrize("border", [False, True])
 def test_reconstruction_equals_the_films_own(blobs, rfilter, border, monkeypatch):
     """The same samples, put by Mitsuba's ImageBlock; in several chunks."""
-    monkeypatch.setattr("mi_ntf.render.plugins.integrator.CHUNK", 500)
+    monkeypatch.setattr("mi_ntf.render.transport.rendering.CHUNK", 500)
     options = {"rfilter": {"type": rfilter}, "sample_border": border, "pixel_format": "rgba"}
     loaded = scenes.scene(blobs, nrf("none", samples=64), LIGHT, size=16, spp=4, film_options=options)
     ours = scenes.render(loaded)

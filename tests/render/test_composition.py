@@ -192,7 +192,7 @@ def test_chunks_that_meet_nothing(blobs, monkeypatch, floor):
     lights = {"light": scenes.light("directional")}
     scene = scenes.scene(blobs, nrf(max_depth=3), lights, size=16, spp=16, shapes=room(blobs, floor))
     whole = scenes.render(scene, 0)
-    monkeypatch.setattr("mi_ntf.render.plugins.integrator.CHUNK", 256)
+    monkeypatch.setattr("mi_ntf.render.transport.rendering.CHUNK", 256)
     rows = scenes.render(scene, 0)
     assert (rows[0, :, :3] == 0).all()
     np.testing.assert_allclose(rows.mean((0, 1)), whole.mean((0, 1)), rtol=0.05)  # other samples

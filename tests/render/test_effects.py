@@ -13,7 +13,7 @@ from mi_ntf.infer.visibility import raymarch
 from mi_ntf.render.maps import building
 from mi_ntf.render.scene import effects
 from mi_ntf.render.scene.media import find_media
-from mi_ntf.render.transport import composition, walk
+from mi_ntf.render.transport import camera_light, composition, walk
 
 EYE = [scenes.SIMILARITY.center[0] + 1.2, scenes.SIMILARITY.center[1] + 1.5, scenes.SIMILARITY.center[2] + 5]
 """The pinhole of `scenes.scene`."""
@@ -81,7 +81,7 @@ def test_no_shapes_no_rays(blobs, monkeypatch):
     furnished = scenes.scene(blobs, nrf(), {"light": scenes.light("point")}, size=16, spp=4, shapes=floor())
     assert described(furnished).surfaces and operations(alone) < operations(furnished)
     forbid(monkeypatch, composition, "Surfaces")
-    forbid(monkeypatch, composition, "Walk")
+    forbid(monkeypatch, camera_light, "Walk")
     assert np.isfinite(scenes.render(alone)).all() and not described(alone).surfaces
     with pytest.raises(Exception, match="Surfaces was called") as caught:
         furnished.integrator().render(furnished)

@@ -192,7 +192,7 @@ def test_seeds_spp_and_chunks(blobs, monkeypatch):
     assert np.abs(first - scenes.render(loaded, 4)).max() > 1e-3
     error = [np.abs(scenes.render(loaded, 1, spp=n) - scenes.render(loaded, 2, spp=512)).mean() for n in (4, 64)]
     assert error[1] < error[0] / 2.5  # sixteen times the samples: a quarter of the error
-    monkeypatch.setattr("mi_ntf.render.plugins.integrator.CHUNK", 1000)
+    monkeypatch.setattr("mi_ntf.render.transport.rendering.CHUNK", 1000)
     assert scenes.render(loaded, 3).mean() == pytest.approx(first.mean(), rel=0.02)
 
 
@@ -210,7 +210,7 @@ def test_crop_window(blobs):
 
 
 def test_timeout_ends_early(blobs, monkeypatch):
-    monkeypatch.setattr("mi_ntf.render.plugins.integrator.CHUNK", 256)
+    monkeypatch.setattr("mi_ntf.render.transport.rendering.CHUNK", 256)
     loaded = scenes.scene(blobs, nrf(timeout=1e-3), {"light": scenes.light("env")}, size=64)
     start = time.monotonic()
     image = scenes.render(loaded)

@@ -11,7 +11,7 @@ from helpers.scenes import nrf
 
 from mi_ntf.core import field_file
 from mi_ntf.core.architecture import Similarity
-from mi_ntf.render.plugins import integrator
+from mi_ntf.render.transport import passes
 
 WHITE = {"albedo": (1 - 1e-6,) * 3, "specular": 1e-6}
 
@@ -114,7 +114,7 @@ def test_further_bounces_add_nothing_to_a_convex_object(tmp_path):
 
 def test_a_stopped_render_shows_whole_light_or_none(blobs, monkeypatch):
     """Three runs of lights, stopped in the last: pixels are as in the whole picture, or empty."""
-    monkeypatch.setattr("mi_ntf.render.plugins.integrator.CHUNK", 256)
+    monkeypatch.setattr("mi_ntf.render.transport.rendering.CHUNK", 256)
     lights = {f"light_{i}": {"type": "point", "position": [3.4 - 2 * i, 3.0, 2.5], "intensity": 50.0} for i in range(3)}
     options = {"visibility": "transmittance_map", "map_resolution": 32, "map_memory": 32**2 * 8 / 2**20}
     loaded = scenes.scene(blobs, nrf(**options, timeout=1e9), lights, size=16, spp=16)
@@ -122,7 +122,7 @@ def test_a_stopped_render_shows_whole_light_or_none(blobs, monkeypatch):
     ticks, runs = iter(range(10**6)), 3 * 16  # chunks of a row of pixels in each run
     stop = runs - 6
     clock = time.monotonic
-    monkeypatch.setattr(integrator.time, "monotonic", lambda: clock() + (2e9 if next(ticks) > stop else 0))
+    monkeypatch.setattr(passes.time, "monotonic", lambda: clock() + (2e9 if next(ticks) > stop else 0))
     part = scenes.render(loaded)
     rows = (part != 0).any((1, 2))
     assert rows.any() and not rows[-4:].any()

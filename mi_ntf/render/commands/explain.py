@@ -15,6 +15,7 @@ from ..maps import building
 from ..plugins.registration import load_scene
 from ..scene import effects
 from ..scene.media import find_media, ordinary_shapes
+from ..transport.rendering import CHUNK
 from . import calibration
 
 
@@ -78,8 +79,6 @@ def _works(integrator, media: list, found, rays: int, count: int, drawn: int) ->
 
 
 def _memory(works: list[model.Work]) -> dict[str, int]:
-    from ..plugins.integrator import CHUNK
-
     return _sum(model.memory(replace(w, rays=max(w.rays, 1)), CHUNK) for w in works)
 
 

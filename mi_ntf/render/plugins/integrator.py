@@ -1,20 +1,12 @@
 """The ``nrf`` integrator."""
 
-import itertools
-import time
-
-import drjit as dr
 import mitsuba as mi
 
-from ...core.errors import MiNtfError, root
+from ...core.errors import root
 from ...infer.visibility import names
-from ..scene.camera import Camera, Reconstruction
-from ..transport import aovs, camera_light
-from ..transport.composition import Composition
+from ..scene.settings import Limits
+from ..transport import aovs, rendering
 from . import properties
-
-CHUNK = 1 << 18
-"""Camera rays in flight: bounds the memory at about half a GiB whatever the image and the number of lights."""
 
 
 def integrator_class() -> type:
@@ -54,12 +46,21 @@ def integrator_class() -> type:
                                     ``roughness``, ``opacity``, ``visibility``, ``visibility_lights``: see
                                     :mod:`mi_ntf.render.transport.aovs` (default: none)
         hide_emitters       boolean leave the environment and shapes that shine out of the picture (default: false)
+        noise_threshold     float   Monte Carlo noise to render down to, on the scale of Cycles: |I − A| over √I, A of
+                                    half of the samples, mean over lit pixels; 0: the sampler's sample_count
+                                    (default: 0)
+        time_budget         float   seconds that a render may take, maps and compilation included; 0 or below: any
+                                    (default: 0)
         timeout             float   seconds after which rendering ends with what is there; below 0: never (default: -1)
         =================== ======= ===================================================================================
 
         At `max_depth` 2 light scatters once: camera ray → point → light, with L = ∫ τ σ h dt (Bi et al. 2020, eq. 2).
         Alpha is the opacity. Every camera ray carries its whole distribution of depths, so 16 samples per pixel look
         like thousands of a path tracer.
+
+        With `noise_threshold` or `time_budget`, samples are added in passes until the first of them is reached,
+        whatever `sample_count` says; the film is right after every pass. What came of it is logged and is the attribute
+        ``achieved``.
 
         Any number of ``nrf`` media, which may overlap (densities add), and ordinary shapes with any BSDF: all hide,
         shade and, from `max_depth` 3 on, light each other. Shadow rays of surfaces are marched where `visibility` is a
@@ -91,6 +92,9 @@ def integrator_class() -> type:
             self.bounces = read.choice("bounces", "auto", ("auto", "paths", "radiosity"))
             self.aovs = aovs.parse(read.text("aovs", ""))
             read.flag("hide_emitters", False)
+            self.limits = Limits(noise=read.number("noise_threshold", 0.0, 0.0, 1e6),
+                                 seconds=max(read.number("time_budget", 0.0), 0.0))
+            self.achieved = {}  # by the last render
             self.lights_seen = 0
             self.patches = None  # of the fields rendered last, by radiosity
             props["timeout"] = -1.0
@@ -99,7 +103,7 @@ def integrator_class() -> type:
         def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             try:
-                return _render(self, scene, sensor, seed, spp, develop)
+                return rendering.render(self, scene, sensor, seed, spp, develop)
             except RuntimeError as error:
                 raise root(error) from None
 
@@ -116,87 +120,8 @@ def integrator_class() -> type:
                 f"  map_components = {self.map_components},\n  map_memory = {self.map_memory},\n"
                 f"  map_file = {self.map_file},\n"
                 f"  max_depth = {self.max_depth},\n  bounces = {self.bounces},\n  aovs = {', '.join(self.aovs)},\n"
-                f"  hide_emitters = {self.hide_emitters},\n  timeout = {self.timeout}\n]"
+                f"  hide_emitters = {self.hide_emitters},\n  noise_threshold = {self.limits.noise},\n"
+                f"  time_budget = {self.limits.seconds},\n  timeout = {self.timeout}\n]"
             )
 
     return NRFIntegrator
-
-
-def _render(self, scene, sensor, seed: int, spp: int, develop: bool):
-    """Camera rays → radiance and opacity → film."""
-    if dr.flag(dr.JitFlag.FreezingScope):
-        raise MiNtfError(
-            "nrf integrator: dr.freeze cannot record a render whose number of shading points is known only while it "
-            "runs; call mi.render outside of frozen functions (its kernels are cached all the same)"
-        )
-    start = time.monotonic()
-    camera = Camera(sensor, spp)
-    film = camera.film
-    composition = Composition(scene, self, sensor, camera.spp)
-    picture = None
-    if self.aovs:
-        self.lights_seen = len(composition.lights.rows.power)
-        picture = aovs.Picture(camera, self.aovs, self.lights_seen)
-    film.prepare(picture.names if picture else [])
-    block = film.create_block()
-    block.set_offset(film.crop_offset())
-    _trace(self, composition, Reconstruction(block, camera), picture, seed, start)
-    if picture:
-        picture.write_to(block)
-    film.put_block(block)
-    if not develop:
-        return mi.TensorXf()
-    image = film.develop()
-    return image + _no_slope(scene) if composition.effects.gradients and not dr.grad_enabled(image) else image
-
-
-def _trace(self, composition, pixels: Reconstruction, picture, seed: int, start: float) -> None:
-    """Camera rays in chunks of pixels: lights in runs whose maps fit into memory, and for each the same rays."""
-    camera = pixels.camera
-    alpha = mi.has_flag(camera.film.flags(), mi.FilmFlags.Alpha)
-    chunks = range(0, camera.count, max(1, CHUNK // camera.spp))
-    for run, first in itertools.product(range(len(composition.runs)), chunks):
-        if self.should_stop() or (self.timeout > 0 and time.monotonic() - start > self.timeout):
-            _stop(pixels, run, first, len(composition.runs))
-            break
-        composition.select(run)
-        count = min(chunks.step, camera.count - first)
-        # Another stream for each chunk and seed; opaque, so that no seed is compiled into a kernel.
-        stream = mi.sample_tea_32(_opaque(seed), _opaque(first))[0]
-        ray, weight, position = camera.rays(first, count, stream)
-        sums = picture and picture.sums(dr.width(ray), run, composition.runs[run])
-        with composition.lights.bare():
-            radiance, opacity = camera_light.trace(composition, ray, camera.quadrature(count), stream, sums)
-        once = [*([opacity] if alpha else []), dr.ones(mi.Float, dr.width(ray))]
-        pixels.add(first, position, [*(radiance * weight), *([None] * len(once) if run else once)])
-        if picture and sums:
-            picture.put(first, position, sums)
-
-
-def _no_slope(scene):
-    """0, attached to every attached parameter of `scene`: of a picture in which none of them shows, derivatives are 0;
-    Dr.Jit would take a detached one for a mistake of the caller."""
-    attached = [value for _, value in mi.traverse(scene) if dr.grad_enabled(value)]
-    zero = dr.opaque(mi.Float, 0)  # a literal one would detach
-    return sum((zero * dr.sum(dr.ravel(getattr(value, "matrix", value))) for value in attached), zero)
-
-
-def _stop(pixels: Reconstruction, run: int, first: int, runs: int) -> None:
-    """Rendering ends before source pixel `first` of `run`: pixels that not all runs of lights have reached stay
-    empty."""
-    last = run == runs - 1
-    if runs > 1:
-        pixels.keep(first if last else 0)
-    mi.Log(  # type: ignore[operator]  # an object in the stub
-        mi.LogLevel.Warn,
-        f"nrf integrator: stopped after {first if last else 0} of {pixels.camera.count} pixels"
-        + ("" if last else f", in run {run + 1} of {runs} of the lights: more map_memory needs fewer runs"),
-    )
-
-
-def _opaque(seed):
-    """A seed, Python number (from Python) or array (from the stock program), or the number of a pixel, as a value that
-    no kernel contains."""
-    value = mi.UInt32(seed)
-    dr.make_opaque(value)
-    return value

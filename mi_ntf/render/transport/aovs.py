@@ -222,6 +222,11 @@ class Picture:
         self.block = mi.ImageBlock(film.crop_size(), film.crop_offset(), len(self.names) + 2, film.rfilter())
         self._pixels = Reconstruction(self.block, camera)
 
+    def seen_by(self, camera: Camera) -> "Picture":
+        """This picture, for the samples of another pass."""
+        self._pixels = Reconstruction(self.block, camera)
+        return self
+
     def sums(self, rays: int, run: int, lights: tuple[int, int] | None) -> Sums | None:
         """For camera rays lit by the run `run` of lights (first, last), None: all of them; None where a later run has
         nothing to add."""
@@ -233,13 +238,13 @@ class Picture:
         """Add the rays' sums, as :meth:`mi_ntf.render.scene.camera.Reconstruction.add`."""
         self._pixels.add(first, position, sums.values())
 
-    def write_to(self, block) -> None:
-        """Fill the extra channels of the film's `block`, which hold 0 so far. The film divides all by the sum of its
-        filter's weights, so values are written times that."""
+    def write_to(self, block, weights: list) -> None:
+        """Fill the extra channels of the film's `block`. The film divides all by the sum of its filter's weights, those
+        of `block` and of others, `weights` in all, so values are written times that."""
         ours, theirs = self.block.tensor(), block.tensor()
         width, base = theirs.shape[2], theirs.shape[2] - len(self.names)
         pixel = dr.arange(mi.UInt32, theirs.shape[0] * theirs.shape[1])
-        filtered = dr.gather(mi.Float, theirs.array, pixel * width + (base - 1))
+        filtered = sum(weights)
         sums = [dr.gather(mi.Float, ours.array, pixel * ours.shape[2] + i) for i in range(ours.shape[2])]
         *sums, stopped, by_fields = sums
         first = 0

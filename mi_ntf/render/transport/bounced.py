@@ -56,7 +56,7 @@ class Patches:
         n, nothing = dr.width(o), (np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, int))
         if not n:
             return [nothing] * len(self.skins)
-        steps = min(radiosity.STEPS, composition.integrator.samples)
+        steps = min(radiosity.STEPS, composition.settings.samples)
         hit, t, which = composition.fly(mi.Ray3f(mi.Point3f(o), d), dr.full(mi.Float, dr.inf, n),
                                         mi.Float(rng.random(n)), mi.Float(radiosity.DEPTH), mi.Float(0.5), steps)
         dr.eval(hit, t, which)

@@ -119,7 +119,7 @@ class _CameraLight:
         """Adds the light of surfaces that the camera sees, and of paths of more than one bounce."""
         ray, hit, surfaces = self.ray, self.hit, self.scene.surfaces
         n = dr.width(ray.o)
-        walk = Walk(self.scene, self.scene.integrator.max_depth, self.total, self.stream)
+        walk = Walk(self.scene, self.scene.settings.max_depth, self.total, self.stream)
         # Neighbouring sequences of one start are alike.
         start, sequence = mi.sample_tea_32(self.stream, dr.arange(mi.UInt32, n))
         rng = mi.PCG32(n, mi.UInt64(start), mi.UInt64(sequence))

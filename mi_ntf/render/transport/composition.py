@@ -16,6 +16,7 @@ from ..lights import scene_lights
 from ..maps import building
 from ..scene import effects
 from ..scene.media import find_media, ordinary_shapes
+from ..scene.settings import Settings
 from .bounced import Bounced, Patches
 from .shadow import Known, Shadow, between
 from .surfaces import Surfaces
@@ -43,13 +44,14 @@ class Part:
 
 
 class Composition:
-    """The scene prepared for one render. What it lacks is not built (:mod:`mi_ntf.render.scene.effects`)."""
+    """The scene prepared for one render. What it lacks is not built (:mod:`mi_ntf.render.scene.effects`). `patches`:
+    of an earlier render of the same fields, None unless they are needed."""
 
-    def __init__(self, scene, integrator, sensor, spp: int):
-        self.scene, self.integrator = scene, integrator
+    def __init__(self, scene, settings: Settings, sensor, spp: int, patches: Patches | None = None):
+        self.scene, self.settings, self.patches = scene, settings, patches
         media = find_media(scene)
-        self.lights = scene_lights.Lights(scene, media, integrator.light_samples, integrator.environment_lights)
-        self.effects = effects.describe(scene, integrator, sensor, spp, media, self.lights)
+        self.lights = scene_lights.Lights(scene, media, settings.light_samples, settings.environment_lights)
+        self.effects = effects.describe(scene, settings, sensor, spp, media, self.lights)
         self._media = [m for m in media if m.field.grid.majorant > 0]
         self._seen = [m for m, visible in zip(media, self.effects.in_view, strict=True) if visible]
         self.runs, self.run = self._runs(), -1  # none yet
@@ -57,13 +59,13 @@ class Composition:
         self.surfaces = None
         if self.effects.surfaces:
             shapes = ordinary_shapes(scene)
-            self.surfaces = Surfaces(scene, shapes, integrator.hide_emitters, self.transmittance)
+            self.surfaces = Surfaces(scene, shapes, settings.hide_emitters, self.transmittance)
         self.bounced = None
         if self.effects.bounces == "radiosity" and self.parts:
             with measurement.by_clock("bounces"):
-                if not integrator.patches or not integrator.patches.of(self):
-                    integrator.patches = Patches(self)
-                self.bounced = self.with_all_lights(lambda: Bounced(self, integrator.patches, integrator.max_depth))
+                found = patches if patches and patches.of(self) else Patches(self)
+                self.bounced = self.with_all_lights(lambda: Bounced(self, found, settings.max_depth))
+                self.patches = found
 
     def _runs(self) -> list:
         """Runs of the table's lights, (first, last), whose maps fit into memory together; [None] for all at once, as
@@ -72,7 +74,7 @@ class Composition:
         if not self._media or not found.lit or not found.needs_visibility:
             return [None]
         table = self.lights.table(self._media[0].frame)
-        options = building.options(self.integrator)
+        options = building.options(self.settings)
         runs = building.parts(found.visibility, self._media, table, options)
         if found.gradients and len(runs) > 1:
             size = sum(building.size_per_light(found.visibility, m, table, options) for m in self._media)
@@ -98,7 +100,7 @@ class Composition:
         if not found.lit or not found.needs_visibility:
             return Part(medium, whole, whole, None, None)
         table = whole.part(*self.runs[self.run]) if len(self.runs) > 1 else whole
-        options = building.options(self.integrator)
+        options = building.options(self.settings)
         drawn = REGISTRY[found.visibility].for_drawn
         if table.moving and not REGISTRY[drawn].derivatives:
             drawn = "raymarch"
@@ -118,7 +120,7 @@ class Composition:
 
     def strands(self, ray, parts, steps=None):
         """``(strands, unit)`` of scene rays through `parts`: t counts in `unit`, scene lengths. `steps` across the unit
-        sphere's diameter: the integrator's `samples` unless told."""
+        sphere's diameter: the settings' `samples` unless told."""
         several = len(parts) > 1
         unit = min(p.frame.length for p in parts)
         result = [
@@ -127,7 +129,7 @@ class Composition:
                 p.medium.field.grid,
                 p.frame.point_to_field(ray.o),
                 p.frame.direction_to_field(ray.d),
-                dr.opaque(mi.Float, 2 / (steps or self.integrator.samples)),
+                dr.opaque(mi.Float, 2 / (steps or self.settings.samples)),
                 dr.opaque(mi.Float, unit / p.frame.length) if several else None,
             )
             for p in parts

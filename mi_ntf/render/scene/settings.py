@@ -1,0 +1,50 @@
+"""What the properties of an ``nrf`` integrator say, apart from the plugin: others can be tried in their place."""
+
+from dataclasses import dataclass, fields, replace
+
+
+@dataclass(frozen=True)
+class Settings:
+    """As in the plugin's table. `specular`: specular lobes take part where there are any."""
+
+    visibility: str
+    samples: int
+    light_samples: int
+    environment_lights: int
+    map_resolution: int
+    map_source: str
+    map_components: int
+    map_memory: float
+    map_file: str
+    max_depth: int
+    bounces: str
+    hide_emitters: bool
+    specular: bool = True
+
+    @classmethod
+    def of(cls, integrator) -> "Settings":
+        """Those of an integrator, or of other settings."""
+        return cls(**{f.name: getattr(integrator, f.name) for f in fields(cls) if hasattr(integrator, f.name)})
+
+    def but(self, **changed) -> "Settings":
+        """These with others in place of some."""
+        return replace(self, **changed)
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What ends a render, the first that is reached; 0: none of the kind.
+
+    noise    Monte Carlo noise (:func:`mi_ntf.render.transport.passes.noise`)
+    error    bias against ``raymarch``, relative RMSE of the picture
+    seconds  from the call of ``render`` on, everything included
+    """
+
+    noise: float = 0.0
+    error: float = 0.0
+    seconds: float = 0.0
+
+    @property
+    def of_samples(self) -> bool:
+        """Whether the number of samples is found while rendering."""
+        return self.noise > 0 or self.seconds > 0
