@@ -15,6 +15,8 @@ from ..maps import building
 from ..plugins.registration import load_scene
 from ..scene import effects
 from ..scene.media import find_media, ordinary_shapes
+from ..scene.settings import Limits, Settings
+from ..transport import choosing
 from ..transport.rendering import CHUNK
 from . import calibration
 
@@ -26,8 +28,9 @@ def explain(scene: Path, parameters: dict[str, str], measure: bool = False) -> d
     ``lights``; their ``radius_degrees``, see :class:`mi_ntf.render.lights.environment.Cells`; the bound on the error of
     an unshadowed surface's irradiance, in percent of all light of that environment), ``effects``: name → ``{"on": bool,
     "why": str}``; ``constants``: where the prices of the machine are from; ``seconds``: predicted, by stage;
-    ``memory_bytes`` of what is held beside the film. With `measure`, measures the machine's prices and renders:
-    ``measured``, see :func:`mi_ntf.render.cost.measurement.measure`. Raises MiNtfError where rendering would.
+    ``memory_bytes`` of what is held beside the film; ``choice`` under limits: what was looked at, and predicted for it.
+    With `measure`, measures the machine's prices and renders: ``measured``, see
+    :func:`mi_ntf.render.cost.measurement.measure`. Raises MiNtfError where rendering would.
     """
     loaded = load_scene(scene, parameters)
     integrator, media = loaded.integrator(), find_media(loaded)
@@ -36,11 +39,17 @@ def explain(scene: Path, parameters: dict[str, str], measure: bool = False) -> d
     sensor = loaded.sensors()[0]
     width, height = (int(v) for v in sensor.film().crop_size())
     spp = sensor.sampler().sample_count()
-    light = scene_lights.Lights(loaded, media, integrator.light_samples, integrator.environment_lights)
-    found = effects.describe(loaded, integrator, sensor, spp, media, light)
+    settings = Settings.of(integrator)
+    chooser = choosing.Chooser(loaded, settings, integrator.limits, sensor, spp, None)
+    choice = chooser.choose() if integrator.limits != Limits() else None
+    if choice:
+        settings, light, found = choice.composition.settings, choice.composition.lights, choice.effects
+    else:
+        light = scene_lights.Lights(loaded, media, settings.light_samples, settings.environment_lights)
+        found = effects.describe(loaded, settings, sensor, spp, media, light)
     count = light.table(media[0].frame).count
-    drawn = effects.drawn(integrator, light)
-    work = _works(integrator, media, found, width * height * spp, count, drawn)
+    drawn = effects.drawn(settings, light)
+    work = _works(settings, media, found, width * height * spp, count, drawn)
     report = {
         "scene": str(scene),
         "image": {"width": width, "height": height, "spp": spp},
@@ -49,12 +58,13 @@ def explain(scene: Path, parameters: dict[str, str], measure: bool = False) -> d
         "lights": {"emitters": list(found.emitters), "count": count, "drawn": drawn},
         "environments": [_environment(each) for each in light.discrete if each.cells],
         "visibility": found.visibility,
-        "effects": _effects(loaded, found, integrator, count),
+        "effects": _effects(loaded, found, settings, count),
         "constants": "measured on this machine" if model.measured() else "built in; --measure measures this machine's",
         "points": sum(w.points for w in work),
         "seconds": _sum(model.seconds(w, model.constants()) for w in work),
-        "memory_bytes": _memory(work) | {"maps or volumes": _held(integrator, media, found, light)},
+        "memory_bytes": _memory(work) | {"maps or volumes": _held(settings, media, found, light)},
     }
+    report |= {"choice": choice.told()} if choice else {}
     return report | ({"measured": watch(loaded, integrator, spp)} if measure else {})
 
 
@@ -151,6 +161,12 @@ def print_table(report: dict) -> None:
     for name, effect in report["effects"].items():
         table.add_row(name, "yes" if effect["on"] else "–", effect["why"])
     console.print(table)
+    if report.get("choice", {}).get("trials"):
+        table = Table("tried", "predicted", "error", "verdict")
+        for trial in report["choice"]["trials"]:
+            error = "–" if math.isnan(trial["error"]) else f"{trial['error']:.2%}"
+            table.add_row(trial["name"], f"{trial['seconds']:.3g} s", error, trial["why"])
+        console.print(table)
     stages = {name: report["seconds"].get(name, 0.0) for name in real["stages"]} if real else report["seconds"]
     table = Table("stage", "predicted", *(["measured"] if real else []),
                   caption=f"prices of the machine: {report['constants']}; compilation is not counted")

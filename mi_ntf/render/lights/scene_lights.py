@@ -20,7 +20,12 @@ class Discrete:
     emitter: object
     kind: str
     rows: light_rows.Rows
-    cells: object = None
+    cells: Any = None
+
+    @property
+    def shining(self) -> int:
+        """Cells of an environment that have power."""
+        return int((self.cells.weight > 0).sum()) if self.cells else 0
 
     @classmethod
     def of(cls, emitter, kind: str, environment_lights: int) -> "Discrete":

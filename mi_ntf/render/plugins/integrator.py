@@ -49,6 +49,9 @@ def integrator_class() -> type:
         noise_threshold     float   Monte Carlo noise to render down to, on the scale of Cycles: |I − A| over √I, A of
                                     half of the samples, mean over lit pixels; 0: the sampler's sample_count
                                     (default: 0)
+        max_error           float   bias against ``raymarch`` that the picture may have, relative RMSE: some pixels are
+                                    rendered beforehand, ``auto`` takes the cheapest method that keeps to it, and what
+                                    the picture hardly shows is left out; 0: nothing is (default: 0)
         time_budget         float   seconds that a render may take, maps and compilation included; 0 or below: any
                                     (default: 0)
         timeout             float   seconds after which rendering ends with what is there; below 0: never (default: -1)
@@ -93,6 +96,7 @@ def integrator_class() -> type:
             self.aovs = aovs.parse(read.text("aovs", ""))
             read.flag("hide_emitters", False)
             self.limits = Limits(noise=read.number("noise_threshold", 0.0, 0.0, 1e6),
+                                 error=read.number("max_error", 0.0, 0.0, 1e6),
                                  seconds=max(read.number("time_budget", 0.0), 0.0))
             self.achieved = {}  # by the last render
             self.lights_seen = 0
@@ -121,6 +125,7 @@ def integrator_class() -> type:
                 f"  map_file = {self.map_file},\n"
                 f"  max_depth = {self.max_depth},\n  bounces = {self.bounces},\n  aovs = {', '.join(self.aovs)},\n"
                 f"  hide_emitters = {self.hide_emitters},\n  noise_threshold = {self.limits.noise},\n"
+                f"  max_error = {self.limits.error},\n"
                 f"  time_budget = {self.limits.seconds},\n  timeout = {self.timeout}\n]"
             )
 

@@ -10,6 +10,7 @@ from ...infer.visibility import REGISTRY
 from ..cost import model
 from . import gradient_checks
 from .media import ordinary_shapes
+from .settings import Settings
 
 PINHOLES = ("PerspectiveCamera",)
 """Cameras whose rays all pass one point: light from there goes the way of the view."""
@@ -58,34 +59,35 @@ class Effects:
         return self.lit and (not self.collocated or self.surfaces or bool(self.bounces))
 
 
-def describe(scene, integrator, sensor, spp: int, media: list, light) -> Effects:
+def describe(scene, settings: Settings, sensor, spp: int, media: list, light) -> Effects:
     """The effects of rendering `scene`, with its `media` and `light`
-    (:class:`mi_ntf.render.lights.scene_lights.Lights`), by an ``nrf`` integrator with `spp` camera rays a pixel."""
-    depth = integrator.max_depth
+    (:class:`mi_ntf.render.lights.scene_lights.Lights`), by an ``nrf`` integrator of `settings` with `spp` camera rays a
+    pixel."""
+    depth = settings.max_depth
     lit = bool(light.rows.power.size or light.sampled) and not 0 <= depth < 2
-    exhaustive = integrator.light_samples == 0
+    exhaustive = settings.light_samples == 0
     gradients = gradient_checks.check(scene, light)
     # Derivatives by a light's place need the light's own transmittance.
-    collocated = lit and not gradients and integrator.visibility != "none" and _at_camera(light, sensor, media)
+    collocated = lit and not gradients and settings.visibility != "none" and _at_camera(light, sensor, media)
     surfaces = len(ordinary_shapes(scene)) > 0
     width, height = sensor.film().crop_size()
-    bounces = _bounces(integrator, media, surfaces, gradients) if lit and not 0 <= depth <= 2 else ""
-    method, reason = _method(integrator, width * height * spp, media, light, surfaces, bounces)
+    bounces = _bounces(settings, media, surfaces, gradients) if lit and not 0 <= depth <= 2 else ""
+    method, reason = _method(settings, width * height * spp, media, light, surfaces, bounces)
     if collocated:
         reason += "; not needed where the camera's own transmittance is the light's"
     rims = [m.field.header.architecture.fresnel for m in media]
     return Effects(
         emitters=tuple(light.kinds),
         lit=lit,
-        background=scene.environment() is not None and not integrator.hide_emitters and depth != 0,
+        background=scene.environment() is not None and not settings.hide_emitters and depth != 0,
         exhaustive=exhaustive,
         visibility=method,
         reason=reason,
         collocated=collocated,
         in_view=_in_view(sensor, media),
         surfaces=surfaces,
-        specular=any(rims) or any(m.field.grid.gloss > MIN_GLOSS for m in media),
-        fresnel=any(rims),
+        specular=settings.specular and (any(rims) or any(m.field.grid.gloss > MIN_GLOSS for m in media)),
+        fresnel=settings.specular and any(rims),
         bounces=bounces,
         gradients=gradients,
     )

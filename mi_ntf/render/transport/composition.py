@@ -49,7 +49,7 @@ class Composition:
 
     def __init__(self, scene, settings: Settings, sensor, spp: int, patches: Patches | None = None):
         self.scene, self.settings, self.patches = scene, settings, patches
-        media = find_media(scene)
+        self.media = media = find_media(scene)
         self.lights = scene_lights.Lights(scene, media, settings.light_samples, settings.environment_lights)
         self.effects = effects.describe(scene, settings, sensor, spp, media, self.lights)
         self._media = [m for m in media if m.field.grid.majorant > 0]

@@ -10,8 +10,7 @@ import numpy as np
 from ...core.errors import MiNtfError
 from ..scene.camera import Camera, Reconstruction
 from ..scene.settings import Limits, Settings
-from . import aovs, camera_light, passes
-from .composition import Composition
+from . import aovs, camera_light, choosing, passes
 
 CHUNK = 1 << 18
 """Camera rays in flight: bounds the memory at about half a GiB whatever the image and the number of lights."""
@@ -27,7 +26,10 @@ def render(integrator, scene, sensor, seed, spp: int, develop: bool):
     counted = passes.Passes(integrator.limits)
     camera = Camera(sensor, spp)
     film = camera.film
-    composition = Composition(scene, Settings.of(integrator), sensor, camera.spp, integrator.patches)
+    chooser = choosing.Chooser(scene, Settings.of(integrator), integrator.limits, sensor, camera.spp,
+                               integrator.patches)
+    choice = chooser.choose()
+    composition = choice.composition
     integrator.patches = composition.patches
     picture = None
     if integrator.aovs:
@@ -48,7 +50,7 @@ def render(integrator, scene, sensor, seed, spp: int, develop: bool):
             break
         counted.done(camera.spp, halves.noise() if integrator.limits.noise > 0 else math.nan)
         samples = counted.next() if integrator.limits.of_samples else 0
-    integrator.achieved = _achieved(integrator.limits, composition, counted)
+    integrator.achieved = _achieved(integrator.limits, choice, counted)
     if not develop:
         return mi.TensorXf()
     image = film.develop()
@@ -60,7 +62,8 @@ class _Halves:
 
     def __init__(self, film, extra: int):
         """`extra`: channels behind the film's own, the last of which are the filter's weights."""
-        self._film, self._extra, self._blocks, self._samples = film, extra, [], [0, 0]
+        self._film, self._extra, self._samples = film, extra, [0, 0]
+        self._blocks: list = []
 
     def block(self):
         """An empty one for a pass."""
@@ -149,18 +152,20 @@ def _stop(pixels: Reconstruction, run: int, first: int, runs: int) -> None:
     )
 
 
-def _achieved(limits: Limits, composition, counted: passes.Passes) -> dict:
+def _achieved(limits: Limits, choice: choosing.Choice, counted: passes.Passes) -> dict:
     """What came of the limits; logged where there are any."""
+    effects = choice.effects
     found = {
-        "visibility": composition.effects.visibility, "reason": composition.effects.reason, "spp": counted.count,
-        "passes": counted.passes, "noise": counted.noise, "seconds": counted.seconds, "ended": counted.ended,
+        "visibility": effects.visibility, "reason": effects.reason, "spp": counted.count, "passes": counted.passes,
+        "noise": counted.noise, "seconds": counted.seconds, "ended": counted.ended, **choice.told(),
     }
     if limits != Limits():
         noise = "" if math.isnan(counted.noise) else f", noise {counted.noise:.3g}"
+        said = "".join(f"; {t.name}: {t.seconds:.2g} s, {t.error:.2%} off, {t.why}" for t in choice.trials)
         mi.Log(  # type: ignore[operator]  # an object in the stub
             mi.LogLevel.Info,
             f"nrf integrator: {counted.count} samples a pixel in {counted.passes} passes and {counted.seconds:.3g} s"
-            f"{noise}; ended by {counted.ended}; visibility {found['visibility']}, {found['reason']}")
+            f"{noise}; ended by {counted.ended}; visibility {found['visibility']}, {found['reason']}{said}")
     return found
 
 
