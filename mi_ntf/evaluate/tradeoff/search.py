@@ -1,0 +1,223 @@
+"""Which point to measure next: points are tried where the Pareto front of seconds and error is unknown, not on a grid.
+
+Each method begins with the scene's own dials. From then on candidates are the neighbours of what is measured, coarse
+steps first. For each candidate there is a hope: the seconds predicted for it and the least error that one may expect of
+it. Its worth is the area that the hope would add to what the front dominates, on log axes, for each second that
+measuring it takes. A candidate whose hope adds nothing is not tried; when none is left, half steps are; then, with what
+is left of the budget, curves of methods off the front are drawn further.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+
+from ...infer.visibility import REGISTRY
+from .measure import CHEAP, REPEATS
+from .points import STOCK, Limits, Point, neighbours
+
+LEAST_GAIN = 0.01
+"""Area on log axes, in decades squared, below which a hope is not worth a measurement."""
+WORST = 0.3
+"""Error from which on none is told from another: such pictures are of no use."""
+START_SHARE = 1 / 40
+"""Of the budget, that the renderings of a method's first point may take: it has fewer samples a pixel otherwise."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """What is known of a measured point. Seconds: `build`, `render`; relative `noise` and `bias` of a picture;
+    `failed`: nothing is known but that it did not work."""
+
+    build: float = 0.0
+    render: float = 0.0
+    noise: float = 1.0
+    bias: float = 1.0
+    failed: bool = False
+
+    @property
+    def seconds(self) -> float:
+        return self.build + self.render
+
+    @property
+    def error(self) -> float:
+        return math.hypot(self.noise, self.bias)
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A point to measure. `seconds`: predicted for one picture; `cost`: for its whole measurement; `why`: for the
+    reader."""
+
+    point: Point
+    seconds: float
+    cost: float
+    why: str
+
+
+def front(results: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Those of ``(seconds, error)`` pairs that no other is at least as good as in both and better in one; by
+    seconds."""
+    best: list[tuple[float, float]] = []
+    for seconds, error in sorted(set(results)):
+        if not best or error < best[-1][1]:
+            best.append((seconds, error))
+    return best
+
+
+def area(results: Iterable[tuple[float, float]], horizon: float) -> float:
+    """Decades squared that the front of ``(seconds, error)`` pairs dominates, up to `horizon` seconds and `WORST`."""
+    total, ends = 0.0, front((t, e) for t, e in results if t < horizon and e < WORST)
+    for i, (seconds, error) in enumerate(ends):
+        above = ends[i - 1][1] if i else WORST
+        total += (math.log10(above) - math.log10(error)) * (math.log10(horizon) - math.log10(seconds))
+    return total
+
+
+class Search:
+    """Proposes points and hears what came of them.
+
+    base       the scene's own point, whose `method` is not read
+    methods    names to try
+    limits     of the dials
+    predict    point → ``(build, render)`` seconds, up to a factor that is learnt; raises where it cannot be rendered
+    budget     seconds of all measurements
+    compile    seconds that a new kernel takes, about
+    """
+
+    def __init__(self, base: Point, methods: Iterable[str], limits: Limits,
+                 predict: Callable[[Point], tuple[float, float]], budget: float, compile: float = 2.0):
+        self.base, self.limits, self.budget, self._predict, self._compile = base, limits, budget, predict, compile
+        self.results: dict[Point, Result] = {}
+        self.skipped: dict[Point, Proposal] = {}
+        self._methods = list(methods)
+        self._known: dict[Point, tuple[float, float] | None] = {}
+
+    def add(self, point: Point, result: Result) -> None:
+        """What came of measuring `point`."""
+        self.results[point] = result
+
+    def next(self, left: float) -> Proposal | None:
+        """The point to measure next with `left` seconds of the budget; None if nothing is left to learn in time. What
+        would take longer is remembered in `skipped`."""
+        for find in (self._first, lambda: self._hopes(False), lambda: self._hopes(True), self._curves):
+            for proposal in find():
+                if proposal.cost <= left:
+                    self.skipped.pop(proposal.point, None)
+                    return proposal
+                if find != self._curves:
+                    self.skipped.setdefault(proposal.point, proposal)
+        return None
+
+    def _first(self) -> Iterator[Proposal]:
+        """Every method's first point, cheap ones first."""
+        found = []
+        for method in self._methods:
+            if any(p.method == method for p in (*self.results, *self.skipped)):
+                continue
+            point = self._start(method)
+            if self._seconds(point):
+                found.append(self._proposal(point, "the method's default"))
+        yield from sorted(found, key=lambda p: p.cost)
+
+    def _start(self, method: str) -> Point:
+        """The scene's own dials, with fewer samples a pixel where those would take too much of the budget."""
+        point = replace(self.base, method=method)
+        if method == STOCK:
+            point = Point(STOCK, self.base.spp, self.base.max_depth)
+        elif REGISTRY[method].drawn:
+            point = replace(point, light_samples=0)
+        while point.spp > 1 and _renderings((self._seconds(point) or (0, 0))[1]) > START_SHARE * self.budget:
+            point = replace(point, spp=max(1, point.spp // 4))
+        return point
+
+    def _hopes(self, fine: bool) -> list[Proposal]:
+        """Neighbours of measured points that may lie on the front, by what they may be worth a second."""
+        known = [(r.seconds, r.error) for r in self.results.values() if not r.failed]
+        now = area(known, self.budget)
+        found: dict[Point, tuple[float, Proposal]] = {}
+        for point, result in self.results.items():
+            if result.failed:
+                continue
+            for other, dial, way in neighbours(point, self.limits, fine):
+                if not self._open(other):
+                    continue
+                proposal = self._proposal(other, f"{dial} {getattr(point, dial)} → {getattr(other, dial)}")
+                hope = (max(proposal.seconds, 1e-4), hoped_error(point, result, other, dial, way))
+                gain = area([*known, hope], self.budget) - now
+                worth = gain / proposal.cost
+                if gain > LEAST_GAIN and worth > found.get(other, (0.0, proposal))[0]:
+                    found[other] = (worth, proposal)
+        return [proposal for _, proposal in sorted(found.values(), key=lambda pair: -pair[0])]
+
+    def _curves(self) -> list[Proposal]:
+        """More samples a pixel for methods whose curve is short, cheap ones first."""
+        found = []
+        for method in self._methods:
+            own = [p for p in self.results if p.method == method and not self.results[p].failed]
+            if own:
+                last = max(own, key=lambda p: p.spp)
+                more = replace(last, spp=4 * last.spp)
+                if self._open(more) and len({p.spp for p in own}) < 4:
+                    found.append(self._proposal(more, "to draw the method's curve"))
+        return sorted(found, key=lambda p: p.cost)
+
+    def _open(self, point: Point) -> bool:
+        """Whether it may be measured: it was not, and its settings did not fail."""
+        if point in self.results or point.spp < 1:
+            return False
+        failed = any(r.failed and p.settings == point.settings for p, r in self.results.items())
+        return not failed and self._seconds(point) is not None
+
+    def _seconds(self, point: Point) -> tuple[float, float] | None:
+        """(build, render) predicted, scaled by the nearest measured point of the method; None where there is none."""
+        own = self._model(point)
+        if own is None:
+            return None
+        alike = [p for p, r in self.results.items() if not r.failed and p.method == point.method]
+        others = [p for p, r in self.results.items() if not r.failed and p.method != STOCK]
+        if not (alike or others) or (point.method == STOCK and not alike):
+            return own
+        nearest = min(alike or others, key=lambda p: _distance(p, point))
+        result, guess = self.results[nearest], self._model(nearest)
+        assert guess is not None  # it was measured
+        return own[0] * _ratio(result.build, guess[0]), own[1] * _ratio(result.render, guess[1])
+
+    def _model(self, point: Point) -> tuple[float, float] | None:
+        if point not in self._known:
+            try:
+                self._known[point] = self._predict(point)
+            except (ValueError, RuntimeError):
+                self._known[point] = None
+        return self._known[point]
+
+    def _proposal(self, point: Point, why: str) -> Proposal:
+        build, render = self._seconds(point) or (0.0, 0.0)
+        return Proposal(point, build + render, self._compile + build + _renderings(render), why)
+
+
+def _renderings(seconds: float) -> float:
+    """Seconds of all renderings that measure a point whose pictures take `seconds`."""
+    return (1 + REPEATS if seconds < CHEAP else 2) * seconds
+
+
+def hoped_error(point: Point, result: Result, other: Point, dial: str, way: int) -> float:
+    """The least error to be expected of `other`, one step of `dial` away from `point`: more samples take away noise;
+    dearer or other settings half of the bias; cheaper ones nothing."""
+    noise, bias = result.noise, result.bias
+    if dial == "spp":
+        return math.hypot(noise * math.sqrt(point.spp / other.spp), bias)
+    if dial == "light_samples" and way > 0:
+        return math.hypot(0.7 * noise, bias)
+    return math.hypot(noise, bias / 2 if way >= 0 else bias)
+
+
+def _distance(a: Point, b: Point) -> float:
+    """How many dials differ; more samples a pixel are nearly the same."""
+    names = ("max_depth", "samples", "light_samples", "environment_lights", "map_resolution", "map_source",
+             "map_components", "representation")
+    return sum(getattr(a, n) != getattr(b, n) for n in names) + 0.1 * abs(math.log2(a.spp / b.spp))
+
+
+def _ratio(measured: float, guess: float) -> float:
+    """Measured over guessed seconds, within a factor of 30."""
+    return min(max(measured / guess, 1 / 30), 30.0) if guess > 1e-6 and measured > 0 else 1.0
