@@ -7,7 +7,7 @@ import numpy as np
 from ...render.cost import model
 from . import errors
 from .points import STOCK
-from .search import front
+from .search import WORST, front
 
 THRESHOLDS = (0.1, 0.05, 0.02, 0.01)
 """Errors that readers ask for."""
@@ -37,7 +37,8 @@ def mark_front(rows: list[dict[str, Any]]) -> None:
 
 def knee(ends: list[dict[str, Any]]) -> dict[str, Any] | None:
     """The row of a front, sorted by seconds, that lies farthest below the straight line between its ends, on log axes;
-    None for fewer than three."""
+    None for fewer than three that are of any use."""
+    ends = [row for row in ends if row["error"] < WORST]
     if len(ends) < 3:
         return None
     x, y = (np.log([max(v, 1e-9) for v in values]) for values in (
@@ -120,8 +121,8 @@ def busy(rows: list[dict[str, Any]], cores: int) -> str:
     most = max((row["load"] for row in measured(rows)), default=0.0)
     if most <= cores + 1:
         return ""
-    return (f"Other work ran beside the study: up to {most:.0f} jobs on {cores} cores. Seconds are too high and uneven; "
-            "errors are what they are.")
+    return (f"Other work ran beside the study: up to {most:.0f} jobs on {cores} cores. Seconds are too high and "
+            "uneven, errors are as they are.")
 
 
 def machine() -> str:

@@ -24,10 +24,10 @@ FIRST_SEED = 1 << 20
 MANY_LIGHTS = 32
 """More lights than these are drawn for the reference, `DRAWN` a shading point, rather than summed: their noise goes the
 way of the pixel's own, and no environment is cut into cells."""
-DRAWN = 16
+DRAWN = 4
 SAMPLES = 192
 """Samples a pixel that the reference should have at least: the picture is shrunk until they fit."""
-PASSES = 6
+PASSES = 4
 SMALLEST = 48
 """Pixels along the shorter side below which no picture is shrunk."""
 TARGET = 0.003
@@ -171,7 +171,7 @@ def hold_against_stock(subject: Subject, picture: Picture, image: np.ndarray, se
             for group, render, samples in zip(pictures, (ours, stock), (max(1, spp // 4), spp), strict=True):
                 group.append(render(samples, FIRST_SEED + 500 + len(group))[0])
             share = time.perf_counter() - began
-            tell(f"reference against stock volpath on {crop[2]}×{crop[3]} pixels: {len(pictures[1]) * spp} samples a pixel")
+            tell(f"reference against stock volpath: {len(pictures[1]) * spp} samples a pixel")
         found: dict[str, Any] = errors.z_test(*pictures)
     except (MiNtfError, RuntimeError) as error:
         return {"reason": str(error), "verdict": f"Stock volpath could not be held against it: {error}",
@@ -216,7 +216,7 @@ def mesh(subject: Subject, path: Path, picture: Picture, shape: tuple[int, ...],
         raise MiNtfError(f"reference {path} has {image.shape[1]}×{image.shape[0]} pixels, the study's pictures "
                          f"{shape[1]}×{shape[0]}; give one of a whole multiple of them")
     image = image.reshape(shape[0], block, shape[1], block, 3).mean((1, 3))
-    return Reference(image, 0.0, 0, 1, 0.0, f"{path.name}, its noise not known")
+    return Reference(image, 0.0, 0, 1, 0.0, f"{path.name}, whose own noise is not known")
 
 
 def _traced(subject: Subject, path: Path, picture: Picture, seconds: float) -> Reference:

@@ -229,7 +229,7 @@ def progress(budget: float, quiet: bool = False) -> Iterator:
         def tell(seconds: float, text: str, done: bool) -> None:
             bar.update(task, completed=min(seconds, budget), description=escape_markup(text))
             if done:
-                console.print(f"{seconds:5.0f} s  {text}", highlight=False, markup=False)
+                console.print(f"{seconds:5.0f} s  {text}", highlight=False, markup=False, soft_wrap=True)
 
         yield tell
 
@@ -251,7 +251,7 @@ def print_table(result: dict[str, Any]) -> None:
     table = Table("", "point", "build s", "render s", "error", "noise", "bias")
     for row in result["points"]:
         if row["reason"]:
-            table.add_row(str(row["number"]), row["label"], "failed:", row["reason"])
+            table.add_row(str(row["number"]), f"{row['label']}: failed, {row['reason']}")
             continue
         name = row["label"] + (" *" if row["front"] else "")
         table.add_row(str(row["number"]), name, f"{row['build']:.2f}", f"{row['render']:.3g}", f"{row['error']:.1%}",

@@ -1,24 +1,29 @@
 """Which point to measure next: points are tried where the Pareto front of seconds and error is unknown, not on a grid.
 
-Each method begins with the scene's own dials. From then on candidates are the neighbours of what is measured, coarse
-steps first. For each candidate there is a hope: the seconds predicted for it and the least error that one may expect of
-it. Its worth is the area that the hope would add to what the front dominates, on log axes, for each second that
-measuring it takes. A candidate whose hope adds nothing is not tried; when none is left, half steps are; then, with what
-is left of the budget, curves of methods off the front are drawn further.
+Each method begins with the scene's own dials, cheap methods first. Beside them, candidates are the neighbours of what
+is measured, coarse steps first, each with the samples a pixel of its neighbour and with more. For each candidate there
+is a hope: the seconds predicted for it and the least error that one may expect of it. Its worth is the area that the
+hope would add to what the front dominates, on log axes, for each second that measuring it takes. A candidate whose hope
+adds nothing is not tried; when none is left, half steps are; then, with what is left of the budget, curves of methods
+off the front are drawn further.
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 from ...infer.visibility import REGISTRY
 from .measure import CHEAP, REPEATS
-from .points import STOCK, Limits, Point, neighbours
+from .points import DIALS, STOCK, Limits, Point, dials, neighbours
 
+MORE = (1, 4, 16)
+"""Times the samples a pixel that another turn of a dial is tried with."""
 LEAST_GAIN = 0.01
 """Area on log axes, in decades squared, below which a hope is not worth a measurement."""
 WORST = 0.3
 """Error from which on none is told from another: such pictures are of no use."""
+FIRST_SHARE = 1 / 12
+"""Of the budget: methods whose first point takes more wait until nothing cheaper may teach as much a second."""
 START_SHARE = 1 / 40
 """Of the budget, that the renderings of a method's first point may take: it has fewer samples a pixel otherwise."""
 
@@ -91,56 +96,72 @@ class Search:
         self.skipped: dict[Point, Proposal] = {}
         self._methods = list(methods)
         self._known: dict[Point, tuple[float, float] | None] = {}
+        self._scaled: dict[Point, tuple[float, float] | None] = {}
 
     def add(self, point: Point, result: Result) -> None:
         """What came of measuring `point`."""
         self.results[point] = result
+        self._scaled.clear()
 
     def next(self, left: float) -> Proposal | None:
         """The point to measure next with `left` seconds of the budget; None if nothing is left to learn in time. What
         would take longer is remembered in `skipped`."""
-        for find in (self._first, lambda: self._hopes(False), lambda: self._hopes(True), self._curves):
-            for proposal in find():
+        firsts = self._firsts()
+        cheap = [p for p in firsts if p.cost <= FIRST_SHARE * self.budget]
+        for found in (cheap, self._hopes(False), firsts, self._hopes(True), self._curves()):
+            for proposal in found:
                 if proposal.cost <= left:
                     self.skipped.pop(proposal.point, None)
                     return proposal
-                if find != self._curves:
-                    self.skipped.setdefault(proposal.point, proposal)
+                self.skipped.setdefault(proposal.point, proposal)
         return None
 
-    def _first(self) -> Iterator[Proposal]:
+    def left_out(self) -> list[Proposal]:
+        """What was not measured for want of time: of each method the cheapest few."""
+        found: list[Proposal] = []
+        for proposal in sorted(self.skipped.values(), key=lambda p: p.cost):
+            alike = sum(p.point.method == proposal.point.method for p in found)
+            if proposal.point not in self.results and alike < 2:
+                found.append(proposal)
+        return found
+
+    def _firsts(self) -> list[Proposal]:
         """Every method's first point, cheap ones first."""
-        found = []
-        for method in self._methods:
-            if any(p.method == method for p in (*self.results, *self.skipped)):
-                continue
-            point = self._start(method)
-            if self._seconds(point):
-                found.append(self._proposal(point, "the method's default"))
-        yield from sorted(found, key=lambda p: p.cost)
+        begun = {p.method for p in self.results}
+        starts = [self._start(method) for method in self._methods if method not in begun]
+        found = [self._proposal(p, "the method's default") for p in starts if self._seconds(p)]
+        return sorted(found, key=lambda p: p.cost)
 
     def _start(self, method: str) -> Point:
-        """The scene's own dials, with fewer samples a pixel where those would take too much of the budget."""
+        """The scene's own dials, with fewer samples a pixel where those would take too much of the budget, and with
+        drawn lights where one sample still does."""
         point = replace(self.base, method=method)
         if method == STOCK:
             point = Point(STOCK, self.base.spp, self.base.max_depth)
         elif REGISTRY[method].drawn:
             point = replace(point, light_samples=0)
+        found = self._fewer(point)
+        if self._proposal(found, "").cost > FIRST_SHARE * self.budget and "light_samples" in dials(point, self.limits):
+            drawn = self._fewer(replace(point, light_samples=point.light_samples or DIALS["light_samples"].first))
+            if self._proposal(drawn, "").cost < 0.5 * self._proposal(found, "").cost:
+                return drawn
+        return found
+
+    def _fewer(self, point: Point) -> Point:
+        """The same with so few samples a pixel as the budget asks for."""
         while point.spp > 1 and _renderings((self._seconds(point) or (0, 0))[1]) > START_SHARE * self.budget:
             point = replace(point, spp=max(1, point.spp // 4))
         return point
 
     def _hopes(self, fine: bool) -> list[Proposal]:
         """Neighbours of measured points that may lie on the front, by what they may be worth a second."""
-        known = [(r.seconds, r.error) for r in self.results.values() if not r.failed]
+        known = front((r.seconds, r.error) for r in self.results.values() if not r.failed)
         now = area(known, self.budget)
         found: dict[Point, tuple[float, Proposal]] = {}
         for point, result in self.results.items():
             if result.failed:
                 continue
-            for other, dial, way in neighbours(point, self.limits, fine):
-                if not self._open(other):
-                    continue
+            for other, dial, way in self._moves(point, fine):
                 proposal = self._proposal(other, f"{dial} {getattr(point, dial)} → {getattr(other, dial)}")
                 hope = (max(proposal.seconds, 1e-4), hoped_error(point, result, other, dial, way))
                 gain = area([*known, hope], self.budget) - now
@@ -148,6 +169,15 @@ class Search:
                 if gain > LEAST_GAIN and worth > found.get(other, (0.0, proposal))[0]:
                     found[other] = (worth, proposal)
         return [proposal for _, proposal in sorted(found.values(), key=lambda pair: -pair[0])]
+
+    def _moves(self, point: Point, fine: bool) -> list[tuple[Point, str, int]]:
+        """Neighbours that may be measured, and those of another dial with more samples a pixel besides: a dial that
+        makes pictures cheap shows what it is worth where samples are many."""
+        found = []
+        for other, dial, way in neighbours(point, self.limits, fine):
+            more = (1,) if dial == "spp" else MORE
+            found += [(replace(other, spp=other.spp * n), dial, way) for n in more]
+        return [move for move in found if self._open(move[0])]
 
     def _curves(self) -> list[Proposal]:
         """More samples a pixel for methods whose curve is short, cheap ones first."""
@@ -170,6 +200,11 @@ class Search:
 
     def _seconds(self, point: Point) -> tuple[float, float] | None:
         """(build, render) predicted, scaled by the nearest measured point of the method; None where there is none."""
+        if point not in self._scaled:
+            self._scaled[point] = self._scale(point)
+        return self._scaled[point]
+
+    def _scale(self, point: Point) -> tuple[float, float] | None:
         own = self._model(point)
         if own is None:
             return None
@@ -203,9 +238,9 @@ def _renderings(seconds: float) -> float:
 def hoped_error(point: Point, result: Result, other: Point, dial: str, way: int) -> float:
     """The least error to be expected of `other`, one step of `dial` away from `point`: more samples take away noise;
     dearer or other settings half of the bias; cheaper ones nothing."""
-    noise, bias = result.noise, result.bias
+    noise, bias = result.noise * math.sqrt(point.spp / other.spp), result.bias
     if dial == "spp":
-        return math.hypot(noise * math.sqrt(point.spp / other.spp), bias)
+        return math.hypot(noise, bias)
     if dial == "light_samples" and way > 0:
         return math.hypot(0.7 * noise, bias)
     return math.hypot(noise, bias / 2 if way >= 0 else bias)

@@ -27,10 +27,13 @@ print_table = report.print_table
 
 REFERENCE, CHECK, MESH = 0.35, 0.12, 0.05
 """Shares of the budget: the converged reference, its comparison with stock `volpath`, a mesh scene to be rendered."""
+CALIBRATED = 120.0
+"""Seconds of budget from which on the machine's prices are measured first, where they never were: seconds predicted by
+others' prices are off by factors."""
 UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 LEAST_BUDGET = 1.0
-PATIENCE = 4.0
-"""A rendering is stopped that takes so many times what was predicted."""
+PATIENCE, LEAST_PATIENCE = 4.0, 0.15
+"""A rendering is stopped that takes so many times what was predicted, and more than this share of the budget."""
 
 Tell = Callable[[float, str, bool], None]
 """Hears the seconds spent so far, what is done now, and whether it is done."""
@@ -83,7 +86,7 @@ class Study:
             self.tell(f"{label(proposal.point, self.subject.base)}: about {proposal.seconds:.2g} s")
             self._try(proposal)
             self._inform(search)
-        self._add("end", skipped=[_skipped(p, self.subject, self.budget - self.spent) for p in search.skipped.values()])
+        self._add("end", skipped=[_skipped(p, self.subject) for p in search.left_out()])
 
     def _add(self, kind: str, **values: Any) -> dict[str, Any]:
         """A finding, with the seconds since the one before it."""
@@ -95,6 +98,9 @@ class Study:
     def _prepare(self) -> None:
         """The size of the picture and the references."""
         share = REFERENCE * self.budget
+        if model.measured() is None and self.budget >= CALIBRATED:
+            self.tell("the machine's prices")
+            self.subject.calibrate()
         if not (found := self.state.one("picture")):
             self.tell("how large a picture the budget allows")
             picture, about = references.choose_picture(self.subject, 0.8 * share)
@@ -131,7 +137,7 @@ class Study:
         made = make()
         values = {k: v for k, v in asdict(made).items() if k != "image"}
         self._add(kind, **values, noise=made.noise, image=self.state.keep(kind, made.image))
-        self.tell(f"{kind}: {made.about}, noise {made.noise:.2%}", True)
+        self.tell(f"{kind}: {made.about}" + (f", noise {made.noise:.2%}" if made.variance else ""), True)
         return made
 
     def _search(self) -> Search:
@@ -173,7 +179,7 @@ class Study:
             return
         self.state.add("begun", name=name)
         try:
-            row |= self._measured(point, name, max(10.0, PATIENCE * proposal.seconds))
+            row |= self._measured(point, name, self._patience(proposal))
         except KeyboardInterrupt:
             self.state.add("interrupted", name=name)
             raise
@@ -181,6 +187,11 @@ class Study:
             row["reason"] = sentence(error)
         found = self._add("point", **row)
         self.tell(_told(found), True)
+
+    def _patience(self, proposal: Proposal) -> float:
+        """Seconds that one picture may take."""
+        share = max(PATIENCE * proposal.seconds, LEAST_PATIENCE * self.budget)
+        return max(5.0, min(share, self.budget - self.spent))
 
     def _measured(self, point: Point, name: str, timeout: float) -> dict[str, Any]:
         """The figures of a point's row."""
@@ -254,9 +265,9 @@ def _error(row: dict[str, Any]) -> errors.Error:
     return errors.Error(row["noise"], row["bias"], row["uncertainty"])
 
 
-def _skipped(proposal: Proposal, subject: Subject, left: float) -> dict[str, Any]:
+def _skipped(proposal: Proposal, subject: Subject) -> dict[str, Any]:
     return {"label": label(proposal.point, subject.base), "point": proposal.point.as_dict(),
-            "reason": f"skipped: measuring it would take about {proposal.cost:.0f} s, {max(left, 0):.0f} s were left"}
+            "reason": f"skipped: measuring it would take about {proposal.cost:.0f} s, which were not left"}
 
 
 def _told(row: dict[str, Any]) -> str:
