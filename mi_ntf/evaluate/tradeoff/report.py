@@ -131,7 +131,7 @@ def _curves(found: Page, rows, reference, pictures) -> None:
 
 def _figure(caption: str, image: str, difference: str | None) -> str:
     below = f'<img class="small" width="{WIDTH}" src="{difference}" alt="difference">' if difference else ""
-    return (f'<figure style="width:{WIDTH}px"><img class="small" width="{WIDTH}" src="{image}" alt="">{below}'
+    return (f'<figure style="width:{WIDTH + 24}px"><img class="small" width="{WIDTH}" src="{image}" alt="">{below}'
             f"<figcaption>{escape(caption)}</figcaption></figure>")
 
 
