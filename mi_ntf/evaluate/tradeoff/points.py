@@ -64,7 +64,8 @@ class Dial:
             return [] if fine else [(self.first, -1)]
         factor = math.sqrt(self.factor) if fine else self.factor
         found = [(round(value * factor), 1), (round(value / factor), -1)]
-        return [(v, way) for v, way in found if self.low <= v <= self.high and v != value]
+        steps = [(v, way) for v, way in found if self.low <= v <= self.high and v != value]
+        return steps + ([(self.unlimited, 1)] if self.unlimited is not None and value == self.first else [])
 
 
 DIALS = {
@@ -120,7 +121,7 @@ def neighbours(point: Point, limits: Limits, fine: bool = False) -> list[tuple[P
             if name == "environment_lights" and way > 0 and point.environment_lights >= limits.texels:
                 continue
             found.append((replace(point, **{name: value}), name, way))
-    if not fine and point.method != STOCK:
+    if not fine and point.method not in (STOCK, "none"):  # light that `none` scatters meets no field again
         if point.max_depth != 2 and limits.depth != 2:
             found.append((replace(point, max_depth=2), "max_depth", -1))
         if point.max_depth == 2 and limits.depth != 2:
@@ -135,7 +136,8 @@ def label(point: Point, base: Point) -> str:
     words = {
         "max_depth": "single scattering" if point.max_depth == 2 else f"depth {point.max_depth}",
         "samples": f"{point.samples} steps",
-        "light_samples": f"{point.light_samples} drawn lights" if point.light_samples else "all lights",
+        "light_samples": f"{point.light_samples} drawn light{'s' if point.light_samples > 1 else ''}"
+                         if point.light_samples else "all lights",
         "environment_lights": f"{point.environment_lights} environment lights",
         "map_resolution": f"maps of {point.map_resolution}²",
         "map_source": f"filled by the {point.map_source}",

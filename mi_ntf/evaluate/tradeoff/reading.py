@@ -61,8 +61,8 @@ def reading(rows: list[dict[str, Any]]) -> list[str]:
     found += _stock(rows)
     biased = [row for row in ends if row["bias"] > row["noise"] and row["bias"] ** 2 > 2 * row["uncertainty"]]
     if biased:
-        numbers = ", ".join(str(row["number"]) for row in biased)
-        found.append(f"On the front, no. {numbers} err by bias more than by noise: more samples do not help them.")
+        which = f"no. {', '.join(str(row['number']) for row in biased)}" if len(biased) < 6 else f"{len(biased)} points"
+        found.append(f"On the front, {which} err by bias more than by noise: more samples do not help there.")
     else:
         found.append("All of the front errs by noise more than by bias: more samples a pixel still help.")
     return found
@@ -89,7 +89,7 @@ def _stock(rows: list[dict[str, Any]]) -> list[str]:
         if row["point"]["method"] != STOCK:
             continue
         better = next((r for r in rows if r["front"] and r["error"] <= row["error"]), None)
-        if better is not None and better is not row and total(better) < total(row):
+        if better is not None and better is not row and 1.5 * total(better) < total(row):
             return [f"Stock volpath errs by {row['error']:.0%} after {total(row):.3g} s; {better['label']} errs no "
                     f"more after {total(better):.3g} s, {total(row) / total(better):.0f} times sooner."]
         return []

@@ -20,10 +20,12 @@ MORE = (1, 4, 16)
 """Times the samples a pixel that another turn of a dial is tried with."""
 LEAST_GAIN = 0.01
 """Area on log axes, in decades squared, below which a hope is not worth a measurement."""
-WORST = 0.3
+WORST = 0.2
 """Error from which on none is told from another: such pictures are of no use."""
-FIRST_SHARE = 1 / 12
-"""Of the budget: methods whose first point takes more wait until nothing cheaper may teach as much a second."""
+DEAR = 1 / 20
+"""Of the budget: a method whose first point takes more begins with drawn lights."""
+FIRST_SHARE = 1 / 10
+"""Of the budget: methods whose first point takes more wait until nothing else may teach as much a second."""
 START_SHARE = 1 / 40
 """Of the budget, that the renderings of a method's first point may take: it has fewer samples a pixel otherwise."""
 
@@ -96,19 +98,24 @@ class Search:
         self.skipped: dict[Point, Proposal] = {}
         self._methods = list(methods)
         self._known: dict[Point, tuple[float, float] | None] = {}
+        self._failed: set[Point] = set()
         self._scaled: dict[Point, tuple[float, float] | None] = {}
 
     def add(self, point: Point, result: Result) -> None:
         """What came of measuring `point`."""
         self.results[point] = result
         self._scaled.clear()
+        if result.failed:
+            self._failed.add(point.settings)
 
     def next(self, left: float) -> Proposal | None:
         """The point to measure next with `left` seconds of the budget; None if nothing is left to learn in time. What
         would take longer is remembered in `skipped`."""
         firsts = self._firsts()
         cheap = [p for p in firsts if p.cost <= FIRST_SHARE * self.budget]
-        for found in (cheap, self._hopes(False), firsts, self._hopes(True), self._curves()):
+        groups = (lambda: cheap, lambda: self._hopes(False, firsts), lambda: firsts, lambda: self._hopes(True, []),
+                  self._curves)
+        for found in (group() for group in groups):
             for proposal in found:
                 if proposal.cost <= left:
                     self.skipped.pop(proposal.point, None)
@@ -141,7 +148,7 @@ class Search:
         elif REGISTRY[method].drawn:
             point = replace(point, light_samples=0)
         found = self._fewer(point)
-        if self._proposal(found, "").cost > FIRST_SHARE * self.budget and "light_samples" in dials(point, self.limits):
+        if self._proposal(found, "").cost > DEAR * self.budget and "light_samples" in dials(point, self.limits):
             drawn = self._fewer(replace(point, light_samples=point.light_samples or DIALS["light_samples"].first))
             if self._proposal(drawn, "").cost < 0.5 * self._proposal(found, "").cost:
                 return drawn
@@ -153,21 +160,27 @@ class Search:
             point = replace(point, spp=max(1, point.spp // 4))
         return point
 
-    def _hopes(self, fine: bool) -> list[Proposal]:
-        """Neighbours of measured points that may lie on the front, by what they may be worth a second."""
-        known = front((r.seconds, r.error) for r in self.results.values() if not r.failed)
+    def _hopes(self, fine: bool, firsts: list[Proposal]) -> list[Proposal]:
+        """Neighbours of measured points, and `firsts`, that may lie on the front, by their worth a second."""
+        good = {point: result for point, result in self.results.items() if not result.failed}
+        known = front((r.seconds, r.error) for r in good.values())
         now = area(known, self.budget)
         found: dict[Point, tuple[float, Proposal]] = {}
-        for point, result in self.results.items():
-            if result.failed:
-                continue
+
+        def consider(proposal: Proposal, error: float) -> None:
+            gain = area([*known, (max(proposal.seconds, 1e-4), error)], self.budget) - now
+            worth = gain / proposal.cost
+            if gain > LEAST_GAIN and worth > found.get(proposal.point, (0.0, proposal))[0]:
+                found[proposal.point] = (worth, proposal)
+
+        for point, result in good.items():
+            tried = self._tried(point)
             for other, dial, way in self._moves(point, fine):
                 proposal = self._proposal(other, f"{dial} {getattr(point, dial)} → {getattr(other, dial)}")
-                hope = (max(proposal.seconds, 1e-4), hoped_error(point, result, other, dial, way))
-                gain = area([*known, hope], self.budget) - now
-                worth = gain / proposal.cost
-                if gain > LEAST_GAIN and worth > found.get(other, (0.0, proposal))[0]:
-                    found[other] = (worth, proposal)
+                consider(proposal, hoped_error(point, result, other, dial, way, tried))
+        least = min((r.noise * math.sqrt(p.spp) for p, r in good.items()), default=WORST)
+        for proposal in firsts:
+            consider(proposal, least / math.sqrt(proposal.point.spp))
         return [proposal for _, proposal in sorted(found.values(), key=lambda pair: -pair[0])]
 
     def _moves(self, point: Point, fine: bool) -> list[tuple[Point, str, int]]:
@@ -178,6 +191,13 @@ class Search:
             more = (1,) if dial == "spp" else MORE
             found += [(replace(other, spp=other.spp * n), dial, way) for n in more]
         return [move for move in found if self._open(move[0])]
+
+    def _tried(self, point: Point) -> int:
+        """How many other settings of the method err by the same bias or more: so often was it hoped to be less."""
+        bias = self.results[point].bias
+        alike = {p.settings for p, r in self.results.items()
+                 if p.method == point.method and not r.failed and r.bias >= 0.9 * bias}
+        return len(alike) - 1
 
     def _curves(self) -> list[Proposal]:
         """More samples a pixel for methods whose curve is short, cheap ones first."""
@@ -195,8 +215,7 @@ class Search:
         """Whether it may be measured: it was not, and its settings did not fail."""
         if point in self.results or point.spp < 1:
             return False
-        failed = any(r.failed and p.settings == point.settings for p, r in self.results.items())
-        return not failed and self._seconds(point) is not None
+        return point.settings not in self._failed and self._seconds(point) is not None
 
     def _seconds(self, point: Point) -> tuple[float, float] | None:
         """(build, render) predicted, scaled by the nearest measured point of the method; None where there is none."""
@@ -227,7 +246,7 @@ class Search:
 
     def _proposal(self, point: Point, why: str) -> Proposal:
         build, render = self._seconds(point) or (0.0, 0.0)
-        return Proposal(point, build + render, self._compile + build + _renderings(render), why)
+        return Proposal(point, build + render, self._compile + _renderings(build + render), why)
 
 
 def _renderings(seconds: float) -> float:
@@ -235,15 +254,16 @@ def _renderings(seconds: float) -> float:
     return (1 + REPEATS if seconds < CHEAP else 2) * seconds
 
 
-def hoped_error(point: Point, result: Result, other: Point, dial: str, way: int) -> float:
+def hoped_error(point: Point, result: Result, other: Point, dial: str, way: int, tried: int = 0) -> float:
     """The least error to be expected of `other`, one step of `dial` away from `point`: more samples take away noise;
-    dearer or other settings half of the bias; cheaper ones nothing."""
+    dearer or other settings half of the bias, less where other settings of the method, `tried` of them, did not;
+    cheaper ones nothing."""
     noise, bias = result.noise * math.sqrt(point.spp / other.spp), result.bias
     if dial == "spp":
         return math.hypot(noise, bias)
     if dial == "light_samples" and way > 0:
         return math.hypot(0.7 * noise, bias)
-    return math.hypot(noise, bias / 2 if way >= 0 else bias)
+    return math.hypot(noise, bias * (1 - 0.5 ** (1 + tried)) if way >= 0 else bias)
 
 
 def _distance(a: Point, b: Point) -> float:

@@ -27,9 +27,6 @@ print_table = report.print_table
 
 REFERENCE, CHECK, MESH = 0.35, 0.12, 0.05
 """Shares of the budget: the converged reference, its comparison with stock `volpath`, a mesh scene to be rendered."""
-CALIBRATED = 120.0
-"""Seconds of budget from which on the machine's prices are measured first, where they never were: seconds predicted by
-others' prices are off by factors."""
 UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 LEAST_BUDGET = 1.0
 PATIENCE, LEAST_PATIENCE = 4.0, 0.15
@@ -98,9 +95,6 @@ class Study:
     def _prepare(self) -> None:
         """The size of the picture and the references."""
         share = REFERENCE * self.budget
-        if model.measured() is None and self.budget >= CALIBRATED:
-            self.tell("the machine's prices")
-            self.subject.calibrate()
         if not (found := self.state.one("picture")):
             self.tell("how large a picture the budget allows")
             picture, about = references.choose_picture(self.subject, 0.8 * share)

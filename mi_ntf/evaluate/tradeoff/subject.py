@@ -10,7 +10,6 @@ from typing import Any
 import mitsuba as mi
 
 from ...core.errors import MiNtfError
-from ...render.commands import calibration
 from ...render.commands.explain import works
 from ...render.cost import model
 from ...render.lights import scene_lights
@@ -58,10 +57,6 @@ class Subject:
             self.own.environment_lights, self.own.map_resolution, self.own.map_source, self.own.map_components,
             media[0].representation)
         self.serves = {name: all(method.needs(m) for m in media) for name, method in model.REGISTRY.items()}
-
-    def calibrate(self) -> None:
-        """Measure the machine's prices and keep them."""
-        calibration.calibrate(find_media(load_scene(self.path, self.parameters))[0])
 
     def load(self, point: Point, picture: Picture):
         """The scene as `point` has it, without its integrator's own properties; `picture`: its film."""
