@@ -239,6 +239,14 @@ def test_the_crop_is_where_the_light_is():
     assert (width, height) == (8, 8) and x <= 10 and x + 8 >= 14 and y <= 20 and y + 8 >= 25
 
 
+@pytest.mark.parametrize(("p", "sigma", "said"), [
+    (0.5, 0.01, "no difference is found"), (0.03, 0.01, "a difference is likely"), (1e-4, 0.01, "is off by about"),
+    (1e-4, 0.05, "too noisy to tell differences below 10%")])
+def test_what_the_comparison_with_volpath_says(p, sigma, said):
+    found = {"difference": 0.02, "sigma": sigma, "z": 2.0, "p": p, "crop": [0, 0, 16, 16], "stock_spp": 64}
+    assert said in references.verdict(found) and "+2.00%" in references.verdict(found)
+
+
 @pytest.mark.parametrize(("text", "found"), [("90s", 90), ("5m", 300), ("1h", 3600), ("1.5m", 90)])
 def test_budgets(text, found):
     assert study.seconds(text) == found
@@ -258,7 +266,7 @@ def row(number, seconds, noise, bias, method="raymarch", **more):
 
 
 def test_the_curve_is_read():
-    rows = [row(0, 8.0, 0.008, 0.0), row(0, 1.0, 0.2, 0.0), row(0, 2.0, 0.01, 0.016), row(0, 3.0, 0.3, 0.0),
+    rows = [row(0, 8.0, 0.008, 0.0), row(0, 1.0, 0.15, 0.0), row(0, 2.0, 0.01, 0.016), row(0, 3.0, 0.3, 0.0),
             row(0, 100.0, 0.3, 0.0, "volpath"), {**row(0, 0, 0, 0), "reason": "why not"}]
     reading.mark_front(rows)
     assert [r["number"] for r in rows if r["front"]] == [1, 2, 4] and rows[-1]["reason"]

@@ -44,7 +44,8 @@ def test_uncertainty_is_the_spread_of_the_estimate(rng):
 
 def test_several_points_of_equal_settings_have_one_bias():
     pooled = errors.pooled([errors.Error(0.2, 0.0, 4e-4), errors.Error(0.05, 0.02, 1e-5)])
-    assert pooled == pytest.approx(0.02, rel=0.01)
+    assert pooled.bias == pytest.approx(0.02, rel=0.01) and pooled.noise == 0.05
+    assert pooled.uncertainty == pytest.approx(1e-5, rel=0.01)
 
 
 def test_one_picture_and_black_references_are_refused(rng):

@@ -118,13 +118,14 @@ def test_front_and_area():
     assert search.area([(1, search.WORST), (100, 0.01)], 100) == 0
 
 
-def test_hopes_take_away_noise_by_samples_and_half_of_the_bias_by_dials():
+def test_hopes_take_away_noise_by_samples_and_a_share_of_the_bias_by_dials():
     result, point = Result(0, 1, 0.03, 0.04), Point("raymarch", 4)
     more = replace(point, spp=16)
     assert search.hoped_error(point, result, more, "spp", 1) == pytest.approx(math.hypot(0.015, 0.04))
     finer = replace(point, samples=768)
-    assert search.hoped_error(point, result, finer, "samples", 1) == pytest.approx(math.hypot(0.03, 0.02))
+    assert search.hoped_error(point, result, finer, "samples", 1) == pytest.approx(math.hypot(0.03, 0.028))
     assert search.hoped_error(point, result, replace(point, samples=192), "samples", -1) == pytest.approx(0.05)
+    assert search.hoped_error(point, result, finer, "samples", 1, 1) == pytest.approx(math.hypot(0.03, 0.034))
 
 
 def test_every_dial_of_a_method_is_turned_or_known_not_to_be():

@@ -67,10 +67,12 @@ def _uncertainty(values: np.ndarray) -> float:
     return float(each.std() / sqrt(each.size))
 
 
-def pooled(errors) -> float:
-    """One bias of several :class:`Error` of the same settings, by the inverse of their squared uncertainties."""
+def pooled(errors) -> Error:
+    """One of several :class:`Error` of the same settings: the bias by the inverse of its squared uncertainties, the
+    noise of the last."""
     weights = [1 / max(e.uncertainty, 1e-12) ** 2 for e in errors]
-    return sqrt(sum(w * e.bias**2 for w, e in zip(weights, errors, strict=True)) / sum(weights))
+    bias = sqrt(sum(w * e.bias**2 for w, e in zip(weights, errors, strict=True)) / sum(weights))
+    return Error(errors[-1].noise, bias, sum(weights) ** -0.5)
 
 
 def z_test(first, second) -> dict[str, float]:

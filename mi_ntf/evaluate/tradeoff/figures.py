@@ -5,10 +5,9 @@ import io
 import re
 from typing import Any
 
-import numpy as np
-
 from ...data.page import GREY, new_figure, plain
-from .reading import bias, groups, measured, total
+from . import errors
+from .reading import error, groups, measured, total
 
 COLOURS = ("#3b82e0", "#e0433a", "#2f9e44", "#e39b1a", "#8b5cf6", "#0ea5b7", "#d6409f", "#8a6d3b", "#7d7d7d")
 MARKERS = "osD^vPXph"
@@ -52,12 +51,11 @@ def bias_curve(rows: list[dict[str, Any]]) -> str:
     for group in groups(rows):
         last = group[-1]
         seconds = last["build"] + last["render"] * (last["noise"] / EQUAL_NOISE) ** 2
-        found, spread = bias(group)
-        known = found**2 > 2 * spread
+        found = errors.pooled([error(row) for row in group])
         method = last["point"]["method"]
         colour, _ = looks[method]
-        axes.scatter([seconds], [found if known else np.sqrt(found**2 + 2 * spread)], s=34, color=colour,
-                     marker="o" if known else "v", facecolors=colour if known else "none", zorder=3,
+        axes.scatter([seconds], [found.bias if found.known else found.most], s=34, color=colour,
+                     marker="o" if found.known else "v", facecolors=colour if found.known else "none", zorder=3,
                      label=None if method in named else method)
         named.add(method)
     _log(axes, f"seconds of a picture of {EQUAL_NOISE:.0%} noise, reckoned from the samples measured", "bias")

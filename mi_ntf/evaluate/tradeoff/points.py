@@ -47,7 +47,7 @@ def from_dict(values: dict[str, Any]) -> Point:
 class Dial:
     """Numbers between `low` and `high`, a coarse step apart by `factor`. `words`: values in place of numbers, each of
     which is a step from any other. `unlimited`: the number that stands for more than any other, None if none does;
-    `first`: the number next to that."""
+    `first`: the number next to that; `relief`: share of the bias that one may hope a step takes away."""
 
     low: int = 1
     high: int = 1 << 16
@@ -55,6 +55,7 @@ class Dial:
     words: tuple = ()
     unlimited: int | None = None
     first: int = 16
+    relief: float = 0.3
 
     def steps(self, value, fine: bool) -> list[tuple[Any, int]]:
         """``(value, direction)`` of the values next to `value`; direction: 1 dearer, −1 cheaper, 0 neither known."""
@@ -73,10 +74,10 @@ DIALS = {
     "samples": Dial(48, 1536),
     "light_samples": Dial(1, 256, 4.0, unlimited=0),
     "environment_lights": Dial(8, 8192, 4.0),
-    "map_resolution": Dial(24, 768),
-    "map_source": Dial(words=("field", "network")),
-    "map_components": Dial(words=(1, 2)),
-    "representation": Dial(words=("grid", "network")),
+    "map_resolution": Dial(24, 768, relief=0.5),
+    "map_source": Dial(words=("field", "network"), relief=0.5),
+    "map_components": Dial(words=(1, 2), relief=0.5),
+    "representation": Dial(words=("grid", "network"), relief=0.1),
 }
 """Every dial that is turned. `max_depth` is one, too: see :func:`neighbours`."""
 COMMON = ("spp", "samples", "light_samples", "environment_lights", "representation")
@@ -89,7 +90,7 @@ NOT_TURNED = ("map_memory", "map_file")
 @dataclass(frozen=True)
 class Limits:
     """What the scene allows. `depth`: its own `max_depth`, the reference's; `environment`: it has one that is summed by
-    cells; `texels`: most lights that it may become; `stock`: the depth is the stock integrator's too."""
+    cells; `texels`: most lights that it may become."""
 
     depth: int = 2
     environment: bool = True

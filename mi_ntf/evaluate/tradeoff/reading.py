@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 
-from ...render.cost import model
 from . import errors
 from .points import STOCK
 from .search import WORST, front
@@ -59,7 +58,7 @@ def reading(rows: list[dict[str, Any]]) -> list[str]:
         found.append(f"The curve bends at no. {bend['number']}, {_told(bend)}: what is faster loses much accuracy, "
                      "what is more accurate takes much longer.")
     found += _stock(rows)
-    biased = [row for row in ends if row["bias"] > row["noise"] and row["bias"] ** 2 > 2 * row["uncertainty"]]
+    biased = [row for row in ends if row["bias"] > row["noise"] and error(row).known]
     if biased:
         which = f"no. {', '.join(str(row['number']) for row in biased)}" if len(biased) < 6 else f"{len(biased)} points"
         found.append(f"On the front, {which} err by bias more than by noise: more samples do not help there.")
@@ -108,12 +107,9 @@ def groups(rows: list[dict[str, Any]]) -> list[list[dict[str, Any]]]:
     return [sorted(group, key=lambda row: row["point"]["spp"]) for group in found.values()]
 
 
-def bias(group: list[dict[str, Any]]) -> tuple[float, float]:
-    """The bias of rows of equal settings, and its standard error squared: of bias², see
-    :class:`mi_ntf.evaluate.tradeoff.errors.Error`."""
-    each = [errors.Error(row["noise"], row["bias"], row["uncertainty"]) for row in group]
-    spread = sum(1 / max(e.uncertainty, 1e-12) ** 2 for e in each) ** -0.5
-    return errors.pooled(each), spread
+def error(row: dict[str, Any]) -> errors.Error:
+    """The error of a measured row."""
+    return errors.Error(row["noise"], row["bias"], row["uncertainty"])
 
 
 def busy(rows: list[dict[str, Any]], cores: int) -> str:
@@ -123,8 +119,3 @@ def busy(rows: list[dict[str, Any]], cores: int) -> str:
         return ""
     return (f"Other work ran beside the study: up to {most:.0f} jobs on {cores} cores. Seconds are too high and "
             "uneven, errors are as they are.")
-
-
-def machine() -> str:
-    """What computed."""
-    return model.machine()

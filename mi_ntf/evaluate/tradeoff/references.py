@@ -4,7 +4,7 @@ and, where there is one, the path-traced mesh."""
 import re
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +48,6 @@ class Reference:
     passes: int
     seconds: float
     about: str = ""
-    extra: dict[str, Any] = field(default_factory=dict)
 
     @property
     def noise(self) -> float:
@@ -189,9 +188,11 @@ def verdict(found: dict[str, Any]) -> str:
     where = f"Against stock volpath on {found['crop'][2]}×{found['crop'][3]} pixels, {found['stock_spp']} samples each"
     if found["sigma"] > 0.02:
         return f"{where}: {figures}; too noisy to tell differences below {2 * found['sigma']:.0%}."
+    if found["p"] > 0.05:
+        return f"{where}: {figures}; no difference is found."
     if found["p"] > 0.01:
-        return f"{where}: {figures}: no difference is found."
-    return f"{where}: {figures}: the renderer itself is off by that."
+        return f"{where}: {figures}; a difference is likely."
+    return f"{where}: {figures}; the renderer itself is off by about that."
 
 
 def find_mesh(subject: Subject) -> Path | None:

@@ -15,14 +15,15 @@ import numpy as np
 from ...core import files
 from ...data.page import Page, encode
 from . import figures
-from .reading import busy, mark_front, measured, reading, total
-
-__all__ = ["mark_front", "progress", "reading", "write"]
+from .reading import busy, error, measured, total
+from .search import WORST
 
 WIDTH = 128
 """Pixels along the longer side of a thumbnail, at most."""
 BRIGHT = 0.9
 """Level that the brightest 0.5 % of the reference are shown from on."""
+SHOWN = 11
+"""Pictures of the front, at most."""
 ERROR_SCALE = 0.5
 """Upper end of difference images, in units of the reference's RMS."""
 COLUMNS = ("number", "front", "label", "build", "render", "total", "repeats", "first", "compile", "peak", "error",
@@ -36,6 +37,7 @@ _STYLE = """<style>
         max-width: 300px; font-size: 13px; }
 #card img { display: inline-block; width: 140px; image-rendering: pixelated; margin-right: 6px; }
 table.points td, table.points th { white-space: nowrap; font-size: 13px; } tr.front { font-weight: 600; }
+table.points td:nth-child(2) { white-space: normal; min-width: 17em; }
 .wide { overflow-x: auto; } g[id^="p"] { cursor: pointer; }
 </style>"""
 _SCRIPT = """<div id="card"></div><script>
@@ -96,7 +98,8 @@ def page(result: dict[str, Any], reference: np.ndarray, pictures: dict[int, np.n
         _curves(found, rows, reference, pictures)
     found.section("All points")
     found.text("By seconds; the front in bold. A picture takes build + render; its first one in a process takes the "
-               "compilation of kernels besides. Bias in brackets is not told from none.")
+               "compilation of kernels besides, or their fetching from Dr.Jit's cache. Bias in brackets is not told from "
+               "none.")
     _table(found, rows, "mesh_error" in next(iter(measured(rows)), {}))
     if result["skipped"]:
         found.table(["not measured", "why"], [[s["label"], s["reason"]] for s in result["skipped"]])
@@ -118,9 +121,11 @@ def _curves(found: Page, rows, reference, pictures) -> None:
     found.text(f"Below each its difference from the reference: white is {ERROR_SCALE:.0%} of the reference's RMS or "
                "more.")
     shown: list[tuple] = [("reference", encode(thumbs.picture(reference)), None)]
+    ends = [row for row in rows if row["front"] and row["number"] in points]
+    ends = [row for row in ends if row["error"] < WORST] or ends
+    kept = np.unique(np.linspace(0, len(ends) - 1, min(SHOWN, len(ends))).round().astype(int))
     shown += [(f"{row['number']}: {row['label']}: {total(row):.3g} s, {row['error']:.1%}",
-               points[row["number"]]["image"], points[row["number"]]["difference"])
-              for row in rows if row["front"] and row["number"] in points]
+               points[row["number"]]["image"], points[row["number"]]["difference"]) for row in (ends[k] for k in kept)]
     found.markup('<div class="row">' + "".join(map(_figure, *zip(*shown, strict=True))) + "</div>")
     found.section("Bias at equal noise")
     found.text("What no number of samples takes away. Open triangles: not told from none, the bound of two standard "
@@ -147,7 +152,7 @@ def _lines(row: dict[str, Any]) -> list[str]:
 
 def _bias(row: dict[str, Any]) -> str:
     text = f"{row['bias']:.1%}"
-    return text if row["bias"] ** 2 > 2 * row["uncertainty"] else f"({text})"
+    return text if error(row).known else f"({text})"
 
 
 def _table(found: Page, rows: list[dict[str, Any]], mesh: bool) -> None:
@@ -203,8 +208,8 @@ class _Thumbnails:
         """sRGB levels of |image − reference|."""
         from matplotlib import colormaps
 
-        error = np.abs(_small(image) - self._reference).mean(-1) / self._rms
-        return (255 * colormaps["inferno"](np.clip(error / ERROR_SCALE, 0, 1))[..., :3]).astype(np.uint8)
+        wrong = np.abs(_small(image) - self._reference).mean(-1) / self._rms
+        return (255 * colormaps["inferno"](np.clip(wrong / ERROR_SCALE, 0, 1))[..., :3]).astype(np.uint8)
 
 
 def _small(image: np.ndarray) -> np.ndarray:

@@ -1,11 +1,11 @@
 """Which point to measure next: points are tried where the Pareto front of seconds and error is unknown, not on a grid.
 
-Each method begins with the scene's own dials, cheap methods first. Beside them, candidates are the neighbours of what
-is measured, coarse steps first, each with the samples a pixel of its neighbour and with more. For each candidate there
-is a hope: the seconds predicted for it and the least error that one may expect of it. Its worth is the area that the
-hope would add to what the front dominates, on log axes, for each second that measuring it takes. A candidate whose hope
-adds nothing is not tried; when none is left, half steps are; then, with what is left of the budget, curves of methods
-off the front are drawn further.
+Each method begins with the scene's own dials, cheap methods first, dear ones by turns with the rest. The rest are
+neighbours of what is measured, coarse steps first, each with the samples a pixel of its neighbour and with more. For
+each there is a hope: the seconds predicted for it and the least error that one may expect of it. Its worth is the area
+that the hope would add to what the front dominates, on log axes, for each second that measuring it takes. A candidate
+whose hope adds nothing is not tried; when none is left, half steps are; then, with what is left of the budget, curves
+of methods off the front are drawn further.
 """
 
 import math
@@ -24,8 +24,8 @@ WORST = 0.2
 """Error from which on none is told from another: such pictures are of no use."""
 DEAR = 1 / 20
 """Of the budget: a method whose first point takes more begins with drawn lights."""
-FIRST_SHARE = 1 / 10
-"""Of the budget: methods whose first point takes more wait until nothing else may teach as much a second."""
+FIRST_SHARE = 1 / 20
+"""Of the budget: methods whose first point takes more have their turn after each point of another kind."""
 START_SHARE = 1 / 40
 """Of the budget, that the renderings of a method's first point may take: it has fewer samples a pixel otherwise."""
 
@@ -99,6 +99,7 @@ class Search:
         self._methods = list(methods)
         self._known: dict[Point, tuple[float, float] | None] = {}
         self._failed: set[Point] = set()
+        self._turn = 0
         self._scaled: dict[Point, tuple[float, float] | None] = {}
 
     def add(self, point: Point, result: Result) -> None:
@@ -113,12 +114,14 @@ class Search:
         would take longer is remembered in `skipped`."""
         firsts = self._firsts()
         cheap = [p for p in firsts if p.cost <= FIRST_SHARE * self.budget]
-        groups = (lambda: cheap, lambda: self._hopes(False, firsts), lambda: firsts, lambda: self._hopes(True, []),
+        turn = [p for p in firsts if p.cost <= left][: self._turn]
+        groups = (lambda: cheap, lambda: turn, lambda: self._hopes(False), lambda: firsts, lambda: self._hopes(True),
                   self._curves)
         for found in (group() for group in groups):
             for proposal in found:
                 if proposal.cost <= left:
                     self.skipped.pop(proposal.point, None)
+                    self._turn = 0 if found is turn else 1
                     return proposal
                 self.skipped.setdefault(proposal.point, proposal)
         return None
@@ -160,8 +163,8 @@ class Search:
             point = replace(point, spp=max(1, point.spp // 4))
         return point
 
-    def _hopes(self, fine: bool, firsts: list[Proposal]) -> list[Proposal]:
-        """Neighbours of measured points, and `firsts`, that may lie on the front, by their worth a second."""
+    def _hopes(self, fine: bool) -> list[Proposal]:
+        """Neighbours of measured points that may lie on the front, by their worth a second."""
         good = {point: result for point, result in self.results.items() if not result.failed}
         known = front((r.seconds, r.error) for r in good.values())
         now = area(known, self.budget)
@@ -178,9 +181,6 @@ class Search:
             for other, dial, way in self._moves(point, fine):
                 proposal = self._proposal(other, f"{dial} {getattr(point, dial)} → {getattr(other, dial)}")
                 consider(proposal, hoped_error(point, result, other, dial, way, tried))
-        least = min((r.noise * math.sqrt(p.spp) for p, r in good.items()), default=WORST)
-        for proposal in firsts:
-            consider(proposal, least / math.sqrt(proposal.point.spp))
         return [proposal for _, proposal in sorted(found.values(), key=lambda pair: -pair[0])]
 
     def _moves(self, point: Point, fine: bool) -> list[tuple[Point, str, int]]:
@@ -256,14 +256,15 @@ def _renderings(seconds: float) -> float:
 
 def hoped_error(point: Point, result: Result, other: Point, dial: str, way: int, tried: int = 0) -> float:
     """The least error to be expected of `other`, one step of `dial` away from `point`: more samples take away noise;
-    dearer or other settings half of the bias, less where other settings of the method, `tried` of them, did not;
-    cheaper ones nothing."""
+    dearer or other settings the dial's share of the bias, less where other settings of the method, `tried` of them,
+    did not; cheaper ones nothing."""
     noise, bias = result.noise * math.sqrt(point.spp / other.spp), result.bias
     if dial == "spp":
         return math.hypot(noise, bias)
     if dial == "light_samples" and way > 0:
         return math.hypot(0.7 * noise, bias)
-    return math.hypot(noise, bias * (1 - 0.5 ** (1 + tried)) if way >= 0 else bias)
+    relief = DIALS[dial].relief if dial in DIALS else 0.5
+    return math.hypot(noise, bias * (1 - relief * 0.5**tried) if way >= 0 else bias)
 
 
 def _distance(a: Point, b: Point) -> float:

@@ -15,7 +15,7 @@ from ...core import files
 from ...core.errors import MiNtfError, sentence
 from ...infer.visibility import REGISTRY
 from ...render.cost import model
-from . import errors, references, report
+from . import errors, reading, references, report
 from .measure import measure
 from .points import STOCK, Point, from_dict, label
 from .references import Reference
@@ -160,8 +160,8 @@ class Study:
             if row["reason"]:
                 search.add(point, Result(failed=True))
                 continue
-            alike = [_error(r) for p, r in rows if p.settings == point.settings and not r["reason"]]
-            search.add(point, Result(row["build"], row["render"], row["noise"], errors.pooled(alike)))
+            alike = [reading.error(r) for p, r in rows if p.settings == point.settings and not r["reason"]]
+            search.add(point, Result(row["build"], row["render"], row["noise"], errors.pooled(alike).bias))
 
     def _try(self, proposal: Proposal) -> None:
         """Measure a point, or note why it failed."""
@@ -241,7 +241,7 @@ def _result(study: Study, scene: Path) -> dict[str, Any]:
     end = last if last["kind"] == "end" else None
     width, height = (n // study.picture.shrink for n in subject.size)
     rows = [dict(row) for row in study.points]
-    report.mark_front(rows)
+    reading.mark_front(rows)
     plain = ("kind", "image", "spent")
     return {
         "scene": str(scene), "parameters": subject.parameters, "size": [width, height],
@@ -251,12 +251,8 @@ def _result(study: Study, scene: Path) -> dict[str, Any]:
         "machine": {"what": model.machine(), "mitsuba": mi.__version__, "version": __version__},
         "references": {kind: {k: v for k, v in found.items() if k not in plain}
                        for kind in ("reference", "check", "mesh") if (found := state.one(kind))},
-        "points": rows, "skipped": end["skipped"] if end else [], "reading": report.reading(rows),
+        "points": rows, "skipped": end["skipped"] if end else [], "reading": reading.reading(rows),
     }
-
-
-def _error(row: dict[str, Any]) -> errors.Error:
-    return errors.Error(row["noise"], row["bias"], row["uncertainty"])
 
 
 def _skipped(proposal: Proposal, subject: Subject) -> dict[str, Any]:
