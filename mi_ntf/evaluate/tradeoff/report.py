@@ -98,8 +98,8 @@ def page(result: dict[str, Any], reference: np.ndarray, pictures: dict[int, np.n
         _curves(found, rows, reference, pictures)
     found.section("All points")
     found.text("By seconds; the front in bold. A picture takes build + render; its first one in a process takes the "
-               "compilation of kernels besides, or their fetching from Dr.Jit's cache. Bias in brackets is not told from "
-               "none.")
+               "compilation of kernels besides, or their fetching from Dr.Jit's cache. Bias in brackets is not told "
+               "from none.")
     _table(found, rows, "mesh_error" in next(iter(measured(rows)), {}))
     if result["skipped"]:
         found.table(["not measured", "why"], [[s["label"], s["reason"]] for s in result["skipped"]])
