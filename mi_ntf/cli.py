@@ -251,6 +251,37 @@ class Bench:
 
 
 @dataclass
+class Tradeoff:
+    """Show what accuracy costs on a scene: seconds, memory and error of every method and its dials, as a page."""
+
+    scene: Positional[Path]
+    """Scene with an nrf medium and integrator."""
+    output: Annotated[Path, arg(aliases=("-o",), metavar="DIR")] = Path("tradeoff")
+    """Folder for index.html, tradeoff.csv and tradeoff.json; an interrupted study goes on there."""
+    define: Annotated[UseAppendAction[tuple[str, ...]], arg(aliases=("-D",), metavar="KEY=VALUE")] = field(
+        default_factory=tuple
+    )
+    """Value of $KEY in the scene."""
+    budget: str = "5m"
+    """How long the study may take: 90s, 5m, 1h."""
+    reference: Annotated[Path | None, arg(metavar="FILE")] = None
+    """The path-traced mesh, an EXR picture or the XML file of its scene; shipped scenes have theirs."""
+    json: bool = False
+    """Print JSON in place of a table, and no progress."""
+
+    def run(self) -> None:
+        parameters = _definitions(self.define)
+        from mi_ntf.evaluate.tradeoff import study
+
+        try:
+            seconds = study.seconds(self.budget)
+        except ValueError as error:
+            raise UsageError(str(error)) from None
+        _report(study.tradeoff(self.scene, self.output, parameters, seconds, self.reference, self.json), self.json,
+                study.print_table)
+
+
+@dataclass
 class Bake:
     """Write the transmittance maps of a scene's lights, one part of an EXR file each."""
 
@@ -310,6 +341,7 @@ Command = (
     | Annotated[Compare, subcommand("compare")]
     | Annotated[Explain, subcommand("explain")]
     | Annotated[Bench, subcommand("bench")]
+    | Annotated[Tradeoff, subcommand("tradeoff")]
     | Annotated[Bake, subcommand("bake")]
     | Annotated[Info, subcommand("info")]
     | Annotated[Doctor, subcommand("doctor")]

@@ -10,6 +10,7 @@ from helpers.programs import run_program
 
 from mi_ntf import cli, doctor
 from mi_ntf.core.errors import MiNtfError
+from mi_ntf.evaluate.tradeoff.study import seconds
 
 
 @pytest.fixture
@@ -36,6 +37,8 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list:
     stand_in("mi_ntf.render.commands.explain", explain=note(table),
              print_table=lambda values: print("table", values["psnr"]))
     stand_in("mi_ntf.core.field_file", describe=note(table))
+    stand_in("mi_ntf.evaluate.tradeoff", study=types.SimpleNamespace(
+        seconds=seconds, tradeoff=note(table), print_table=lambda values: print("table", values["psnr"])))
     return seen
 
 
@@ -100,6 +103,8 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list:
         ("compare a.exr b.exr -o c.png", (Path("a.exr"), Path("b.exr"), Path("c.png")), {}),
         ("explain s.xml -D spp=4 -D light=env", (Path("s.xml"), {"spp": "4", "light": "env"}, False), {}),
         ("explain s.xml --measure", (Path("s.xml"), {}, True), {}),
+        ("tradeoff s.xml -D a=4 --budget 2m", (Path("s.xml"), Path("tradeoff"), {"a": "4"}, 120.0, None, False), {}),
+        ("tradeoff s.xml -o d --reference m.xml", (Path("s.xml"), Path("d"), {}, 300.0, Path("m.xml"), False), {}),
         ("info f.safetensors", (Path("f.safetensors"),), {}),
     ],
 )
@@ -109,7 +114,7 @@ def test_commands_pass_their_arguments_on(calls: list, line: str, args: tuple, k
 
 
 @pytest.mark.parametrize("line", ["compare a b --json", "train d -o f --json", "explain s.xml --json", "info f --json",
-                                  "inspect d --json"])
+                                  "inspect d --json", "tradeoff s.xml --json"])
 def test_json(calls: list, line: str, capsys: pytest.CaptureFixture[str]):
     assert cli.main(line.split()) == 0
     assert json.loads(capsys.readouterr().out) == {"psnr": 30.5, "inner": {"a": 1}}
@@ -147,6 +152,7 @@ def test_limits_of_compare_decide_the_exit_code(calls: list, capsys: pytest.Capt
         "compare a.exr b.exr --max-psnr 30",
         "compare a.exr b.exr --max-flip little",
         "explain s.xml -D spp",
+        "tradeoff s.xml --budget soon",
         "render",
         "render -D spp scene.xml",
         "render --nonsense scene.xml",

@@ -16,7 +16,7 @@ TEXT = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
 BLOCKS = re.findall(r"```(\w+)\n(.*?)```", TEXT, re.S)
 COMMANDS = [line.split("#")[0] for line in TEXT.splitlines() if re.match(r"    (mi-ntf|mitsuba|make) ", line)]
 COMMANDS = [line.split() for line in dict.fromkeys(map(str.rstrip, COMMANDS))]
-SMALLER = {"--minutes": "0.1", "--steps": "20", "--size": "24"}
+SMALLER = {"--minutes": "0.1", "--steps": "20", "--size": "24", "--budget": "5s"}
 CAPTURE = {"--views": "12", "--size": "24", "--test-views": "1", "--spp": "2"}
 
 
@@ -83,15 +83,18 @@ def test_command(folder, words):
         words += [word for k, v in CAPTURE.items() if k not in words for word in (k, v)]
     if words[0] == "mitsuba" and "scenes/" in words[-1]:  # a swapped one is small by itself
         words[1:1] = ["-D", "res=16"]
-    if words[1] in ("explain", "bake"):
+    if words[1] in ("explain", "bake", "tradeoff"):
         words += ["-D", "res=16", "-D", "spp=1"]
+    if words[1] == "tradeoff" and "--budget" not in words:
+        words += ["--budget", SMALLER["--budget"]]
     printed = check(*words, folder=folder)
     assert words[1] != "info" or "similarity" in printed
 
 
 def test_every_command_is_shown():
     shown = {words[1] if words[0] == "mi-ntf" else words[0] for words in COMMANDS}
-    assert shown == {"capture", "inspect", "train", "swap", "mitsuba", "info", "compare", "explain", "bake", "make"}
+    assert shown == {"capture", "inspect", "train", "swap", "mitsuba", "info", "compare", "explain", "bake", "make",
+                     "tradeoff"}
 
 
 def test_readme_is_short():

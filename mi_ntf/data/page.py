@@ -1,4 +1,5 @@
-"""One short HTML page that holds all it shows: no network, no scripts. For reports to look at.
+"""One short HTML page that holds all it shows: no network, and no scripts but those given to :meth:`Page.markup`. For
+reports to look at.
 
     page = Page("skull")
     page.section("Photographs")
@@ -78,7 +79,7 @@ class Page:
         self._parts.append('<div class="row">')
         for caption, array in pictures:
             small = ' class="small"' if array.shape[1] < width else ""
-            self._image(_encode(array), caption, f'{small} width="{width}"')
+            self._image(encode(array), caption, f'{small} width="{width}"')
         self._parts.append("</div>")
 
     def figure(self, figure, caption: str = "") -> None:
@@ -108,6 +109,10 @@ class Page:
         if len(curves) > 1:
             axes.legend(frameon=False, labelcolor=GREY)
         self.figure(figure)
+
+    def markup(self, html: str) -> None:
+        """HTML as it is, not escaped: the caller's own, that loads nothing."""
+        self._parts.append(html)
 
     def html(self) -> str:
         """The page so far."""
@@ -144,7 +149,7 @@ def plain(axes) -> None:
     axes.grid(True, color=GREY, alpha=0.2)
 
 
-def _encode(array: np.ndarray) -> str:
+def encode(array: np.ndarray) -> str:
     """Data URI of a picture (H, W, 3): linear light as floats, or sRGB levels."""
     from PIL import Image
 

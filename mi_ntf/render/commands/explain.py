@@ -49,7 +49,7 @@ def explain(scene: Path, parameters: dict[str, str], measure: bool = False) -> d
         found = effects.describe(loaded, settings, sensor, spp, media, light)
     count = light.table(media[0].frame).count
     drawn = effects.drawn(settings, light)
-    work = _works(settings, media, found, width * height * spp, count, drawn)
+    work = works(settings, media, found, width * height * spp, count, drawn)
     report = {
         "scene": str(scene),
         "image": {"width": width, "height": height, "spp": spp},
@@ -75,7 +75,7 @@ def _environment(light) -> dict:
             "radius_degrees": math.degrees(cells.radius), "irradiance_error_percent": 100 * cells.error()}
 
 
-def _works(integrator, media: list, found, rays: int, count: int, drawn: int) -> list[model.Work]:
+def works(integrator, media: list, found, rays: int, count: int, drawn: int) -> list[model.Work]:
     """What each medium's part of the render comes to."""
     method = found.visibility if found.needs_visibility else "none"
     radiosity = found.bounces == "radiosity"

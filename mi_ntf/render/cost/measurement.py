@@ -29,8 +29,9 @@ def by_clock(stage: str):
     start = time.perf_counter()
     yield
     dr.sync_thread()
-    _watched.append({"stage": stage, "execution_time": 1e3 * (time.perf_counter() - start)})
-    dr.kernel_history_clear()
+    compiled = compilation(dr.kernel_history())
+    _watched.append({"stage": stage, "execution_time": 1e3 * (time.perf_counter() - start - compiled),
+                     "backend_time": 1e3 * compiled})
 
 
 @contextmanager
@@ -63,24 +64,39 @@ def maps_made_anew():
 def measure(scene, integrator, spp: int) -> dict:
     """Render `scene` twice and report the second time, when every kernel is compiled. Maps and patches are made anew.
 
-    ``stages``: kernel seconds, as in :func:`mi_ntf.render.cost.model.seconds`, and those by the clock of ``bounces`` by
-    radiosity; ``wall_seconds`` of the whole, Python and the film included; ``points``: shading points; ``peak_bytes``:
-    most memory that Dr.Jit held.
+    What is returned is that of :func:`once`.
     """
-    seeds: tuple[Any, Any] = 1, 0  # numbers, where Mitsuba's stub asks for arrays
-    with maps_made_anew(), dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        dr.eval(mi.render(scene, integrator=integrator, seed=seeds[0], spp=spp))
+    with maps_made_anew():
+        once(scene, integrator, spp, 1)
         integrator.patches = None
+        return once(scene, integrator, spp, 0)[1]
+
+
+def once(scene, integrator, spp: int, seed: Any) -> tuple[Any, dict]:
+    """Render `scene` by any integrator: the image, and what that took.
+
+    ``stages``: kernel seconds, as in :func:`mi_ntf.render.cost.model.seconds`, and those by the clock of ``bounces`` by
+    radiosity; ``wall_seconds`` of the whole, Python, compilation and the film included; ``compile_seconds`` of it;
+    ``points``: shading points; ``peak_bytes``: most memory that Dr.Jit held.
+    """
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.sync_thread()
         dr.detail.malloc_clear_statistics()
         with _watching() as history:
             start = time.perf_counter()
-            dr.eval(mi.render(scene, integrator=integrator, seed=seeds[1], spp=spp))
+            image = mi.render(scene, integrator=integrator, seed=seed, spp=spp)
+            dr.eval(image)
             dr.sync_thread()
             wall = time.perf_counter() - start
             history.extend(dr.kernel_history())
-    backend = dr.backend_v(mi.Float)
-    return by_stage(history) | {"wall_seconds": wall, "peak_bytes": int(dr.detail.malloc_watermark(backend))}
+    peak = int(dr.detail.malloc_watermark(dr.backend_v(mi.Float)))
+    return image, by_stage(history) | {"wall_seconds": wall, "compile_seconds": compilation(history),
+                                       "peak_bytes": peak}
+
+
+def compilation(history: list[dict]) -> float:
+    """Seconds of a kernel history that went into making kernels, or into fetching them from Dr.Jit's cache on disk."""
+    return 1e-3 * sum(kernel.get("codegen_time", 0) + kernel.get("backend_time", 0) for kernel in history)
 
 
 def by_stage(history: list[dict]) -> dict:
