@@ -186,10 +186,9 @@ def test_a_scene_without_our_integrator(tmp_path):
     assert mi.variant() == "llvm_ad_rgb"
 
 
-def test_under_a_limit_the_trials_are_told(tmp_path, monkeypatch, capsys):
+def test_under_a_limit_the_trials_are_told(monkeypatch, capsys):
     monkeypatch.setattr("mi_ntf.render.transport.choosing.TRIAL", 0.0)
-    scene = with_integrator(tmp_path, '<float name="max_error" value="0.1"/>')
-    report = explain(scene, {"visibility": "auto", "res": "24", "spp": "4"})
+    report = explain(SCENE, {"error": "0.1", "res": "24", "spp": "4"})
     trials = report["choice"]["trials"]
     assert trials[-1]["taken"] and report["effects"]["visibility"]["why"].endswith(trials[-1]["why"])
     assert report["choice"]["predicted"] == {"seconds": trials[-1]["seconds"], "error": trials[-1]["error"]}
