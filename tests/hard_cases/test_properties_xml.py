@@ -23,13 +23,13 @@ KINDS = {
     "Vector": '<vector name="{}" x="1" y="2" z="3"/>', "Color": '<rgb name="{}" value="1 2 3"/>',
     "Transform": '<transform name="{}"><scale value="4"/></transform>', "Object": '<bsdf type="diffuse" name="{}"/>',
 }  # fmt: skip
-NUMBERS = {"timeout", "map_memory", "scale", "sampling_weight"}
+NUMBERS = {"timeout", "map_memory", "scale", "sampling_weight", "noise_threshold", "max_error", "time_budget"}
 WORDS = {"visibility", "bounces", "map_source", "representation", "aovs", "filename", "map_file"}
 FLAGS = {"hide_emitters", "sample_emitters"}
 RANGES = {
     "samples": (8, 8192), "light_samples": (0, 65536), "environment_lights": (1, 65536), "map_resolution": (4, 4096),
     "map_components": (1, 2), "map_memory": (0.0, 2.0**24), "max_depth": (-1, 1 << 20), "resolution": (16, 512),
-    "scale": (1e-12, 1e12), "sampling_weight": (0.0, 1e30),
+    "scale": (1e-12, 1e12), "sampling_weight": (0.0, 1e30), "noise_threshold": (0.0, 1e6), "max_error": (0.0, 1e6),
 }  # fmt: skip
 CASES = [(plugin, name) for plugin, names in PLUGINS.items() for name in names]
 
