@@ -115,7 +115,7 @@ class Sizes:
 FULL = Sizes(pixels=600, points=400, skies=18, spp=(16, 4), reference_spp=1024, cells=288, map_resolution=256,
              views=100, photograph=256, ntf="paper", steps=20000, stages=(1 / 100, 1 / 50, 1 / 20, 1),
              study=(128, 4, 50), build=(1, 2, 4, 8), bench=BENCH)
-QUICK = Sizes(pixels=192, points=8, skies=3, spp=(16, 2), reference_spp=512, cells=64, map_resolution=128,
+QUICK = Sizes(pixels=192, points=8, skies=3, spp=(16, 2), reference_spp=512, cells=64, map_resolution=192,
               views=60, photograph=128, ntf="ray", steps=2000, stages=(1 / 40, 1 / 16, 1 / 4, 1),
               study=(64, 2, 12), build=(1, 2, 4),
               bench=replace(BENCH, queries=1 << 15, repeats=3, pixels=75, image=200, tables=(50, 64, 256)))

@@ -14,6 +14,7 @@ from ...render.commands.calibration import table_of
 from ...render.maps import building
 from .. import bench_paper, transmittance
 from ..photographs import field_ball
+from . import images
 from .compared import Scene, Sizes
 
 POINTS = 400
@@ -43,7 +44,7 @@ def along(scene: Scene, methods: dict[str, tuple[Path, str]]) -> dict:
 
 def _ray(scene: Scene) -> tuple[np.ndarray, np.ndarray, float]:
     """``(m, d, h)``: middle of the chord, direction towards the light, half its length."""
-    sensor = mi.load_file(str(scene.mesh), res="16", spp="1").sensors()[0]
+    sensor = images.meshes(scene, 16).sensors()[0]
     medium = _medium(scene.field)
     o, away, _ = bench_paper.view_rays(sensor, medium.frame, SIDE)
     o, away = (np.array(v).T.astype(np.float64) for v in (o, away))

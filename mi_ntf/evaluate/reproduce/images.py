@@ -8,7 +8,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...core import files
+from ...core import errors, files
+from ...core.errors import MiNtfError
 from ...data.schema import write_exr
 from .. import compare, metrics, perceptual
 from ..photographs import field_ball
@@ -26,7 +27,7 @@ class Studio:
 
     def __init__(self, scene: Scene, sizes: Sizes):
         self.scene, self.sizes = scene, sizes
-        loaded = mi.load_file(str(scene.mesh), res=str(sizes.pixels), spp="1")
+        loaded = meshes(scene, sizes.pixels)
         self._meshes = {f"shape{i}": s for i, s in enumerate(loaded.shapes()) if not s.is_emitter()}
         self._sensor = loaded.sensors()[0]
         self._balls: dict[Path, Any] = {}
@@ -87,6 +88,18 @@ class Studio:
         fov = float(2 * np.degrees(np.arcsin(1 / DISTANCE)))
         return mi.load_dict({"type": "perspective", "fov": fov, "to_world": look, "film": film,
                              "sampler": {"type": "independent"}})
+
+
+def meshes(scene: Scene, pixels: int):
+    """The Mitsuba scene of the meshes, of `pixels`² pixels. Raises MiNtfError."""
+    try:
+        loaded = mi.load_file(str(scene.mesh), res=str(pixels))
+    except RuntimeError as error:
+        raise MiNtfError(f"{scene.mesh} cannot be loaded ({errors.sentence(error)}); as in shipped scenes, "
+                         "$res must be its film's size") from None
+    if not loaded.sensors():
+        raise MiNtfError(f"{scene.mesh} has no sensor; add the one that its pictures are seen by")
+    return loaded
 
 
 def measure(image: np.ndarray, reference: np.ndarray) -> dict[str, float | None]:

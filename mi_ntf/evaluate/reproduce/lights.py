@@ -128,7 +128,7 @@ def sky(elevation: float, azimuth: float, width: int = 64, height: int = 32, fin
     """Mitsuba's ``sunsky`` with its sun at these degrees as a latitude-longitude map (h, w, 3), means of `finer`²
     samples a pixel, and an even ground."""
     e, a = np.radians((elevation, azimuth))
-    sun = [float(np.cos(e) * np.sin(a)), float(-np.cos(e) * np.cos(a)), float(np.sin(e))]  # its own axes have z up
+    sun = [float(np.cos(e) * np.sin(a)), float(np.cos(e) * np.cos(a)), float(np.sin(e))]  # its own axes have z up
     emitter = mi.load_dict({"type": "sunsky", "sun_direction": sun, "turbidity": TURBIDITY, "sun_aperture": 2.0})
     u, v = np.meshgrid((np.arange(width * finer) + 0.5) / (width * finer) * 2 * np.pi,
                        (np.arange(height * finer) + 0.5) / (height * finer) * np.pi)

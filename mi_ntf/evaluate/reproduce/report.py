@@ -8,7 +8,7 @@ from ...core import files
 from ...data.page import GREY, Page, new_figure, plain
 from . import costs as times
 from . import images, paper, tables
-from .compared import LIGHTS, METHODS, TABLES, Sizes
+from .compared import LIGHTS, METHODS, METRICS, TABLES, Sizes
 from .jobs import Plan
 from .results import Accuracy
 from .tables import Table
@@ -66,12 +66,12 @@ class Report:
         page.text(f"{done} of {len(self.plan.jobs)} jobs are done. Ours first, the paper's figure in brackets. "
                   + ("--quick: small pictures, few lights, short trainings." if self.quick else "Full size."))
         if failed:
-            page.warning(f"{len(failed)} jobs failed; why is at the end of the page. They are tried again by the same "
-                         "command.")
+            page.warning(f"{_count(len(failed), 'job')} failed; why is at the end of the page. The same command tries "
+                         "again.")
         for kind, light in LIGHTS.items():
             ssim, rmse = (self.accuracy.over_scenes("drop", kind, m, "TM") for m in ("ssim", "rmse"))
             if ssim.ours is not None and rmse.ours is not None:
-                page.text(f"{light}, TM against NRF, mean of {len(self.plan.scenes)} scenes: SSIM less by "
+                page.text(f"{light}, TM against NRF, mean of {_count(len(self.plan.scenes), 'scene')}: SSIM less by "
                           f"{ssim.ours:.4f} [{ssim.paper:.4f}], rMSE {rmse.ours:+.1%} [{rmse.paper:+.1%}].")
         page.section("What differs from the paper")
         page.table([""], [[text] for text in differences(self.plan.sizes, self.plan, machine)])
@@ -79,6 +79,10 @@ class Report:
     def _table2(self, page: Page) -> None:
         few, many = self.accuracy.images()
         if many:
+            missing = [METRICS[m] for m in METRICS if not self.accuracy.measured(m)]
+            if missing:
+                page.text(f"{' and '.join(missing)}: not measured here. MS-SSIM needs 176² pixels; LPIPS its package "
+                          "and AlexNet's weights, `mi-ntf compare` says from where.")
             page.text(f"Means of {few} to {many} pictures of {self.plan.sizes.pixels}² pixels [400 and 18, of 600²]. "
                       "SSIM and MS-SSIM: more is better; LPIPS and rMSE: less. Drops: above 0 is worse than NRF.")
             body = [[LIGHTS[kind], name, len(s), f"{np.median(s):.1f}"] for (kind, name), s in
@@ -150,7 +154,7 @@ class Report:
             a.plot(row["t"], row["curves"][marched], color="#e0433a", linewidth=1.2)
             a.plot(row["t"], row["curves"][name], color="#3b82e0", linewidth=1.2)
             a.set_title(name)
-            a.set(ylim=(-0.05, 1.05))
+            a.set(ylim=(-0.05, 1.05), xticks=np.linspace(-1, 1, 5))
             plain(a)
         for a in axes[len(others):]:
             a.set_axis_off()
@@ -180,6 +184,10 @@ class Report:
 
     def _built(self) -> dict[str, dict]:
         return {name.split("/")[1]: row for name, row in self.rows.items() if name.startswith("build/")}
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}" + ("" if number == 1 else "s")
 
 
 def _finish(*axes) -> None:

@@ -73,6 +73,10 @@ class Accuracy:
         rows = self._found.get((scene, kind, method), {})
         return {light: row[metric] for light, row in rows.items() if row.get(metric) is not None}
 
+    def measured(self, metric: str) -> bool:
+        """Whether any picture has it."""
+        return any(row.get(metric) is not None for rows in self._found.values() for row in rows.values())
+
     def images(self) -> tuple[int, int]:
         """Fewest and most pictures of a mean."""
         counts = [len(rows) for rows in self._found.values()]

@@ -102,7 +102,8 @@ def complexity(costs: times.Costs) -> Table:
             ["hours of queries, here", *(f"{counts[k] * each[k] / 3600:.3g}" for k in paper.COMPLEXITY)]]
     measured = {name: np.divide(*times.transmittance(costs, lights, *times.MAP)[::-1])
                 for name, lights in paper.LIGHTS.items()}
-    note = (f"Ideal speed-up of TM over NRF with the queries of reflectance: {paper.ideal_speed_up(1):.2f} × for one "
+    note = ("AG asks at every sample of a camera ray, l·n·c; the paper has m for c, which is as large. "
+            f"Ideal speed-up of TM over NRF with the queries of reflectance: {paper.ideal_speed_up(1):.2f} × for one "
             f"light, {paper.ideal_speed_up(500):.0f} × for 500; of the transmittance alone {paper.SAMPLES} ×, measured "
             f"{measured['environment']:.0f} × [391 ×].")
     return Table("Time-complexity of relighting with an environment map", ["", *paper.COMPLEXITY], rows, (), note)
