@@ -265,8 +265,8 @@ class Reproduce:
     tables: tuple[str, ...] = ()
     """Of table1, table2, runtime, maps, complexity, curves, ablation; all unless given."""
     methods: tuple[str, ...] = ()
-    """Of NRF, TM, AG, "No AG", NeRV, "TM of AG", "TM field"; all unless given. The first two and the last train
-    nothing."""
+    """Of NRF, TM, AG, "No AG", NeRV, "TM of AG", "TM field", March; all unless given. The first two and the last two
+    train nothing."""
     json: bool = False
     """Print JSON in place of a summary."""
 

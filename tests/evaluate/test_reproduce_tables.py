@@ -93,7 +93,7 @@ def test_table_2_is_laid_out_as_in_the_paper(found):
     assert block.rows[1] == ["mine", "0.200", "0.190", "0.800", "0.810", "1"]
     assert block.rows[2][:2] == ["mean of 2 [of 3]", "0.200 [0.056]"]
     drops = tables.drops(found, ["NRF", "TM"])[1]
-    assert drops.rows[0] == ["statue [Sitting Buddha]", "+20.0% [+100.0%]", "+0.010 [+0.009]", "1"]
+    assert drops.rows[0] == ["statue [Sitting Buddha]", "+20.0% [+100.0%]", "+0.0100 [+0.009]", "1"]
     assert blocks[0].rows[0][1] == "– [0.985]"
 
 

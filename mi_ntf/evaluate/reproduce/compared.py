@@ -8,6 +8,7 @@ No AG      the same, trained on camera rays alone
 NeRV       ``visibility_mlp``: a network of a point and a direction (Srinivasan et al. 2021)
 TM of AG   maps filled by the network of AG: the paper's own TM, letter by letter
 TM field   maps marched from the field, the product's default: no network
+March      ``raymarch``: the field's own transmittance, which NRF tabulates
 =========  ===========================================================================================================
 
 The fields are the shipped ones in every column: density, normals and reflectance are the same, so that columns differ
@@ -52,6 +53,7 @@ METHODS = {m.name: m for m in (
     Method("NeRV", "visibility_mlp", network="ag"),
     Method("TM of AG", "transmittance_map", NETWORK, network="ag"),
     Method("TM field", "transmittance_map"),
+    Method("March", "raymarch"),
 )}
 
 

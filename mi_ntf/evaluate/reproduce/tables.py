@@ -31,10 +31,9 @@ def number(value: float | None, form: str = ".3f") -> str:
     return MISSING if value is None or not np.isfinite(value) else f"{value:{form}}"
 
 
-def cell(figure: Figure, form: str = ".3f") -> str:
-    """``ours [the paper's]``."""
-    theirs = "" if figure.paper is None else f" [{number(figure.paper, form)}]"
-    return number(figure.ours, form) + theirs
+def cell(figure: Figure, form: str, theirs: str) -> str:
+    """``ours [the paper's]``; `form` and `theirs`: their formats."""
+    return number(figure.ours, form) + ("" if figure.paper is None else f" [{number(figure.paper, theirs)}]")
 
 
 def seconds(value: float) -> str:
@@ -44,13 +43,14 @@ def seconds(value: float) -> str:
 
 def table2(found: Accuracy, methods: list[str]) -> list[Table]:
     """The paper's four blocks, with the mean over scenes."""
-    return _blocks(found, methods, "mean", "", lambda metric: ".3f")
+    return _blocks(found, methods, "mean", "", lambda metric: (".3f", ".3f"))
 
 
 def drops(found: Accuracy, methods: list[str]) -> list[Table]:
     """The same blocks less NRF's column: how much worse each method is than NRF."""
     others = [name for name in methods if name != BASE]
-    return _blocks(found, others, "drop", "drop against NRF, ", lambda m: "+.1%" if m == "rmse" else "+.3f")
+    forms = {"rmse": ("+.1%", "+.1%")}
+    return _blocks(found, others, "drop", "drop against NRF, ", lambda m: forms.get(m, ("+.4f", "+.3f")))
 
 
 def _blocks(found: Accuracy, methods: list[str], what: str, title: str, form) -> list[Table]:
@@ -64,9 +64,9 @@ def _blocks(found: Accuracy, methods: list[str], what: str, title: str, form) ->
                 name = scene.name + (f" [{scene.paper}]" if scene.paper else "")
                 counts = {f.images for _, f in figures if f.images}
                 images = f"{min(counts)}–{max(counts)}" if len(counts) > 1 else str(*counts or (0,))
-                rows.append([name, *(cell(f, form(m)) for m, f in figures), images])
+                rows.append([name, *(cell(f, *form(m)) for m, f in figures), images])
             means = [(m, found.over_scenes(what, kind, m, name)) for m in pair for name in methods]
-            rows.append([f"mean of {len(found.scenes)} [of 3]", *(cell(f, form(m)) for m, f in means), ""])
+            rows.append([f"mean of {len(found.scenes)} [of 3]", *(cell(f, *form(m)) for m, f in means), ""])
             header = ["scene", *methods, *methods, "pictures"]
             tables.append(Table(f"{light}, {title}{METRICS[pair[0]]} and {METRICS[pair[1]]}", header, rows, groups))
     return tables
