@@ -248,6 +248,11 @@ def test_own_environments(tmp_path):
     assert [light.title for light in found] == ["a.hdr", "b.exr"]
     mean = lights.mean_radiance(lights.read(lights.ENVIRONMENT))
     np.testing.assert_allclose(np.array(found[1].emitter["bitmap"]), mean, rtol=1e-4)
+    uneven = np.random.default_rng(0).uniform(0.5, 1, (4, 8, 3)).astype(np.float32)
+    for name, image in (("b.exr", uneven), ("c.exr", np.ascontiguousarray(uneven[:, ::-1]))):
+        mi.Bitmap(image).write(str(tmp_path / name))
+    _, one, mirrored = lights.environments(0, tmp_path)
+    assert one.about != mirrored.about  # pictures under one of them are none of the other
     mi.Bitmap(np.zeros((4, 8, 3), np.float32)).write(str(tmp_path / "b.exr"))
     with pytest.raises(MiNtfError, match=r"environment b\.exr is black"):
         lights.environments(0, tmp_path)

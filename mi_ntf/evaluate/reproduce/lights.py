@@ -5,6 +5,7 @@ know no exposure: a white surface that faces the point light shines 1, and every
 the shipped one.
 """
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -86,8 +87,8 @@ def environments(count: int, folder: Path | None = None) -> list[Light]:
             raise MiNtfError(f"environment {name} is black; remove it from the folder, or give it light")
         scaled = np.ascontiguousarray(image * (wanted / mean), np.float32)
         emitter = {"type": "envmap", "bitmap": mi.Bitmap(scaled)}
-        digest = [name, list(image.shape), float(np.float32(scaled).sum(dtype=np.float64))]
-        found.append(Light(f"environment-{k:03}", name, "environment", emitter, None, k == 0, digest))
+        about = [list(scaled.shape), hashlib.sha256(scaled.tobytes()).hexdigest()]
+        found.append(Light(f"environment-{k:03}", name, "environment", emitter, None, k == 0, about))
     return found
 
 
