@@ -79,7 +79,7 @@ class Train:
     seed: int = 0
     """Seed of weights and samples."""
     ntf: str | None = None
-    """Transmittance network in place of the preset's: mixture2, logistic or ray."""
+    """Transmittance network in place of the preset's: mixture2, logistic, ray or paper."""
     no_augmentation: bool = False
     """Learn transmittance on camera rays alone."""
     no_colour_loss: bool = False
@@ -282,6 +282,34 @@ class Tradeoff:
 
 
 @dataclass
+class Reproduce:
+    """The paper's tables and figures on our scenes, every number beside the paper's. Run again, it goes on."""
+
+    output: Annotated[Path, arg(aliases=("-o",), metavar="DIR")] = Path("reproduce")
+    """Folder of the run: finished jobs, references, networks, report.html, tables.tex."""
+    quick: bool = False
+    """Small pictures, few lights, short trainings: an afternoon on two cores."""
+    scenes: tuple[str, ...] = ()
+    """Names of scenes/, or folders with mesh.xml and field.safetensors; statue, globe and knot unless given."""
+    environments: Annotated[Path | None, arg(metavar="FOLDER")] = None
+    """Latitude-longitude maps (.hdr, .exr) in place of 18 made from the shipped one."""
+    tables: tuple[str, ...] = ()
+    """Of table1, table2, runtime, maps, complexity, curves, ablation; all unless given."""
+    methods: tuple[str, ...] = ()
+    """Of NRF, TM, AG, "No AG", NeRV, "TM of AG", "TM field", March; all unless given. The first two and the last two
+    train nothing."""
+    json: bool = False
+    """Print JSON in place of a summary."""
+
+    def run(self) -> int:
+        from mi_ntf.evaluate.reproduce import print_table, reproduce
+
+        found = reproduce(self.output, self.quick, self.scenes, self.environments, self.tables, self.methods)
+        _report(found, self.json, print_table)
+        return 1 if found["failed"] else 0
+
+
+@dataclass
 class Bake:
     """Write the transmittance maps of a scene's lights, one part of an EXR file each."""
 
@@ -342,6 +370,7 @@ Command = (
     | Annotated[Explain, subcommand("explain")]
     | Annotated[Bench, subcommand("bench")]
     | Annotated[Tradeoff, subcommand("tradeoff")]
+    | Annotated[Reproduce, subcommand("reproduce")]
     | Annotated[Bake, subcommand("bake")]
     | Annotated[Info, subcommand("info")]
     | Annotated[Doctor, subcommand("doctor")]

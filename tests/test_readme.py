@@ -83,6 +83,9 @@ def test_command(folder, words):
         words += [word for k, v in CAPTURE.items() if k not in words for word in (k, v)]
     if words[0] == "mitsuba" and "scenes/" in words[-1]:  # a swapped one is small by itself
         words[1:1] = ["-D", "res=16"]
+    if words[1] == "reproduce":  # a table without pictures and trainings
+        words = [*words[:2], "-o", "reproduced", "--quick", "--scenes", "statue", "--tables", "curves", "--methods",
+                 "TM"]
     if words[1] in ("explain", "bake", "tradeoff"):
         words += ["-D", "res=16", "-D", "spp=1"]
     if words[1] == "tradeoff" and "--budget" not in words:
@@ -94,7 +97,7 @@ def test_command(folder, words):
 def test_every_command_is_shown():
     shown = {words[1] if words[0] == "mi-ntf" else words[0] for words in COMMANDS}
     assert shown == {"capture", "inspect", "train", "swap", "mitsuba", "info", "compare", "explain", "bake", "make",
-                     "tradeoff"}
+                     "tradeoff", "reproduce"}
 
 
 def test_readme_is_short():

@@ -67,9 +67,12 @@ class Page:
         """A paragraph that stands out."""
         self._parts.append(f'<p class="warning">⚠ {escape(text)}</p>')
 
-    def table(self, header: Sequence[object], rows: Iterable[Sequence[object]], folded: str = "") -> None:
-        """A table, one text or number a cell. `folded`: what is shown in its place until it is clicked on."""
-        lines = ["".join(f"<th>{escape(str(cell))}</th>" for cell in header)]
+    def table(self, header: Sequence[object], rows: Iterable[Sequence[object]], folded: str = "",
+              groups: Sequence[tuple[str, int]] = ()) -> None:
+        """A table, one text or number a cell. `folded`: what is shown in its place until it is clicked on. `groups`: a
+        line above the header, each text over so many columns."""
+        lines = ["".join(f'<th colspan="{span}">{escape(text)}</th>' for text, span in groups)] if groups else []
+        lines += ["".join(f"<th>{escape(str(cell))}</th>" for cell in header)]
         lines += ["".join(f"<td>{escape(str(cell))}</td>" for cell in row) for row in rows]
         table = "<table>" + "".join(f"<tr>{line}</tr>\n" for line in lines) + "</table>"
         self._parts.append(f"<details><summary>{escape(folded)}</summary>{table}</details>" if folded else table)
@@ -82,11 +85,14 @@ class Page:
             self._image(encode(array), caption, f'{small} width="{width}"')
         self._parts.append("</div>")
 
-    def figure(self, figure, caption: str = "") -> None:
-        """A `matplotlib.figure.Figure`; its background is the page's, its text and axes should be ``GREY``."""
+    def figure(self, figure, caption: str = "", vector: bool = False) -> None:
+        """A `matplotlib.figure.Figure`; its background is the page's, its text and axes should be ``GREY``. `vector`:
+        as SVG, for figures of few lines."""
         buffer = io.BytesIO()
-        figure.savefig(buffer, format="png", dpi=150, transparent=True)
-        self._image(_uri("png", buffer.getvalue()), caption, f' width="{int(96 * figure.get_figwidth())}"')
+        metadata = {"Date": None} if vector else {}  # the same figure is the same page
+        figure.savefig(buffer, format="svg" if vector else "png", dpi=150, transparent=True, metadata=metadata)
+        uri = _uri("svg+xml" if vector else "png", buffer.getvalue())
+        self._image(uri, caption, f' width="{int(96 * figure.get_figwidth())}"')
 
     def curves(self, title: str, curves: Mapping[str, tuple[Sequence[float], Sequence[float]]], xlabel: str = "",
                ylabel: str = "", log: bool = False) -> None:

@@ -117,9 +117,10 @@ NTF = {
     "mixture2": FAST.transmittance,
     "logistic": replace(FAST.transmittance, components=1),
     "ray": Network(Encoding("frequency", octaves=6), (128, 128, 128, 128)),
+    "paper": PAPER.transmittance,
 }
 """Transmittance networks by name: two logistics or one, read from the ray's optical depths; and the paper's kind, one
-logistic from the ray's end points alone, of a size that CPUs can train."""
+logistic from the ray's end points alone, of a size that CPUs can train and of the paper's own."""
 
 
 def configured(preset: str, *, ntf: str | None = None, augmentation: bool = True, colour_loss: bool = True,

@@ -12,7 +12,7 @@ from mi_ntf.core.errors import MiNtfError
 from mi_ntf.data.images import LINEAR
 from mi_ntf.data.page import Page, new_figure
 
-URI = re.compile(r"data:image/(\w+);base64,([A-Za-z0-9+/=]+)")
+URI = re.compile(r"data:image/([\w+]+);base64,([A-Za-z0-9+/=]+)")
 
 
 def pictures(html: str) -> list[np.ndarray]:
@@ -80,6 +80,21 @@ def test_curves_are_drawn_in_their_colours():
     opaque = figure[figure[..., 3] == 255][:, :3].astype(int)
     assert (np.abs(opaque - (0xE0, 0x43, 0x3A)).max(1) < 8).sum() > 100  # red
     assert (figure[..., 3] == 0).mean() > 0.8  # the page shows through
+
+
+def test_figures_of_lines_and_headers_over_several_columns():
+    page = Page("p")
+    figure = new_figure(2, 1)
+    figure.add_subplot().plot([0, 1], [1, 2])
+    page.figure(figure, vector=True)
+    page.table(["", "a", "b"], [[1, 2, 3]], groups=[("", 1), ("both <", 2)])
+    html = page.html()
+    [(kind, content)] = URI.findall(html)
+    assert kind == "svg+xml" and b"<svg" in base64.b64decode(content) and 'width="192"' in html
+    assert '<tr><th colspan="1"></th><th colspan="2">both &lt;</th></tr>\n<tr><th></th><th>a</th>' in html
+    again = Page("p")
+    again.figure(figure, vector=True)
+    assert content in again.html() or "clipPath" in base64.b64decode(content).decode()
 
 
 def test_written_whole_or_not_at_all(tmp_path, monkeypatch):

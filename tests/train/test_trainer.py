@@ -105,7 +105,7 @@ def _step(state):
 
 @pytest.mark.parametrize(("options", "text"), [
     ({"preset": "quick"}, "preset 'quick' is unknown; it is one of fast"),
-    ({"ntf": "mixture9"}, "--ntf 'mixture9' is unknown; it is one of mixture2, logistic, ray"),
+    ({"ntf": "mixture9"}, "--ntf 'mixture9' is unknown; it is one of mixture2, logistic, ray, paper"),
     ({"minutes": 1, "steps": 10}, "both --minutes 1 and --steps 10 are given"),
     ({"steps": 0}, "--steps is 0; it must be positive"),
     ({"minutes": float("nan")}, "--minutes is nan; it must be positive"),
