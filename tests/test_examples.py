@@ -19,7 +19,7 @@ ROOT = Path(__file__).parents[1]
 
 def _run(script, *words):
     words = [sys.executable, ROOT / "examples" / script, *map(str, words)]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=300, check=False)
+    done = subprocess.run(words, capture_output=True, text=True, timeout=900, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 

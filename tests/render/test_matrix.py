@@ -26,6 +26,12 @@ DRAWN = ("area", "projector")
 KINDS = ("point", "spot", "directional", "constant", "envmap", "sunsky", "area", "projector", "directionalarea")
 
 
+@pytest.fixture(autouse=True)
+def one_atlas_a_field(monkeypatch):
+    """Made once for all emitters."""
+    monkeypatch.setenv("MI_NTF_MAP_CACHE", "memory")
+
+
 def images(name: str, kind: str, methods) -> dict[str, np.ndarray]:
     """The scene's field from its own camera, 64² pixels, lit by one emitter: method → RGB; "fine" for marches of
     quarter steps."""
