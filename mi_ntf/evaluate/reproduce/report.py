@@ -133,10 +133,9 @@ class Report:
             theirs = [paper.TABLE1[kind]["transmittance"][k] for kind in LIGHTS]
             axes.plot([1, 500], theirs, "o", color=colour, markerfacecolor="none")
         axes.plot([], [], "o", color=GREY, markerfacecolor="none", label="the paper's table 1")
-        for scene, row in built.items():
+        for row in built.values():
             axes.plot(row["lights"], row["map"], ".", color="#3b82e0")
             axes.plot(row["lights"], row["volume"], ".", color="#e0433a")
-            axes.annotate(scene, (row["lights"][-1], row["volume"][-1]), color=GREY, fontsize=7)
         axes.set(xlabel="lights", ylabel="seconds", xscale="log", yscale="log")
         _finish(axes)
         page.figure(figure, "Seconds to make all maps or volumes by the number of lights. Dots: measured on the "
