@@ -19,7 +19,8 @@ def swap(scene: Path, field: Path, out: Path) -> None:
     capture. The integrator becomes ``nrf`` with ``<default name="visibility" value="auto"/>`` and keeps `max_depth` and
     `hide_emitters`. Sensors, films, emitters, parameters and includes stay; an include that holds shapes or the
     integrator is inlined, with ``$parameters`` in its name at their defaults. BSDFs and textures that nothing uses any
-    more are dropped. Paths are rewritten for `out`'s folder. Comments are lost.
+    more are dropped. Paths are rewritten for `out`'s folder, whose files come before those of the same name in the
+    working folder. Comments are lost.
 
     Raises :class:`MiNtfError` where `scene` is no Mitsuba XML, has no shape to replace, or an include is missing.
     """
@@ -159,6 +160,7 @@ def _drop_unused(root: ET.Element, folder: Path, defaults: dict[str, str]) -> No
 def _move_paths(root: ET.Element, old: Path, new: Path, defaults: dict[str, str]) -> None:
     """Make relative paths, written for the folder `old`, right for the folder `new`."""
     if old.resolve() == new.resolve():
+        _look_here_first(root)
         return
     nodes = [(e, "value") for e in root.iter("string") if e.get("name") == "filename"]
     nodes += [(e, "filename") for e in root.iter() if e.tag in ("include", "spectrum")]
@@ -172,3 +174,10 @@ def _move_paths(root: ET.Element, old: Path, new: Path, defaults: dict[str, str]
     if root.find("include") is not None:
         # Mitsuba looks for the files that an include names in the main scene's folder, so that folder stays known.
         root.insert(0, ET.Element("path", value=Path(os.path.relpath(old, new)).as_posix()))
+    _look_here_first(root)
+
+
+def _look_here_first(root: ET.Element) -> None:
+    """Mitsuba looks in the working folder first, where another field may have the name of this one; the last path that
+    is added comes before all."""
+    root.insert(len(root.findall("path")), ET.Element("path", value="."))

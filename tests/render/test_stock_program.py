@@ -1,5 +1,7 @@
 """The stock `mitsuba` program with the plugins of this package: same picture as Python, clean exits, clear errors."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from helpers import scenes
@@ -8,6 +10,7 @@ from helpers.programs import run_program
 import mi_ntf.render
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.evaluate.compare import read_image
+from mi_ntf.swap import swap
 
 SCENE = """<scene version="3.9.0">
   <default name="visibility" value="auto"/> <default name="spp" value="4"/>
@@ -55,6 +58,23 @@ def test_equals_rendering_from_python(folder, variant, visibility, tmp_path):
     ours = np.array(variant.render(variant.load_file(str(path), visibility=visibility), seed=0))
     assert ours[..., :3].max() > 0.05
     np.testing.assert_allclose(read_image(out), ours, atol=1e-4)
+
+
+@pytest.mark.parametrize("place", ["", "deep"])
+def test_a_field_in_the_working_folder_is_not_taken_for_the_scenes_own(folder, tmp_path, place):
+    """`mi-ntf swap` names the field's file, and Mitsuba looks for files in the working folder first."""
+    (folder / "mesh.xml").write_text(SCENE.format(integrator="path", options="", light=POINT))
+    (folder / "light.xml").write_text(f'<scene version="3.9.0">{POINT}</scene>')
+    swapped = folder / place / "swapped.xml"
+    swap(folder / "mesh.xml", folder / "blobs.safetensors", swapped)
+    (tmp_path / "blobs.safetensors").write_bytes(b"another")
+    (tmp_path / "field.safetensors").write_bytes(b"another")
+    shipped = Path(__file__).parents[2] / "scenes/statue/scene.xml"
+    for scene in (swapped, shipped):
+        small = ["-D", "res=8"] if scene == shipped else []
+        done = run_program("mitsuba", "-m", "llvm_ad_rgb", "-D", "visibility=none", "-D", "spp=1", *small, "-o",
+                           tmp_path / "a.exr", scene, cwd=tmp_path)
+        assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_twenty_runs_in_a_row_exit_cleanly(folder, tmp_path):

@@ -107,7 +107,7 @@ def test_paths_move_with_the_output(folder):
     assert root.find("emitter/string").get("value") == "../../scene/env.exr"
     assert root.find("shape/medium/string").get("value") == "../../scene/f.safetensors"
     # The included light names env.exr, which Mitsuba seeks in the main scene's folder and in <path>s.
-    assert [p.get("value") for p in root.findall("path")] == ["../../scene"]
+    assert [p.get("value") for p in root.findall("path")] == ["../../scene", "."]
 
 
 def test_includes_with_shapes_are_inlined_recursively(folder):
