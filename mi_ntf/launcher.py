@@ -5,18 +5,25 @@ parse, instantiate, render without developing, let the film write the file.
 """
 
 import argparse
+import json
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import OpenEXR
 
 from mi_ntf import bridge
+from mi_ntf.core import files
 from mi_ntf.core.errors import MiNtfError
 
 VARIANT_PRIORITY = ("cuda_ad_rgb", "llvm_ad_rgb")
 """Without `-m`, the first of these that this machine can run, as in the stock program."""
+
+MTIME = 2.0
+"""Seconds that a file system's clock may be behind."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -79,7 +86,24 @@ def render_file(path: Path, parameters: dict[str, str], *, sensor_index: int = 0
 
     sensor = scene.sensors()[sensor_index]
     scene.integrator().render(scene, sensor, develop=False)
+    begun = time.time()
     sensor.film().write(str(output or path))
+    written = (output or path).with_suffix(".exr")  # of EXR films
+    if written.is_file() and written.stat().st_mtime > begun - MTIME:
+        _annotate(written, getattr(scene.integrator(), "achieved", {}))
+
+
+def _annotate(path: Path, achieved: dict) -> None:
+    """Write what came of the limits of an ``nrf`` integrator into the header of the EXR `path`, as JSON under
+    ``mi_ntf``; pixels stay as they are. The stock program has no place for it."""
+    if not achieved:
+        return
+    # What is not a number is none in JSON.
+    text = json.dumps(json.loads(json.dumps(achieved), parse_constant=lambda _: None))
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        header = {name: value for name, value in file.header().items() if name != "channels"}
+        with files.replacing(path) as temporary:
+            OpenEXR.File(header | {"mi_ntf": text}, file.channels()).write(str(temporary))
 
 
 def _apply_settings(args: argparse.Namespace) -> None:

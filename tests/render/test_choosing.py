@@ -1,12 +1,15 @@
 """What is chosen under limits of error and time."""
 
+from dataclasses import replace
+
 import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import scenes
 
+from mi_ntf.infer.visibility import REGISTRY
 from mi_ntf.render.cost import model
-from mi_ntf.render.transport import choosing
+from mi_ntf.render.transport import choosing, estimate, probing
 
 
 def nrf(**options) -> dict:
@@ -19,12 +22,25 @@ def relative(image, truth) -> float:
 
 @pytest.fixture
 def trials_are_free(monkeypatch):
-    """As if every picture were large."""
+    """As if every picture were large; of the methods those that are built fast."""
     monkeypatch.setattr(choosing, "TRIAL", 0.0)
+    monkeypatch.setattr(choosing, "REGISTRY", {n: REGISTRY[n] for n in ("raymarch", "transmittance_map")})
+
+
+def prices(monkeypatch, each):
+    """Every sample takes `each(settings)` seconds: small pictures are measured too roughly to be told apart."""
+    plain = probing.Probes.look
+
+    def look(self, compose):
+        found = plain(self, compose)
+        return replace(found, built=0.0, each=each(found.composition.settings))
+
+    monkeypatch.setattr(probing.Probes, "look", look)
 
 
 @pytest.mark.parametrize("limit", [0.3, 0.06, 1e-4])
-def test_the_error_is_kept(blobs, trials_are_free, limit):
+def test_the_error_is_kept(blobs, trials_are_free, monkeypatch, limit):
+    prices(monkeypatch, lambda s: (2.0 if s.visibility == "raymarch" else 1.0) * s.environment_lights / 512)
     loaded = scenes.scene(blobs, nrf(max_error=limit), {"light": scenes.light("env")}, size=32, spp=2)
     image = mi.render(loaded, seed=1).numpy()[..., :3]
     march = mi.load_dict(nrf(visibility="raymarch"))
@@ -58,9 +74,9 @@ def test_a_named_method_stays(blobs, trials_are_free):
 def test_a_faint_lobe_is_left_out(tmp_path, trials_are_free, monkeypatch):
     """Where the prices say that it saves enough."""
     path = scenes.write_blobs(tmp_path, log_density=3.0, specular=0.06, roughness=0.9)
-    plain = choosing.Chooser._seconds
-    monkeypatch.setattr(choosing.Chooser, "_seconds",
-                        lambda self, composition, s: plain(self, composition, s) * (1 if s.specular else 0.8))
+    plain = estimate.Estimate.seconds
+    monkeypatch.setattr(estimate.Estimate, "seconds", lambda self, s: plain(self, s) * (1 if s.specular else 0.5))
+    prices(monkeypatch, lambda s: 1.0 if s.specular else 0.5)
     loaded = scenes.scene(path, nrf(visibility="raymarch", max_error=0.1), {"light": scenes.light("point")}, size=24)
     image = mi.render(loaded, seed=1).numpy()[..., :3]
     found = loaded.integrator().achieved
@@ -69,10 +85,62 @@ def test_a_faint_lobe_is_left_out(tmp_path, trials_are_free, monkeypatch):
     assert 0 < relative(image, whole) <= 0.1
 
 
+def test_dim_lights_are_left_out(blobs, trials_are_free, monkeypatch):
+    """Forty of a thousandth of the light of the one beside them; as many steps as keep to the error."""
+    prices(monkeypatch, lambda s: 1.0 - s.dimmest)
+    monkeypatch.setattr(estimate.Estimate, "seconds", lambda self, s: self._count(s) * (s.visibility == "raymarch"))
+    rng = np.random.default_rng(1)
+    lamps = {f"l{i}": {"type": "point", "position": [3.4 * c for c in rng.normal(size=3)],
+                       "intensity": {"type": "rgb", "value": 0.05}} for i in range(40)}
+    loaded = scenes.scene(blobs, nrf(visibility="raymarch", max_error=0.05), {"sun": scenes.light("point"), **lamps},
+                          size=16, spp=2)
+    image = mi.render(loaded, seed=1).numpy()[..., :3]
+    found = loaded.integrator().achieved
+    assert [t["name"] for t in found["trials"] if t["taken"]][-1] == "raymarch without dim lights"
+    whole = mi.render(loaded, integrator=mi.load_dict(nrf(visibility="raymarch")), seed=1).numpy()[..., :3]
+    assert 0 < relative(image, whole) <= 0.05
+
+
+@pytest.mark.parametrize("shown", [True, False])
+def test_a_field_of_a_few_pixels_is_left_out_or_seen(blobs, trials_are_free, monkeypatch, shown):
+    """Probes go to it, however small: where it is as bright as a lamp, it stays."""
+    prices(monkeypatch, lambda s: 1.0 - 0.5 * len(s.without))
+    monkeypatch.setattr(estimate.Estimate, "seconds", lambda self, s: 1.0 - 0.5 * len(s.without))
+    center, radius = np.array([-1.6, 0.2, -3.0]), 0.12
+    size = radius / scenes.SIMILARITY.radius
+    place = mi.ScalarTransform4f().translate((center - size * np.array(scenes.SIMILARITY.center)).tolist()).scale(size)
+    far = scenes.ball(blobs, scenes.Similarity(tuple(center), radius), to_world=place)
+    lights = {"sun": scenes.light("directional")}
+    if shown:
+        lights["lamp"] = {"type": "point", "position": [-1.5, 0.3, -2.6], "intensity": {"type": "rgb", "value": 100}}
+    loaded = scenes.scene(blobs, nrf(visibility="raymarch", max_error=0.1), lights,
+                          shapes={"far": far}, size=64, spp=1)
+    image = mi.render(loaded, seed=1).numpy()[..., :3]
+    whole = mi.render(loaded, integrator=mi.load_dict(nrf(visibility="raymarch")), seed=1).numpy()[..., :3]
+    (trial,) = [t for t in loaded.integrator().achieved["trials"] if "small fields" in t["name"]]
+    assert trial["taken"] != shown
+    assert relative(image, whole) <= 0.1 and (relative(image, whole) > 0) != shown
+
+
+@pytest.mark.parametrize(("frames", "visibility"), [(1, "raymarch"), (20, "transmittance_map")])
+def test_frames_share_what_is_built_and_the_choice(blobs, monkeypatch, frames, visibility):
+    """What does not pay for one picture pays for many; pixels are rendered beforehand for the first alone."""
+    monkeypatch.setattr(choosing, "REGISTRY", {n: REGISTRY[n] for n in ("raymarch", "transmittance_map")})
+    prices(monkeypatch, lambda s: 2.0 if s.visibility == "raymarch" else 1.7)
+    monkeypatch.setattr(estimate.Estimate, "seconds", lambda self, s: 2.0 if s.visibility == "raymarch" else 1.7)
+    loaded = scenes.scene(blobs, nrf(max_error=0.3, frames=frames), {"light": scenes.light("point")}, size=16, spp=1)
+    mi.render(loaded)
+    first = loaded.integrator().achieved
+    assert first["visibility"] == visibility
+    monkeypatch.setattr(probing.Probes, "__init__", None)
+    mi.render(loaded, seed=1)
+    assert loaded.integrator().achieved["trials"] == first["trials"]
+
+
 def test_time_for_the_march(blobs):
     """Where it fits it has no error; where not even one sample does, that is said."""
     lights = {"light": scenes.light("env")}
-    loaded = scenes.scene(blobs, nrf(time_budget=1e4), lights, size=16, spp=1)
+    loaded = scenes.scene(blobs, nrf(time_budget=30), lights, size=16, spp=1)
     chooser = choosing.Chooser(loaded, choosing.Settings.of(loaded.integrator()), loaded.integrator().limits,
                                loaded.sensors()[0], 1, None)
     assert chooser.choose().composition.effects.visibility == "raymarch"

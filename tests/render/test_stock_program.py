@@ -1,8 +1,10 @@
 """The stock `mitsuba` program with the plugins of this package: same picture as Python, clean exits, clear errors."""
 
+import json
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pytest
 from helpers import scenes
 from helpers.programs import run_program
@@ -75,6 +77,20 @@ def test_a_field_in_the_working_folder_is_not_taken_for_the_scenes_own(folder, t
         done = run_program("mitsuba", "-m", "llvm_ad_rgb", "-D", "visibility=none", "-D", "spp=1", *small, "-o",
                            tmp_path / "a.exr", scene, cwd=tmp_path)
         assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_our_program_writes_what_it_achieved_into_the_header(folder, tmp_path):
+    """And the picture of the stock program."""
+    options = NRF["options"] + '<float name="noise_threshold" value="0.05"/>'
+    path = write(folder, "noise.xml", options=options)
+    words = ("-m", "llvm_ad_rgb", "-D", "visibility=raymarch")
+    for command in (("mi-ntf", "render"), ("mitsuba",)):
+        done = run_program(*command, *words, "-o", tmp_path / f"{command[0]}.exr", path, cwd=tmp_path)
+        assert done.returncode == 0, done.stdout + done.stderr
+    with OpenEXR.File(str(tmp_path / "mi-ntf.exr"), header_only=True) as file:
+        found = json.loads(file.header()["mi_ntf"])
+    assert found["ended"] == "noise" and found["noise"] <= 0.05 and found["visibility"] == "raymarch"
+    np.testing.assert_array_equal(read_image(tmp_path / "mi-ntf.exr"), read_image(tmp_path / "mitsuba.exr"))
 
 
 def test_twenty_runs_in_a_row_exit_cleanly(folder, tmp_path):

@@ -12,13 +12,11 @@ import drjit as dr
 import numpy as np
 
 from ...core.errors import MiNtfError
-from ...render.cost.measurement import once
+from ...render.cost.measurement import BUILT, once
 from ...render.maps import map_cache
 from .points import STOCK, Point
 from .subject import Picture, Subject
 
-BUILT = ("maps or volumes", "bounces")
-"""Stages of :func:`mi_ntf.render.cost.measurement.once` that do not grow with pixels and samples."""
 CHEAP = 1.0
 """Seconds below which a picture is rendered `REPEATS` times warm, dearer ones once."""
 REPEATS = 3

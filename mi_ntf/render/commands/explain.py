@@ -44,6 +44,7 @@ def explain(scene: Path, parameters: dict[str, str], measure: bool = False) -> d
     choice = chooser.choose() if integrator.limits != Limits() else None
     if choice:
         settings, light, found = choice.composition.settings, choice.composition.lights, choice.effects
+        media = choice.composition.media
     else:
         light = scene_lights.Lights(loaded, media, settings.light_samples, settings.environment_lights)
         found = effects.describe(loaded, settings, sensor, spp, media, light)

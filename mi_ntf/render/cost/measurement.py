@@ -14,6 +14,9 @@ LOOPS = {"camera march": "camera march", "lights": "lights", "free flight": "bou
 they fetch reflectance, or are small."""
 
 
+BUILT = ("maps or volumes", "bounces")
+"""Stages that do not grow with pixels and samples."""
+
 _watched: list[dict] | None = None
 """History of the render that is watched, as far as it was asked for; None where none is watched."""
 
@@ -36,14 +39,28 @@ def by_clock(stage: str):
 
 @contextmanager
 def _watching():
-    """Within, a render is watched: its history."""
+    """Within, a render is watched: its history. One within another is the other's stage ``trials``."""
     global _watched
-    _watched = []
+    outer, _watched = _watched, []
+    before = dr.kernel_history()
     try:
-        dr.kernel_history_clear()
         yield _watched
     finally:
-        _watched = None
+        if outer is not None:
+            outer.extend([*before, *(kernel | {"stage": "trials"} for kernel in _watched)])
+        _watched = outer
+
+
+def watch(work):
+    """``(result, stages)``: what `work()` returns, and the seconds of its kernels as in :func:`by_stage`, compilation
+    left out. It evaluates what it returns itself."""
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.sync_thread()
+        with _watching() as history:
+            result = work()
+            dr.sync_thread()
+            history.extend(dr.kernel_history())
+    return result, by_stage(history)["stages"]
 
 
 @contextmanager
@@ -75,9 +92,9 @@ def measure(scene, integrator, spp: int) -> dict:
 def once(scene, integrator, spp: int, seed: Any) -> tuple[Any, dict]:
     """Render `scene` by any integrator: the image, and what that took.
 
-    ``stages``: kernel seconds, as in :func:`mi_ntf.render.cost.model.seconds`, and those by the clock of ``bounces`` by
-    radiosity; ``wall_seconds`` of the whole, Python, compilation and the film included; ``compile_seconds`` of it;
-    ``points``: shading points; ``peak_bytes``: most memory that Dr.Jit held.
+    ``stages``: kernel seconds, as in :func:`mi_ntf.render.cost.model.seconds`, those by the clock of ``bounces`` by
+    radiosity, and of ``trials`` before a render with limits; ``wall_seconds`` of the whole, Python, compilation and the
+    film included; ``compile_seconds`` of it; ``points``: shading points; ``peak_bytes``: most memory that Dr.Jit held.
     """
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.sync_thread()

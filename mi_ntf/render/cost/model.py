@@ -62,6 +62,7 @@ class Work:
     source        of maps: ``field`` or ``network``
     network       the field is its networks, not its grid, of `voxels`³
     patches       that light bounces between, 0 where it does not by radiosity
+    frames        pictures that share what is built for a field
     """
 
     rays: float
@@ -77,6 +78,7 @@ class Work:
     patches: int = 0
     drawn: int = 0
     others: float = 0.0
+    frames: int = 1
 
 
 def per_pair(work: Work, c: Constants) -> float:
@@ -95,10 +97,20 @@ def making(work: Work, c: Constants) -> float:
     return method.making(work, c) * (1 if method.per_field else work.lights) if method.making else 0.0
 
 
-def visibility(work: Work, c: Constants) -> float:
-    """ns of all that depends on the method: what is made, and every light's τ at every point that faces it."""
+def shared(work: Work, c: Constants) -> float:
+    """ns of :func:`making` that fall on one of `work.frames` pictures; lights may move between them."""
+    return making(work, c) / (work.frames if REGISTRY[work.method].per_field else 1)
+
+
+def asking(work: Work, c: Constants) -> float:
+    """ns of every light's τ at every point that faces it."""
     random = (work.points * work.drawn + work.others) * per_drawn_pair(work, c)
-    return making(work, c) + FACING * (work.points * work.lights * per_pair(work, c) + random)
+    return FACING * (work.points * work.lights * per_pair(work, c) + random)
+
+
+def visibility(work: Work, c: Constants) -> float:
+    """ns of all that depends on the method."""
+    return shared(work, c) + asking(work, c)
 
 
 def choose(work: Work, c: Constants | None = None) -> tuple[str, str]:
@@ -125,6 +137,7 @@ def work(integrator, medium, method: str, rays: int, lights: int = 1, drawn: int
         texels=integrator.map_resolution**2, samples=integrator.samples, source=integrator.map_source,
         components=medium.field.network.components if network else integrator.map_components,
         network=medium.representation == "network", voxels=medium.field.grid.resolution, drawn=drawn, others=others,
+        frames=integrator.frames,
     )
 
 
@@ -146,7 +159,7 @@ def seconds(work: Work, c: Constants) -> dict[str, float]:
         "maps or volumes": 1e-9 * making(work, c),
         "camera march": 1e-9 * work.rays * work.samples * (c.camera + NOT_SKIPPED * query),
         "reflectance": 1e-9 * work.points * (c.reflect + query),
-        "lights": 1e-9 * (pairs * c.shade + visibility(work, c) - making(work, c)),
+        "lights": 1e-9 * (pairs * c.shade + asking(work, c)),
     }
     if work.patches:
         rays = radiosity.CHORDS + work.patches * (radiosity.FEW**2 + radiosity.SIDE**2)

@@ -38,6 +38,19 @@ class Rows:
             cones = np.concatenate([frame.world_to_field_numpy(cones[:, :3], direction=True), cones[:, 3:]], axis=1)
         return LightTable(where, self.power, self.is_point, frame.length, mi, cones)
 
+    def strength(self, places: list) -> np.ndarray:
+        """(n,) irradiance of each light where it is strongest of all `places`, cones left aside."""
+        light = np.abs(self.power).mean(1)
+        if not self.is_point.any() or not places:
+            return light
+        squares = np.stack([((self.where - place) ** 2).sum(1) for place in places]).min(0)
+        return np.where(self.is_point, light / np.maximum(squares, 1e-12), light)
+
+    def part(self, kept: np.ndarray) -> "Rows":
+        """Those lights alone for which `kept` (n,) holds."""
+        cones = None if self.cones is None else self.cones[kept]
+        return Rows(self.where[kept], self.power[kept], self.is_point[kept], cones)
+
 
 def join(parts: list[Rows], dark: bool = False) -> Rows:
     """All of them, in order, without those that have no power unless `dark`."""

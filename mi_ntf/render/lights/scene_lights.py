@@ -43,6 +43,7 @@ class Lights:
     light_samples       0: every discrete light at every point, environments by texels, and a few samples of each
                         emitter that is no finite set of lights; n: n samples a point of all emitters together
     environment_lights  most directional lights that stand for an environment
+    dimmest             share of all light at the fields; the dimmest lights that have no more of it do not shine
 
     kinds    plugin name of each emitter
     sampled  emitters that are drawn at random
@@ -52,7 +53,8 @@ class Lights:
     Raises MiNtfError where an emitter has numbers that are none, or cannot be drawn.
     """
 
-    def __init__(self, scene, media=(), light_samples: int = 0, environment_lights: int = 512):
+    def __init__(self, scene, media=(), light_samples: int = 0, environment_lights: int = 512,
+                 dimmest: float = 0.0):
         self._wrapped: list = []
         emitters = [self._unwrap(e, scene, media) for e in scene.emitters()]
         self.kinds = [kind(e) for e in emitters]
@@ -63,10 +65,23 @@ class Lights:
         self.discrete = [Discrete.of(e, k, environment_lights) for e, k in discrete]
         # What is dark now may be the parameter that is to become light.
         dark = light_gradients.attached([e for e, _ in discrete])
-        self.rows = light_rows.join([d.rows for d in self.discrete], dark)
+        every = light_rows.join([d.rows for d in self.discrete], dark)
+        self._strength = every.strength([m.frame.origin for m in media])
+        self.rows = every.part(self._bright(dimmest)) if dimmest else every
         pairs = [(e, w) for e, w in zip(emitters, scene.emitters(), strict=True) if light_samples or not is_discrete(e)]
         self.sampled = [e for e, _ in pairs if _shines(e)]
         self._weights = [outer.sampling_weight() for e, outer in pairs if _shines(e)]
+
+    def _bright(self, dimmest: float) -> np.ndarray:
+        """Which of all rows remain."""
+        order = np.argsort(self._strength)
+        sums = np.empty(len(order))
+        sums[order] = np.cumsum(self._strength[order])
+        return sums > dimmest * self._strength.sum()
+
+    def brighter(self, dimmest: float) -> int:
+        """How many rows there are without the dimmest."""
+        return int(self._bright(dimmest).sum()) if dimmest else len(self._strength)
 
     def _unwrap(self, emitter, scene, media):
         """What an ``ntf`` emitter wraps, where its medium is one of `media`; any other emitter itself."""

@@ -54,6 +54,8 @@ def integrator_class() -> type:
                                     the picture hardly shows is left out; 0: nothing is (default: 0)
         time_budget         float   seconds that a render may take, maps and compilation included; 0 or below: any
                                     (default: 0)
+        frames              integer pictures that will be rendered of the same fields: ``auto`` shares among them what
+                                    is built for a field (default: 1)
         timeout             float   seconds after which rendering ends with what is there; below 0: never (default: -1)
         =================== ======= ===================================================================================
 
@@ -98,6 +100,8 @@ def integrator_class() -> type:
             self.limits = Limits(noise=read.number("noise_threshold", 0.0, 0.0, 1e6),
                                  error=read.number("max_error", 0.0, 0.0, 1e6),
                                  seconds=max(read.number("time_budget", 0.0), 0.0))
+            self.frames = read.whole("frames", 1, 1, 1 << 20)
+            self.chosen = None  # under limits, for the next frame
             self.achieved = {}  # by the last render
             self.lights_seen = 0
             self.patches = None  # of the fields rendered last, by radiosity
@@ -126,7 +130,7 @@ def integrator_class() -> type:
                 f"  max_depth = {self.max_depth},\n  bounces = {self.bounces},\n  aovs = {', '.join(self.aovs)},\n"
                 f"  hide_emitters = {self.hide_emitters},\n  noise_threshold = {self.limits.noise},\n"
                 f"  max_error = {self.limits.error},\n"
-                f"  time_budget = {self.limits.seconds},\n  timeout = {self.timeout}\n]"
+                f"  time_budget = {self.limits.seconds},\n  frames = {self.frames},\n  timeout = {self.timeout}\n]"
             )
 
     return NRFIntegrator

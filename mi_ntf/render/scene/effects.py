@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -162,6 +163,21 @@ def _in_view(sensor, media) -> tuple[bool, ...]:
     return tuple(
         h and bool((sides @ (m.frame.origin - eye) > -m.frame.length).all()) for h, m in zip(held, media, strict=True)
     )
+
+
+def on_film(sensor, frame):
+    """Corners (low, high) of the part of the picture, a unit square, that the sphere of `frame` may take; None where
+    the camera is no pinhole or the sphere reaches behind it."""
+    if sensor.class_name() not in PINHOLES:
+        return None
+    corners = frame.origin[:, None] + frame.length * (2 * np.indices((2, 2, 2)).reshape(3, 8) - 1)
+    at = dr.zeros(mi.Interaction3f, 8)
+    at.p = mi.Point3f(*(mi.Float(c) for c in corners))
+    if (np.array(sensor.world_transform().inverse() @ at.p)[2] <= 0).any():
+        return None
+    seen, _ = sensor.sample_direction(at, mi.Point2f(0.5))
+    place = np.array(seen.uv, np.float64) / np.array(sensor.film().crop_size(), np.float64)[:, None]
+    return np.clip(place.min(1), 0, 1), np.clip(place.max(1), 0, 1)
 
 
 def _eye(sensor) -> np.ndarray:

@@ -5,7 +5,9 @@ from dataclasses import dataclass, fields, replace
 
 @dataclass(frozen=True)
 class Settings:
-    """As in the plugin's table. `specular`: specular lobes take part where there are any."""
+    """As in the plugin's table, and what is left out of what the scene calls for: `specular`, whether specular lobes
+    take part; `dimmest`, share of all light that the dimmest lights have which do not; `without`, numbers of the media
+    that do not."""
 
     visibility: str
     samples: int
@@ -18,8 +20,11 @@ class Settings:
     map_file: str
     max_depth: int
     bounces: str
+    frames: int
     hide_emitters: bool
     specular: bool = True
+    dimmest: float = 0.0
+    without: tuple[int, ...] = ()
 
     @classmethod
     def of(cls, integrator) -> "Settings":

@@ -1,27 +1,24 @@
 """``visibility=auto`` under a limit: which method, with which dials, and what is not worth its price.
 
 Some pixels are rendered beforehand by the march and by what is cheaper: the difference is the error that a picture
-would have. The cheapest that keeps to `max_error` renders the picture.
+would have, and their seconds are this machine's own prices. The cheapest that keeps to `max_error` renders the picture;
+under a `time_budget` alone, what has the smallest error when the time is over, bias and noise together.
 """
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any
 
-import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from ...infer.visibility import REGISTRY
-from ..cost import model
 from ..scene import effects
 from ..scene.settings import Limits, Settings
-from . import camera_light
 from .composition import Composition
+from .estimate import Estimate
+from .omissions import OMISSIONS
+from .probing import SAMPLES, Look, Probes, probed
 
-SHARE = 0.03
-"""Of the pixels, those rendered beforehand, at most `MOST` and at least `LEAST`; `SAMPLES` of each, or fewer if the
-picture has fewer."""
-MOST, LEAST, SAMPLES = 1024, 192, 4
 MARGIN = 0.9
 """Of `max_error`, what the pixels rendered beforehand may be off: they are few."""
 TRIAL = 1.0
@@ -30,21 +27,20 @@ SAVING = 0.1
 """Of the predicted time, what leaving something out must save at least."""
 FINER = {"map_resolution": 256, "map_components": 2}
 """Dials of a map for smaller errors."""
-FEWEST = 32
-"""Lights that stand for an environment at least."""
 UNTOLD = 32
 """Samples a pixel that a render is taken to have if a limit of noise says how many."""
+SPARED = 0.2
+"""Of the time that is left, what a trial may take under a `time_budget`."""
 
 
 @dataclass(frozen=True)
 class Trial:
     """Something in place of the march of all that the scene calls for: `name`, its `error` (relative RMSE; nan: not
-    measured) and `seconds` predicted, whether it is `taken`, and why."""
+    measured) and `seconds` of a picture, predicted or those of its probes; whether it is `taken`, and why."""
 
     name: str
-    settings: Settings
     seconds: float
-    error: float = float("nan")
+    error: float = math.nan
     taken: bool = False
     why: str = ""
 
@@ -54,7 +50,7 @@ class Choice:
     """`composition`: to render with; `trials`: what was looked at, in order; `predicted`: seconds, error."""
 
     composition: Composition
-    trials: list = field(default_factory=list)
+    trials: list[Trial] = field(default_factory=list)
     predicted: dict = field(default_factory=dict)
 
     @property
@@ -65,79 +61,100 @@ class Choice:
 
     def told(self) -> dict:
         """``predicted`` and ``trials`` as numbers and words."""
-        names = ("name", "seconds", "error", "taken", "why")
-        return {"predicted": self.predicted,
-                "trials": [{name: getattr(t, name) for name in names} for t in self.trials]}
+        return {"predicted": self.predicted, "trials": [vars(t) for t in self.trials]}
 
 
 class Chooser:
-    """For one render of `scene` by `settings` and `limits`, with `spp` samples a pixel unless a limit says how many."""
+    """For one render of `scene` by `settings` and `limits`, with `spp` samples a pixel unless a limit says how many.
+    `gone`: seconds that the render has taken so far; `before`: :meth:`kept` of an earlier frame; `whole`: nothing is
+    left out, whatever it is worth."""
 
-    def __init__(self, scene, settings: Settings, limits: Limits, sensor, spp: int, patches):
+    def __init__(self, scene, settings: Settings, limits: Limits, sensor, spp: int, patches,
+                 gone: Callable[[], float] = lambda: 0.0, before=None, whole: bool = False):
         self.scene, self.settings, self.limits, self.sensor, self.patches = scene, settings, limits, sensor, patches
-        self.spp = UNTOLD if limits.noise > 0 else spp
-        width, height = (int(n) for n in sensor.film().crop_size())
-        self._pixels = width * height
+        self._spp = UNTOLD if limits.noise > 0 else spp
+        self._gone, self._before, self._whole = gone, before, whole
+        self._size = tuple(int(n) for n in sensor.film().crop_size())
         self.trials: list[Trial] = []
 
     def choose(self) -> Choice:
         """As the limits say. A method that the user named stays, whatever its error."""
-        plain = self._composed(self.settings)
-        found = plain.effects
+        by_time = self.limits.seconds > 0 and self.settings.visibility == "auto"
+        if not self.limits.error and not by_time:
+            return Choice(self._composed(self.settings))
+        self.estimate = Estimate(self.scene, self.settings, self.sensor, self._size[0] * self._size[1], self._spp)
+        found = self.estimate.effects
         if found.gradients or not found.needs_visibility or found.visibility == "none":
-            return Choice(plain)
-        if self.limits.error > 0:
-            return self._by_error(plain)
-        if self.limits.seconds > 0 and self.settings.visibility == "auto":
-            return self._by_time(plain)
-        return Choice(plain)
+            return Choice(self._composed(self.settings))
+        if self._before and self._before[0] == self._key():
+            _, settings, self.trials, predicted = self._before
+            return Choice(self._composed(settings), self.trials, predicted)
+        return self._by_error() if self.limits.error else self._by_time()
+
+    def kept(self, choice: Choice):
+        """For the next frame: where it is one of the same scene with as many lights, the choice is made once."""
+        return (self._key(), choice.composition.settings, choice.trials, choice.predicted) if choice.trials else None
+
+    def _key(self):
+        lights = self.estimate.lights
+        return (id(self.scene), self.settings, self.limits, self._size, self._spp, tuple(lights.kinds),
+                len(lights.rows.power))
 
     def _composed(self, settings: Settings) -> Composition:
-        return Composition(self.scene, settings, self.sensor, self.spp, self.patches)
+        return Composition(self.scene, settings, self.sensor, self._spp, self.patches)
 
-    def _by_time(self, plain: Composition) -> Choice:
-        """Of what fits into the time with the samples that the scene asks for, the march, which has no error of its
-        own; else the cheapest."""
+    def _looked(self, settings: Settings) -> Look:
+        return self.probes.look(lambda: self._composed(settings))
+
+    def _marched(self) -> Look:
+        """The probes by the march, which also tell how far off the prices are."""
+        self.probes = Probes(self.sensor, self.estimate.media, min(self._spp, SAMPLES))
         march = self.settings.but(visibility="raymarch")
-        seconds = self._seconds(plain, march)
-        if plain.effects.visibility != "raymarch" and seconds < 0.5 * self.limits.seconds:
-            return Choice(self._composed(march), predicted={"seconds": seconds, "error": 0.0})
-        least = self._seconds(plain, plain.settings.but(visibility=plain.effects.visibility)) / max(self.spp, 1)
-        if least > self.limits.seconds:
-            mi.Log(  # type: ignore[operator]  # an object in the stub
-                mi.LogLevel.Warn,
-                f"nrf integrator: time_budget is {self.limits.seconds:.3g} s, but one sample a pixel takes about "
-                f"{least:.3g} s by {plain.effects.visibility}; that will be rendered")
-        return Choice(plain)
+        truth = self._looked(march)
+        self.estimate.dearer = self._price(truth) / max(self.estimate.seconds(march), 1e-9)
+        return truth
 
-    def _by_error(self, plain: Composition) -> Choice:
-        march = self._composed(self.settings.but(visibility="raymarch"))
-        probes = Probes(self.sensor, self._pixels, min(self.spp, SAMPLES))
-        truth = probes.of(march)
-        best = self._method(plain, march, probes, truth)
-        best = self._without(plain, probes, truth, best)
-        trial, composition = best
-        return Choice(composition, self.trials, {"seconds": trial.seconds, "error": trial.error})
+    def _price(self, look: Look) -> float:
+        """Seconds of a picture, what is built shared among the frames."""
+        return look.built / self.settings.frames + look.each * self._spp
 
-    def _method(self, plain: Composition, march: Composition, probes: "Probes", truth):
-        """``(trial, composition)`` of the cheapest method that keeps to the error."""
-        if self.settings.visibility != "auto":
-            error = relative(probes.of(plain), truth)
-            return self._tried(plain.settings, self._seconds(plain, plain.settings), error, True, "named"), plain
-        full = self._seconds(plain, march.settings)
-        for seconds, settings in sorted(((self._seconds(plain, s), s) for s in self._candidates()), key=lambda p: p[0]):
-            if seconds > full - TRIAL:
+    def _pays(self, saved: float) -> bool:
+        """Whether so many seconds less a picture are worth a trial."""
+        return saved * self.settings.frames >= TRIAL
+
+    def _by_error(self) -> Choice:
+        named = self.settings.visibility != "auto"
+        first = self.settings if named else self.settings.but(visibility="raymarch")
+        seconds = self.estimate.seconds(first)
+        if not self._pays(seconds):
+            error, why = (math.nan, "named") if named else (0.0, "all else saves less than a trial takes")
+            best = self._tried(first, seconds, error, True, why)
+            return Choice(self._composed(first), self.trials, {"seconds": best.seconds, "error": best.error})
+        truth = self._marched()
+        if named:
+            look = self._looked(first)
+            best = self._judged(look, truth, True, "named")
+        else:
+            best, look = self._method(truth)
+        if not self._whole:
+            best, look = self._without(best, look, truth)
+        return Choice(look.composition, self.trials, {"seconds": best.seconds, "error": best.error})
+
+    def _method(self, truth: Look) -> tuple[Trial, Look]:
+        """The cheapest that keeps to the error."""
+        full, limit = self._price(truth), MARGIN * self.limits.error
+        for seconds, settings in sorted(((self.estimate.seconds(s), s) for s in self._candidates()),
+                                        key=lambda pair: pair[0]):
+            if not self._pays(full - seconds):
                 self._tried(settings, seconds, why="saves less than a trial takes")
                 continue
-            tried = self._composed(settings)
-            if len(tried.runs) > 1:
-                self._tried(settings, seconds, why="its maps do not fit into map_memory at once")
-                continue
-            error = relative(probes.of(tried), truth)
-            if error <= MARGIN * self.limits.error:
-                return self._tried(settings, seconds, error, True, "the cheapest that keeps to max_error"), tried
-            self._tried(settings, seconds, error, why="off by more than max_error allows")
-        return self._tried(march.settings, full, 0.0, True, "nothing cheaper keeps to max_error"), march
+            look = self._looked(settings)
+            good = self.probes.error(look, truth) <= limit
+            if good and len(look.composition.runs) == 1 and self._price(look) < full:
+                return self._judged(look, truth, True, "the cheapest that keeps to max_error"), look
+            self._judged(look, truth, False, "no cheaper than the march" if good else
+                         "off by more than max_error allows")
+        return self._tried(truth.composition.settings, full, 0.0, True, "nothing cheaper keeps to max_error"), truth
 
     def _candidates(self) -> list[Settings]:
         """What ``auto`` may choose, with the settings' own dials and finer ones."""
@@ -149,101 +166,81 @@ class Chooser:
                     found.append(self.settings.but(visibility=name, **FINER))
         return found
 
-    def _without(self, plain: Composition, probes: "Probes", truth, best):
-        """``(trial, composition)`` like `best`, without what the picture hardly shows."""
+    def _without(self, best: Trial, look: Look, truth: Look) -> tuple[Trial, Look]:
+        """Like `best`, without what the picture hardly shows."""
         for name, of in OMISSIONS.items():
-            good = True
-            while good:
-                trial, composition = best
-                settings = of(composition.settings, composition)
-                seconds = self._seconds(plain, settings) if settings else trial.seconds
-                if trial.seconds - seconds < max(SAVING * trial.seconds, TRIAL):
+            while (settings := of(look.composition.settings, look.composition)) is not None:
+                share = self.estimate.seconds(settings) / self.estimate.seconds(look.composition.settings)
+                if share > 1 - SAVING or not self._pays(best.seconds * (1 - share)):
                     break
-                tried = self._composed(settings)
-                error = relative(probes.of(tried), truth)
-                good = error <= MARGIN * self.limits.error
-                why = "left out: the picture keeps to max_error" if good else "kept: it is more than max_error allows"
-                if good:
-                    best = self._tried(settings, seconds, error, True, why, name), tried
-                else:
-                    self._tried(settings, seconds, error, False, why, name)
-        return best
+                tried = self._looked(settings)
+                good = self.probes.error(tried, truth) <= MARGIN * self.limits.error
+                cheaper = self._price(tried) < best.seconds
+                why = ("kept: it is more than max_error allows" if not good else
+                       "left out: the picture keeps to max_error" if cheaper else "kept: it costs nothing")
+                trial = self._judged(tried, truth, good and cheaper, why, name)
+                if not trial.taken:
+                    break
+                best, look = trial, tried
+        return best, look
 
-    def _tried(self, settings, seconds, error=float("nan"), taken=False, why="", what="") -> Trial:
+    def _by_time(self) -> Choice:
+        """The smallest error when the time is over: samples that a march cannot have may be worth a bias."""
+        march = self.settings.but(visibility="raymarch")
+        samples = min(self._spp, SAMPLES) * probed(self._size[0] * self._size[1])
+        if max(self.estimate.each(march) * samples, TRIAL) > SPARED * self._left():
+            return self._untried(march)
+        truth = self._marched()
+        best, least = truth, self._ends_at(truth, truth)
+        self._tried(march, self._price(truth), least, True, "smallest error when the time is over")
+        for settings in self._candidates():
+            built = self.estimate.built(settings)
+            hoped = self._noise(truth, (self._left() - built) / max(self.estimate.each(settings), 1e-9))
+            if built + TRIAL > SPARED * self._left() or hoped > least:
+                continue
+            look = self._looked(settings)
+            error = self._ends_at(look, truth)
+            better = error < least and len(look.composition.runs) == 1
+            self._tried(settings, self._price(look), error, better,
+                        "smallest error when the time is over" if better else "a larger error when the time is over")
+            best, least = (look, error) if better else (best, least)
+        self._warn(best.each, best.composition.settings)
+        return Choice(best.composition, self.trials, {"seconds": self.limits.seconds, "error": least})
+
+    def _untried(self, march: Settings) -> Choice:
+        """By the prices alone: the march, which has no error of its own, if the samples that the scene asks for fit
+        into half of the time; else the cheapest."""
+        fits = self.estimate.seconds(march) < 0.5 * self._left()
+        settings = march if fits else self.settings.but(visibility=self.estimate.effects.visibility)
+        self._warn(self.estimate.each(settings), settings)
+        return Choice(self._composed(settings), predicted={"seconds": self.limits.seconds, "error": math.nan})
+
+    def _ends_at(self, look: Look, truth: Look) -> float:
+        """Error of a picture by what is left of the time."""
+        return math.hypot(self.probes.error(look, truth), self._noise(truth, self._left() / max(look.each, 1e-9)))
+
+    def _noise(self, truth: Look, samples: float) -> float:
+        return self.probes.noise(truth) / math.sqrt(max(samples, 1.0))
+
+    def _left(self) -> float:
+        return max(self.limits.seconds - self._gone(), 1e-3)
+
+    def _warn(self, each: float, settings: Settings) -> None:
+        """What cannot end in time is said before it begins."""
+        if each > self._left():
+            mi.Log(  # type: ignore[operator]  # an object in the stub
+                mi.LogLevel.Warn,
+                f"nrf integrator: time_budget is {self.limits.seconds:.3g} s, but one sample a pixel takes about "
+                f"{each:.3g} s by {settings.visibility}; that will be rendered")
+
+    def _judged(self, look: Look, truth: Look, taken: bool, why: str, what: str = "") -> Trial:
+        return self._tried(look.composition.settings, self._price(look), self.probes.error(look, truth), taken, why,
+                           what)
+
+    def _tried(self, settings: Settings, seconds: float, error: float = math.nan, taken: bool = False, why: str = "",
+               what: str = "") -> Trial:
         dials = [f"{settings.map_resolution}², {settings.map_components} logistics"] if REGISTRY[
             settings.visibility].drawn else []
         name = " ".join([settings.visibility, *dials, *([f"without {what}"] if what else [])])
-        self.trials.append(Trial(name, settings, seconds, error, taken, why))
+        self.trials.append(Trial(name, seconds, error, taken, why))
         return self.trials[-1]
-
-    def _seconds(self, plain: Composition, settings: Settings) -> float:
-        """Predicted, of the whole render."""
-        found, light = plain.effects, plain.lights
-        rays = self._pixels * self.spp
-        count = len(light.rows.power)
-        if settings.environment_lights < self.settings.environment_lights:
-            count += sum(min(settings.environment_lights, d.shining) - d.shining for d in light.discrete)
-        bounces = found.bounces if settings.max_depth != 2 else ""
-        total = 0.0
-        for medium, seen in zip(plain.media, found.in_view, strict=True):
-            others = effects.others(settings, rays, found.surfaces, bounces) if found.lit else 0
-            work = model.work(settings, medium, settings.visibility, rays if seen else 0, count,
-                              effects.drawn(settings, light), others)
-            work = replace(work, patches=model.patches(medium.field.grid) if bounces == "radiosity" else 0)
-            total += sum(model.seconds(work, model.constants()).values())
-        return total
-
-
-def _fewer_lights(settings: Settings, composition: Composition) -> Settings | None:
-    most = max((d.shining for d in composition.lights.discrete), default=0)
-    return settings.but(environment_lights=most // 2) if most > FEWEST else None
-
-
-def _no_bounces(settings: Settings, composition: Composition) -> Settings | None:
-    return settings.but(max_depth=2) if composition.effects.bounces else None
-
-
-def _no_lobes(settings: Settings, composition: Composition) -> Settings | None:
-    return settings.but(specular=False) if composition.effects.specular else None
-
-
-OMISSIONS: dict[str, Any] = {
-    "further bounces": _no_bounces, "half of the environment's lights": _fewer_lights, "specular lobes": _no_lobes}
-"""What may be left out → settings without it, None where there is nothing to leave out."""
-
-
-class Probes:
-    """Camera rays through pixels here and there."""
-
-    def __init__(self, sensor, pixels: int, samples: int):
-        self.count, self.samples = int(min(max(SHARE * pixels, LEAST), MOST)), samples
-        rng = np.random.default_rng(0)
-        width, height = sensor.film().crop_size()
-        place = np.repeat(rng.random((2, self.count)), samples, 1)
-        n = place.shape[1]
-        place += (rng.random((2, n)) - 0.5) / np.array([[width], [height]])
-        aperture = mi.Point2f(*(mi.Float(v) for v in rng.random((2, n))))
-        moment = mi.Float(rng.random(n) * float(sensor.shutter_open_time()) + float(sensor.shutter_open()))
-        at = mi.Point2f(*(mi.Float(v) for v in place))
-        ray, weight = sensor.sample_ray_differential(moment, 0.0, at, aperture)
-        self._ray, self._weight = mi.Ray3f(ray), weight
-        if dr.width(self._ray) < n:  # a sensor whose rays are all the same
-            self._ray = dr.gather(mi.Ray3f, self._ray, dr.zeros(mi.UInt32, n))
-        self._quadrature = tuple(mi.Float(v) for v in rng.random((2, n)))
-        dr.eval(self._ray, self._weight, self._quadrature)
-
-    def of(self, composition: Composition) -> np.ndarray:
-        """(pixels, 3) radiance."""
-        total = mi.Color3f(0)
-        for run in range(len(composition.runs)):
-            composition.select(run)
-            with composition.lights.bare():
-                light, _ = camera_light.trace(composition, self._ray, self._quadrature, dr.opaque(mi.UInt32, 7))
-            total += light * self._weight
-        return np.array(total).T.reshape(self.count, self.samples, 3).mean(1)
-
-
-def relative(found: np.ndarray, truth: np.ndarray) -> float:
-    """Relative RMSE; 0 for a black truth."""
-    power = float((truth**2).mean())
-    return float(np.sqrt(((found - truth) ** 2).mean() / power)) if power > 0 else 0.0

@@ -48,9 +48,10 @@ class Composition:
     of an earlier render of the same fields, None unless they are needed."""
 
     def __init__(self, scene, settings: Settings, sensor, spp: int, patches: Patches | None = None):
-        self.scene, self.settings, self.patches = scene, settings, patches
-        self.media = media = find_media(scene)
-        self.lights = scene_lights.Lights(scene, media, settings.light_samples, settings.environment_lights)
+        self.scene, self.settings, self.sensor, self.patches = scene, settings, sensor, patches
+        self.media = media = [m for number, m in enumerate(find_media(scene)) if number not in settings.without]
+        self.lights = scene_lights.Lights(scene, media, settings.light_samples, settings.environment_lights,
+                                          settings.dimmest)
         self.effects = effects.describe(scene, settings, sensor, spp, media, self.lights)
         self._media = [m for m in media if m.field.grid.majorant > 0]
         self._seen = [m for m, visible in zip(media, self.effects.in_view, strict=True) if visible]

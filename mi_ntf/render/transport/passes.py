@@ -60,9 +60,13 @@ class Passes:
         self._started, self.seconds = now, now - self._begin
         self.count, self.passes, self.noise = self.count + samples, self.passes + 1, noise
 
+    def gone(self) -> float:
+        """Seconds since the render began."""
+        return self._clock() - self._begin
+
     def overtime(self, timeout: float) -> bool:
         """Whether more than `timeout` seconds have passed; below 0: never."""
-        return 0 < timeout < self._clock() - self._begin
+        return 0 < timeout < self.gone()
 
     def next(self) -> int:
         """Samples of the next pass; 0: a limit is reached."""

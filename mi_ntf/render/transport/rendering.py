@@ -26,10 +26,11 @@ def render(integrator, scene, sensor, seed, spp: int, develop: bool):
     counted = passes.Passes(integrator.limits)
     camera = Camera(sensor, spp)
     film = camera.film
-    chooser = choosing.Chooser(scene, Settings.of(integrator), integrator.limits, sensor, camera.spp,
-                               integrator.patches)
+    chooser = choosing.Chooser(
+        scene, Settings.of(integrator), integrator.limits, sensor, camera.spp, integrator.patches, counted.gone,
+        integrator.chosen, whole=any(name in aovs.OF_LIGHTS for name in integrator.aovs))
     choice = chooser.choose()
-    composition = choice.composition
+    composition, integrator.chosen = choice.composition, chooser.kept(choice)
     integrator.patches = composition.patches
     picture = None
     if integrator.aovs:

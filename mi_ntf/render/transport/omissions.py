@@ -1,0 +1,54 @@
+"""What a picture may do without, if it hardly shows: each in steps, from the next of which settings are returned, None
+where there is none."""
+
+from collections.abc import Callable
+
+from ..scene import effects
+from ..scene.settings import Settings
+from .composition import Composition
+
+FEWEST = 32
+"""Lights that stand for an environment at least."""
+DIM = 0.005
+"""Share of all light that the dimmest may have at first."""
+SMALL = 0.01
+"""Share of the picture that bounds of a field are below which may be left out."""
+
+
+def _no_bounces(settings: Settings, composition: Composition) -> Settings | None:
+    return settings.but(max_depth=2) if composition.effects.bounces else None
+
+
+def _fewer_lights(settings: Settings, composition: Composition) -> Settings | None:
+    most = max((d.shining for d in composition.lights.discrete), default=0)
+    return settings.but(environment_lights=most // 2) if most > FEWEST else None
+
+
+def _bright_lights(settings: Settings, composition: Composition) -> Settings | None:
+    """Environments have their own way: their lights are of about equal power."""
+    share, lights = max(2 * settings.dimmest, DIM), composition.lights
+    if any(d.shining for d in lights.discrete) or lights.brighter(share) == len(lights.rows.power):
+        return None
+    return settings.but(dimmest=share)
+
+
+def _no_small_field(settings: Settings, composition: Composition) -> Settings | None:
+    sizes = []
+    for number, medium in enumerate(composition.media):
+        box = effects.on_film(composition.sensor, medium.frame)
+        if box is not None:
+            sizes.append((float((box[1] - box[0]).prod()), number))
+    if len(composition.media) < 2 or not sizes or min(sizes)[0] > SMALL:
+        return None
+    there = [i for i in range(len(composition.media) + len(settings.without)) if i not in settings.without]
+    return settings.but(without=(*settings.without, there[min(sizes)[1]]))
+
+
+def _no_lobes(settings: Settings, composition: Composition) -> Settings | None:
+    return settings.but(specular=False) if composition.effects.specular else None
+
+
+OMISSIONS: dict[str, Callable[[Settings, Composition], Settings | None]] = {
+    "further bounces": _no_bounces, "small fields": _no_small_field,
+    "half of the environment's lights": _fewer_lights, "dim lights": _bright_lights, "specular lobes": _no_lobes}
+"""What may be left out, in the order in which it is tried."""

@@ -1,0 +1,121 @@
+"""Some pixels of a picture, rendered beforehand: what they show, how noisy a sample is, and what a picture takes."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..cost import measurement
+from ..scene import effects
+from . import camera_light
+from .composition import Composition
+
+SHARE = 0.03
+"""Of the pixels, those rendered beforehand, at most `MOST` and at least `LEAST`; `SAMPLES` of each."""
+MOST, LEAST, SAMPLES = 1024, 192, 4
+SMALL, WITHIN = 0.01, 48
+"""A field whose bounds take less than this share of the picture gets as many pixels of its own."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """`radiance` (pixels, samples, 3) of the probes; seconds, compilation left out: `built` of what does not grow with
+    the picture, `each` of one sample for every pixel of it."""
+
+    composition: Composition
+    radiance: np.ndarray
+    built: float
+    each: float
+
+
+def probed(pixels: int) -> float:
+    """The share of so many pixels that is rendered beforehand."""
+    return min(max(SHARE * pixels, LEAST), MOST) / pixels
+
+
+class Probes:
+    """Camera rays through pixels here and there; through those of fields that are small in the picture, all the more.
+
+    weight  (probes,): share of the picture that each stands for
+    """
+
+    def __init__(self, sensor, media: list, samples: int = SAMPLES):
+        width, height = (int(n) for n in sensor.film().crop_size())
+        self._pixels, self.samples = width * height, samples
+        rng = np.random.default_rng(0)
+        count = round(probed(self._pixels) * self._pixels)
+        places, self.weight = _places(rng, count, _small(sensor, media))
+        self.count = len(self.weight)
+        self._sharpness = _pixels_of(sensor.film().rfilter())
+        place = np.repeat(places, samples, 1)
+        n = place.shape[1]
+        place += (rng.random((2, n)) - 0.5) / np.array([[width], [height]])
+        aperture = mi.Point2f(*(mi.Float(v) for v in rng.random((2, n))))
+        moment = mi.Float(rng.random(n) * float(sensor.shutter_open_time()) + float(sensor.shutter_open()))
+        at = mi.Point2f(*(mi.Float(v) for v in place))
+        ray, weight = sensor.sample_ray_differential(moment, 0.0, at, aperture)
+        self._ray, self._weight = mi.Ray3f(ray), weight
+        if dr.width(self._ray) < n:  # a sensor whose rays are all the same
+            self._ray = dr.gather(mi.Ray3f, self._ray, dr.zeros(mi.UInt32, n))
+        self._quadrature = tuple(mi.Float(v) for v in rng.random((2, n)))
+        dr.eval(self._ray, self._weight, self._quadrature)
+
+    def look(self, compose: Callable[[], Composition]) -> Look:
+        """What `compose` makes, seen through the probes."""
+        (composition, radiance), stages = measurement.watch(lambda: self._trace(compose()))
+        built = sum(stages.get(name, 0.0) for name in measurement.BUILT)
+        # Probes of small fields are more than their share: the time is that of a picture with as many.
+        each = (sum(stages.values()) - built) * self._pixels / (self.count * self.samples)
+        return Look(composition, radiance, built, each)
+
+    def _trace(self, composition: Composition):
+        total = mi.Color3f(0)
+        for run in range(len(composition.runs)):
+            composition.select(run)
+            with composition.lights.bare():
+                light, _ = camera_light.trace(composition, self._ray, self._quadrature, dr.opaque(mi.UInt32, 7))
+            total += light * self._weight
+            dr.eval(total)
+        return composition, np.array(total).T.reshape(self.count, self.samples, 3)
+
+    def error(self, found: Look, truth: Look) -> float:
+        """Relative RMSE of the picture, as far as the probes tell; 0 for a black truth. Both are seen along the same
+        rays: their noise is no part of it."""
+        a, b = (look.radiance.mean(1) for look in (found, truth))
+        power = float(self.weight @ (b**2).mean(1))
+        return float(np.sqrt(self.weight @ ((a - b) ** 2).mean(1) / power)) if power > 0 else 0.0
+
+    def noise(self, look: Look) -> float:
+        """Relative RMS error of a picture of one sample a pixel, whose filter takes the mean of several."""
+        power = float(self.weight @ (look.radiance.mean(1) ** 2).mean(1))
+        variance = float(self.weight @ look.radiance.var(1, ddof=1).mean(1)) if self.samples > 1 else 0.0
+        return float(np.sqrt(variance / power / self._sharpness)) if power > 0 else 0.0
+
+
+def _pixels_of(rfilter) -> float:
+    """Pixels whose samples a pixel of the film is made of, counted as a mean of as many would be as noisy."""
+    radius = float(rfilter.radius())
+    x = np.linspace(-radius, radius, 65)
+    f = np.array(rfilter.eval(mi.Float(x)), np.float64).ravel()
+    across = 2 * radius * f.mean() ** 2 / max(float((f**2).mean()), 1e-12)
+    return max(across, 1.0) ** 2
+
+
+def _places(rng, count: int, boxes: list) -> tuple[np.ndarray, np.ndarray]:
+    """``(places, weights)``: (2, n) of the unit square, `count` all over it and `WITHIN` in each of `boxes`, corners
+    (low, high); what is all over it stands for what is in no box."""
+    places, weights = [rng.random((2, count))], [np.full(count, 1 / count)]
+    for low, high in boxes:
+        inside = ((places[0] >= low[:, None]) & (places[0] <= high[:, None])).all(0)
+        weights[0] = np.where(inside, 0.0, weights[0])
+        places.append(low[:, None] + rng.random((2, WITHIN)) * (high - low)[:, None])
+        weights.append(np.full(WITHIN, np.prod(high - low) / WITHIN))
+    return np.concatenate(places, 1), np.concatenate(weights)
+
+
+def _small(sensor, media: list) -> list:
+    """Corners, in the unit square, of the boxes that hold those of `media` that are small in the picture."""
+    boxes = [effects.on_film(sensor, m.frame) for m in media] if len(media) > 1 else []
+    return [b for b in boxes if b is not None and 0 < np.prod(b[1] - b[0]) < SMALL]
