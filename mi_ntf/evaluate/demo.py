@@ -116,7 +116,7 @@ def demo(out: Path = Path("out/demo"), scene: str = "statue", size: int = 256, s
 
     Args:
         out: folder for images, table, picture and the study's report.
-        scene: name of a folder of scenes/.
+        scene: name of a folder of scenes/, or the path of another that holds the same files.
         size: pixels along a side, a divisor of the references' 256.
         spp: samples per pixel under the point light.
         environment_spp: the same under the environment map, whose hundreds of lights each sample pays for.
@@ -124,9 +124,10 @@ def demo(out: Path = Path("out/demo"), scene: str = "statue", size: int = 256, s
     """
     from rich.console import Console
 
-    folder = Path(__file__).parents[2] / "scenes" / scene
+    folder = Path(__file__).parents[2] / "scenes" / scene  # an absolute path stays what it is
     if not (folder / "scene.xml").is_file():
-        raise MiNtfError(f"{folder / 'scene.xml'} does not exist; run the demo in a checkout, on a scene of scenes/")
+        raise MiNtfError(f"{folder / 'scene.xml'} does not exist; run the demo in a checkout, on a scene of scenes/ "
+                         "or an absolute path")
     seconds_of(budget)
     references = {light: _reference(folder, light, size) for light in LIGHTS}
     files.make_folder(out)
