@@ -1,9 +1,14 @@
-"""`make demo`: the stock `mitsuba` program renders the shipped scene three ways; a table and a picture show the
-outcome.
+"""`make demo`: the stock `mitsuba` program renders the shipped scene three ways, then `mi-ntf tradeoff` studies it; a
+table and a picture show the outcome.
 
     python -m mi_ntf.evaluate.demo [--out out/demo] [--scene statue] [--size 256] [--spp 16] [--environment-spp 4]
+                                   [--budget 150s]
 
-Writes to `out`: one EXR a render, ``table.md``, ``metrics.json``, ``comparison.png``. Exit code 1 if a render fails.
+Writes to `out`: one EXR a render, ``table.md``, ``metrics.json``, ``comparison.png``, and the study's report in
+``tradeoff``. Exit code 1 if a render or the study fails; the study comes last and takes nothing of the rest with it.
+
+Seconds are those of work that is done: renders and study are processes without a cache of transmittance maps, and the
+study takes up nothing that an earlier one, interrupted or not, has left in the folder.
 """
 
 import json
@@ -11,39 +16,22 @@ import os
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from mi_ntf.core import files
 from mi_ntf.core.errors import MiNtfError
 
-from .compare import compare_arrays, read_image
-from .metrics import relative_rmse, srgb
+from .compare import read_image
+from .demo_report import LIGHTS, Shot, picture, report
 
-LIGHTS = {"point": "point light", "env": "environment map"}
 VISIBILITIES = ("raymarch", "neural_transmittance", "transmittance_map")
 TIMEOUT = 600
-"""Seconds after which one render counts as hung."""
-ERROR_SCALE = 0.5
-"""Upper end of the error maps, in units of the reference's RMS."""
-
-
-@dataclass(frozen=True)
-class Shot:
-    """One render. `image`: linear RGBA (h, w, 4); `seconds`: wall time of the whole process, start included."""
-
-    light: str
-    visibility: str
-    seconds: float
-    image: np.ndarray
-
-    def measure(self, reference: np.ndarray, marched: np.ndarray) -> dict:
-        """JSON of this shot: :func:`.compare.compare_arrays` to the path-traced meshes, relative RMSE to `raymarch`."""
-        return {"light": self.light, "visibility": self.visibility, "seconds": round(self.seconds, 2),
-                **compare_arrays(self.image[..., :3], reference[..., :3], reference[..., 3]),
-                "relative_rmse_to_raymarch": relative_rmse(self.image[..., :3], marched[..., :3])}
+"""Seconds after which one render counts as hung, and a study that has taken so much more than its budget."""
+REPORT = ("index.html", "tradeoff.csv", "tradeoff.json")
+"""Files of a study's report."""
 
 
 def program() -> tuple[list[str], str]:
@@ -59,6 +47,12 @@ def program() -> tuple[list[str], str]:
     return look_alike, f"rendered by `mi-ntf render`, since the bridge is missing ({why})"
 
 
+def environment() -> dict[str, str]:
+    """That of every process whose seconds are shown: this one's, but no transmittance map comes from a cache or goes
+    into one."""
+    return {**os.environ, "MI_NTF_MAP_CACHE": "off"}
+
+
 def render(command: list[str], scene: Path, light: str, visibility: str, spp: int, size: int, out: Path) -> Shot:
     """Run one render of `size`² pixels as a process of its own. Raises :class:`MiNtfError` with the end of its output
     if it fails."""
@@ -67,7 +61,7 @@ def render(command: list[str], scene: Path, light: str, visibility: str, spp: in
     words = [*command, "-m", "llvm_ad_rgb", *defines, "-o", str(out), str(scene)]
     start = time.perf_counter()
     try:
-        done = subprocess.run(words, capture_output=True, text=True, timeout=TIMEOUT, check=False)
+        done = subprocess.run(words, env=environment(), capture_output=True, text=True, timeout=TIMEOUT, check=False)
     except subprocess.TimeoutExpired:
         raise MiNtfError(f"{' '.join(words)}\ndid not end within {TIMEOUT} s; "
                          "try fewer samples (--spp, --environment-spp)") from None
@@ -78,89 +72,87 @@ def render(command: list[str], scene: Path, light: str, visibility: str, spp: in
     return Shot(light, visibility, seconds, read_image(out))
 
 
-def table(measured: list[dict], note: str) -> str:
-    """Markdown table of :meth:`Shot.measure` results."""
-    lines = [f"Whole-process seconds on {os.cpu_count()} cores, start and compilation included; {note}. "
-             "Reference: the original meshes, path-traced. Metrics: `mi_ntf/evaluate/metrics.py`.", "",
-             "| light | visibility | seconds | SSIM | PSNR, dB | HDR-FLIP | relative RMSE | rel. RMSE to `raymarch` |",
-             "|---|---|---:|---:|---:|---:|---:|---:|"]
-    for m in measured:
-        lines.append(f"| {LIGHTS[m['light']]} | `{m['visibility']}` | {m['seconds']:.1f} | {m['ssim']:.3f} | "
-                     f"{m['psnr']:.1f} | {m['flip']:.3f} | {m['relative_rmse']:.1%} | "
-                     f"{m['relative_rmse_to_raymarch']:.1%} |")
-    return "\n".join(lines) + "\n"
+def study(command: list[str], scene: Path, out: Path, budget: str, size: int, spp: int) -> dict[str, Any]:
+    """Run `mi-ntf tradeoff` (`command`: `mi-ntf`) on `scene` under its environment map for `budget`, as a process of
+    its own that shows what it does; its report lies in `out`. `size`, `spp`: the scene's own pixels along a side and
+    samples a pixel.
 
+    It begins anew: seconds that an earlier study measured in `out` are not those of this run.
 
-def picture(path: Path, shots: list[Shot], references: dict[str, np.ndarray], measured: list[dict]) -> None:
-    """Draw, per light, the reference and the shots side by side and beneath them the error maps |a − b|/RMS(b)."""
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
-    from matplotlib.figure import Figure
-
-    columns = 1 + max(sum(s.light == light for s in shots) for light in references)
-    figure = Figure(figsize=(3.1 * columns, 6.6 * len(references)), layout="constrained")
-    axes = figure.subplots(2 * len(references), columns, squeeze=False)
-    for a in axes.flat:
-        a.set_axis_off()
-    for row, (light, reference) in enumerate(references.items()):
-        top, bottom = axes[2 * row], axes[2 * row + 1]
-        top[0].imshow(srgb(reference[..., :3]))
-        top[0].set_title(f"{LIGHTS[light]}\nreference: path-traced meshes", fontsize=9)
-        rms = np.sqrt(np.mean(np.square(reference[..., :3])))
-        ours = [(s, m) for s, m in zip(shots, measured, strict=True) if s.light == light]
-        for column, (shot, m) in enumerate(ours, 1):
-            top[column].imshow(srgb(shot.image[..., :3]))
-            top[column].set_title(f"{shot.visibility}\n{shot.seconds:.1f} s · SSIM {m['ssim']:.3f}", fontsize=9)
-            error = np.abs(shot.image - reference)[..., :3].mean(-1) / rms
-            bottom[column].imshow(error, cmap="inferno", vmin=0, vmax=ERROR_SCALE)
-            bottom[column].set_title(f"relative RMSE {m['relative_rmse']:.1%}, "
-                                     f"to raymarch {m['relative_rmse_to_raymarch']:.1%}", fontsize=9)
-        scale = ScalarMappable(Normalize(0, ERROR_SCALE), "inferno")
-        figure.colorbar(scale, cax=bottom[0].inset_axes([0.7, 0.1, 0.06, 0.8]), label="error / RMS of the reference")
-    with files.replacing(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=110)
-
-
-def report(out: Path, shots: list[Shot], references: dict[str, np.ndarray], note: str) -> str:
-    """Measure `shots` against `references` (by light), write ``table.md``, ``metrics.json``, ``comparison.png``.
-
-    Returns the table.
+    Returns what ``tradeoff.json`` holds. Raises MiNtfError where the study fails, or every point of it.
     """
-    marched = {s.light: s.image for s in shots if s.visibility == "raymarch"}
-    for shot in shots:
-        if shot.image.shape != references[shot.light].shape:
-            raise MiNtfError(f"{shot.light}/{shot.visibility} has shape {shot.image.shape}, its reference "
-                             f"{references[shot.light].shape}; make the reference anew at the scene's size")
-    measured = [s.measure(references[s.light], marched[s.light]) for s in shots]
-    text = table(measured, note)
-    for name, content in [("table.md", text), ("metrics.json", json.dumps(measured, indent=1) + "\n")]:
-        files.write(out / name, content)
-    picture(out / "comparison.png", shots, references, measured)
-    return text
+    from .tradeoff import reading, state
+
+    if state.forget(out):
+        print(f"{out}: what an earlier study measured there is dropped, the demo measures anew", file=sys.stderr)
+    for name in REPORT:
+        (out / name).unlink(missing_ok=True)
+    defines = [w for d in ("light=env", f"res={size}", f"spp={spp}") for w in ("-D", d)]
+    words = [*command, "tradeoff", str(scene), *defines, "--budget", budget, "-o", str(out)]
+    try:
+        done = subprocess.run(words, env=environment(), timeout=TIMEOUT + seconds_of(budget), check=False)
+    except subprocess.TimeoutExpired as error:
+        raise MiNtfError(f"{' '.join(words)}\ndid not end within {error.timeout:.0f} s") from None
+    path = out / "tradeoff.json"
+    if done.returncode or not path.is_file():
+        raise MiNtfError(f"{' '.join(words)}\nfailed with exit code {done.returncode}; what it said stands above")
+    found = json.loads(path.read_text(encoding="utf-8"))
+    rows = found["points"]
+    if rows and not reading.measured(rows):
+        raise MiNtfError(f"every point of the study failed, the first one since {rows[0]['reason']}; see {out}")
+    return found
+
+
+def seconds_of(budget: str) -> float:
+    """The seconds of a budget such as 90s or 5m. Raises MiNtfError."""
+    from .tradeoff.study import seconds
+
+    return seconds(budget)
 
 
 def demo(out: Path = Path("out/demo"), scene: str = "statue", size: int = 256, spp: int = 16,
-         environment_spp: int = 4) -> None:
-    """Render a shipped scene in three visibilities under two lights and compare.
+         environment_spp: int = 4, budget: str = "150s") -> None:
+    """Render a shipped scene in three visibilities under two lights and compare; then study what accuracy costs.
 
     Args:
-        out: folder for images, table and picture.
-        scene: name of a folder of scenes/.
+        out: folder for images, table, picture and the study's report.
+        scene: name of a folder of scenes/, or the path of another that holds the same files.
         size: pixels along a side, a divisor of the references' 256.
         spp: samples per pixel under the point light.
         environment_spp: the same under the environment map, whose hundreds of lights each sample pays for.
+        budget: how long the study of the scene under its environment map may take: 90s, 5m.
     """
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-    folder = Path(__file__).parents[2] / "scenes" / scene
+    folder = Path(__file__).parents[2] / "scenes" / scene  # an absolute path stays what it is
     if not (folder / "scene.xml").is_file():
-        raise MiNtfError(f"{folder / 'scene.xml'} does not exist; run the demo in a checkout, on a scene of scenes/")
+        raise MiNtfError(f"{folder / 'scene.xml'} does not exist; run the demo in a checkout, on a scene of scenes/ "
+                         "or an absolute path")
+    seconds_of(budget)
     references = {light: _reference(folder, light, size) for light in LIGHTS}
     files.make_folder(out)
     command, note = program()
     console = Console()
     console.print(f"{folder / 'scene.xml'}: {note}")
+    shots = _shots(command, folder, out, size, {"point": spp, "env": environment_spp}, console)
+    text, measured = report(out, shots, references, note)
+    print(text)
+    path = out / "comparison.png"
+    console.print(f"picture: {path}; the study of what accuracy costs follows, {budget}", soft_wrap=True)
+    try:
+        found = study([sys.executable, "-m", "mi_ntf"], folder / "scene.xml", out / "tradeoff", budget, size,
+                      environment_spp)
+    except MiNtfError as error:
+        raise MiNtfError(f"the study failed; table and picture of the renders are in {out}, without its curve\n{error}"
+                         ) from None
+    picture(path, shots, references, measured, found)
+    console.print(f"picture, now with the study: {path}\nstudy: {out / 'tradeoff' / 'index.html'}", soft_wrap=True)
+
+
+def _shots(command: list[str], folder: Path, out: Path, size: int, samples: dict[str, int], console) -> list[Shot]:
+    """All renders of the scene in `folder`, one after the other; `samples`: per pixel, by light."""
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
     shots = []
     with Progress(TextColumn("{task.description:36}"), BarColumn(), TextColumn("{task.completed}/{task.total}"),
                   TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(), console=console) as progress:
@@ -170,11 +162,9 @@ def demo(out: Path = Path("out/demo"), scene: str = "statue", size: int = 256, s
                 progress.update(task, description=f"{light} · {visibility}")
                 file = out / f"{folder.name}_{light}_{visibility}.exr"
                 file.unlink(missing_ok=True)
-                samples = environment_spp if light == "env" else spp
-                shots.append(render(command, folder / "scene.xml", light, visibility, samples, size, file))
+                shots.append(render(command, folder / "scene.xml", light, visibility, samples[light], size, file))
                 progress.advance(task)
-    print(report(out, shots, references, note))
-    console.print(f"picture: {out / 'comparison.png'}")
+    return shots
 
 
 def _reference(folder: Path, light: str, size: int) -> np.ndarray:

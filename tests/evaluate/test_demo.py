@@ -1,6 +1,8 @@
 """`make demo`: process handling, table and picture by themselves, and the whole of it."""
 
 import json
+import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -10,11 +12,14 @@ import pytest
 from skimage import io
 
 from mi_ntf.core.errors import MiNtfError
-from mi_ntf.evaluate import demo
+from mi_ntf.evaluate import demo, demo_report
+from mi_ntf.evaluate.tradeoff import reading
+from mi_ntf.evaluate.tradeoff.points import Point
 
 FAKE = """
-import sys, numpy as np, OpenEXR
+import os, sys, numpy as np, OpenEXR
 words = sys.argv[1:]
+assert os.environ["MI_NTF_MAP_CACHE"] == "off"
 assert words[:2] == ["-m", "llvm_ad_rgb"] and words[-1].endswith("scene.xml"), words
 defined = dict(words[i + 1].split("=") for i, w in enumerate(words) if w == "-D")
 assert defined["res"] == "64"
@@ -32,7 +37,8 @@ def fake(tmp_path):
     return [sys.executable, str(tmp_path / "fake.py")]
 
 
-def test_render_passes_parameters_and_times_the_process(fake, tmp_path):
+def test_render_passes_parameters_and_times_the_process(fake, tmp_path, monkeypatch):
+    monkeypatch.setenv("MI_NTF_MAP_CACHE", "on")  # of the user: renders have theirs off
     shot = demo.render(fake, tmp_path / "scene.xml", "env", "raymarch", 3, 64, tmp_path / "o.exr")
     assert (shot.light, shot.visibility, shot.image.shape) == ("env", "raymarch", (4, 6, 4))
     assert (shot.image == 3).all() and shot.seconds > 0
@@ -41,6 +47,36 @@ def test_render_passes_parameters_and_times_the_process(fake, tmp_path):
 def test_a_failed_render_shows_its_output(fake, tmp_path):
     with pytest.raises(MiNtfError, match=r"(?s)visibility=none.*exit code 1.*no such visibility.*mi-ntf doctor"):
         demo.render(fake, tmp_path / "scene.xml", "env", "none", 3, 64, tmp_path / "o.exr")
+
+
+CACHED = """
+import sys, numpy as np, OpenEXR
+from types import SimpleNamespace
+from mi_ntf.render.maps import map_cache
+
+found = []
+def make(values=None):
+    found.append("made" if values is None else "read")
+    return SimpleNamespace(values=np.arange(6, dtype=np.float32))
+
+map_cache.cached("0" * 64, make, 6, 0)
+pixels = np.full((1, 1), found == ["made"], np.float32)
+with OpenEXR.File({"type": OpenEXR.scanlineimage}, {c: pixels for c in "RGBA"}) as file:
+    file.write(sys.argv[sys.argv.index("-o") + 1])
+print(found[0])
+"""
+
+
+def test_a_full_cache_of_maps_makes_no_difference(tmp_path, monkeypatch):
+    """What would be read from the user's cache, were it on, is made anew in the demo's renders."""
+    monkeypatch.setenv("MI_NTF_MAP_CACHE", "on")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    program = [sys.executable, "-c", CACHED]
+    alone = [subprocess.run([*program, "-o", str(tmp_path / "o.exr")], capture_output=True, text=True, check=True)
+             for _ in range(2)]
+    assert [done.stdout for done in alone] == ["made\n", "read\n"]
+    shot = demo.render(program, tmp_path / "scene.xml", "env", "transmittance_map", 1, 64, tmp_path / "o.exr")
+    assert (shot.image == 1).all()
 
 
 def _shots():
@@ -53,8 +89,9 @@ def _shots():
 
 def test_report_measures_against_reference_and_raymarch(tmp_path):
     shots, references = _shots()
-    text = demo.report(tmp_path, shots, references, "a note")
+    text, figures = demo.report(tmp_path, shots, references, "a note")
     measured = json.loads((tmp_path / "metrics.json").read_text())
+    assert measured == figures
     assert [m["relative_rmse"] for m in measured[:3]] == pytest.approx([0.02, 0.1, 0.1])
     assert [m["relative_rmse_to_raymarch"] for m in measured[3:]] == pytest.approx([0, 0.08 / 1.02, 0.12 / 1.02])
     assert text == (tmp_path / "table.md").read_text() and text.count("\n| ") == 7
@@ -69,6 +106,78 @@ def test_report_refuses_a_reference_of_another_size(tmp_path):
     references["env"] = references["env"][:32]
     with pytest.raises(MiNtfError, match=r"env/raymarch has shape \(64, 64, 4\), its reference \(32, 64, 4\)"):
         demo.report(tmp_path, shots, references, "")
+
+
+def _found(*points):
+    """A study's result of `points`: method, samples a pixel, drawn lights, seconds, error."""
+    rows = [{"label": method, "build": 0.5, "render": seconds - 0.5, "noise": error, "bias": 0.0, "uncertainty": 1e-8,
+             "error": error, "reason": "", "load": 1.0, "point": Point(method, spp, 6, light_samples=lights).as_dict()}
+            for method, spp, lights, seconds, error in points]
+    reading.mark_front(rows)
+    return {"points": rows, "base": Point("auto", 4, 6).as_dict(), "size": [64, 64], "budget_seconds": 120.0}
+
+
+def test_the_picture_gains_the_curve(tmp_path):
+    """Below what it showed before; words for the points of the front, marks for all."""
+    from matplotlib.figure import Figure
+    from matplotlib.text import Text
+
+    shots, references = _shots()
+    _, measured = demo.report(tmp_path, shots, references, "")
+    before = io.imread(tmp_path / "comparison.png")
+    study = _found(("transmittance_atlas", 4, 0, 2.0, 0.1), ("raymarch", 1, 16, 4.0, 0.3), ("volpath", 1, 0, 1.0, 0.9),
+                   ("ray_network", 16, 1, 2.1, 0.099))
+    demo.picture(tmp_path / "comparison.png", shots, references, measured, study)
+    after = io.imread(tmp_path / "comparison.png")
+    added = after.shape[0] - before.shape[0]
+    assert added == pytest.approx(110 * demo_report.CURVE_HEIGHT, abs=2) and after.shape[1] == before.shape[1]
+    assert after[-added:, :, :3].std() > 20 and np.abs(after[:-added] - before.astype(float)).mean() < 12
+    part = Figure(figsize=(12.4, 4.8), layout="constrained")
+    demo_report.pareto(part, study)
+    axes = part.axes[0]
+    assert axes.get_title() == "environment map: what accuracy costs, 4 ways measured within 120 s"
+    words = ["volpath, 1 spp", "atlas, 512 lights, 4 spp", "ray network, 1 drawn light, 16 spp"]
+    assert [text.get_text() for text in axes.texts] == words
+    part.draw_without_rendering()
+    boxes = [Text.get_window_extent(text) for text in axes.texts]  # without the lines that lead to the points
+    points = axes.transData.transform([(1.0, 0.9), (2.0, 0.1), (2.1, 0.099)])
+    for box, (x, y) in zip(boxes, points, strict=True):  # to the left, below, within the axes
+        assert box.x1 < x and (box.y0 + box.y1) / 2 < y
+        assert axes.bbox.x0 <= box.x0 and axes.bbox.y0 <= box.y0
+    assert not boxes[1].overlaps(boxes[2])
+    assert {"volpath", "raymarch", "transmittance_atlas", "ray_network"} < set(axes.get_legend_handles_labels()[1])
+
+
+def test_a_study_without_a_point_says_so_in_the_picture():
+    from matplotlib.figure import Figure
+
+    part = Figure()
+    demo_report.pareto(part, _found())
+    assert part.axes[0].texts[0].get_text() == "no point was measured: a larger --budget measures some"
+
+
+def test_a_failing_study_leaves_table_and_picture(tmp_path, monkeypatch, capsys):
+    def rendered(command, scene, light, visibility, spp, size, out):
+        return demo.Shot(light, visibility, 1.0, demo._reference(scene.parent, light, size))
+
+    def failing(*arguments):
+        raise MiNtfError("no light")
+
+    monkeypatch.setattr(demo, "render", rendered)
+    monkeypatch.setattr(demo, "study", failing)
+    monkeypatch.setattr(sys, "argv", ["demo", "--size", "32", "--out", str(tmp_path)])
+    assert demo.main() == 1
+    printed = capsys.readouterr()
+    assert "demo: the study failed; table and picture of the renders are in" in printed.err
+    assert printed.err.endswith("without its curve\nno light\n")
+    assert "| point light | `raymarch` | 1.0 |" in printed.out
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["comparison.png", "metrics.json", "table.md"]
+
+
+def test_a_budget_that_is_none_is_refused_before_the_renders(tmp_path):
+    with pytest.raises(MiNtfError, match="--budget is 'soon', expected a time of a second or more such as 90s"):
+        demo.demo(out=tmp_path / "out", size=32, budget="soon")
+    assert not (tmp_path / "out").exists()
 
 
 def test_program_falls_back_where_the_bridge_is_missing(monkeypatch):
@@ -110,15 +219,37 @@ def check_demo(folder: Path, ssim: float, rmse: float, to_march: float) -> None:
     assert (folder / "table.md").read_text().count("\n| ") == 7
     assert io.imread(folder / "comparison.png")[..., :3].std() > 20
     assert len(list(folder.glob("*.exr"))) == 6 and not list(folder.glob("*.part*"))
+    for name in demo.REPORT:
+        assert (folder / "tradeoff" / name).stat().st_size > 0
+
+
+COARSE = (('name="interior">', 'name="interior"><integer name="resolution" value="96"/>'),
+          ('<integrator type="nrf">', '<integrator type="nrf"><integer name="map_resolution" value="64"/>'))
+"""What makes the statue's scene quick to load: most of a render on few pixels is the field's grid and the maps."""
 
 
 def test_the_demo_on_few_pixels(tmp_path):
-    """The command of `make demo` itself, by the stock program, on 32² pixels."""
+    """The command of `make demo` itself, by the stock program, on 32² pixels of a coarser statue. The user's cache of
+    maps is on and empty: so it stays, though maps are made."""
+    out, cache, scene = tmp_path / "out", tmp_path / "cache", tmp_path / "scenes" / "statue"
+    for name in ("statue", "common"):
+        shutil.copytree(ROOT / "scenes" / name, tmp_path / "scenes" / name)
+    text = (scene / "scene.xml").read_text()
+    for old, new in COARSE:
+        assert old in text
+        text = text.replace(old, new)
+    (scene / "scene.xml").write_text(text)
     command = [sys.executable, "-m", "mi_ntf.evaluate.demo", "--size", "32", "--spp", "16", "--environment-spp", "4",
-               "--out", str(tmp_path)]  # fmt: skip
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=600)
+               "--budget", "5s", "--scene", str(scene), "--out", str(out)]  # fmt: skip
+    environment = {**os.environ, "MI_NTF_MAP_CACHE": "on", "XDG_CACHE_HOME": str(cache)}
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False, timeout=600)
     assert done.returncode == 0, done.stdout + done.stderr
-    check_demo(tmp_path, 0.8, 0.3, 0.15)
+    check_demo(out, 0.8, 0.3, 0.15)
+    assert not list(cache.rglob("*.map"))
+    assert "reference:" in done.stderr and str(out / "tradeoff" / "index.html") in done.stdout
+    result = json.loads((out / "tradeoff" / "tradeoff.json").read_text())
+    assert result["parameters"] == {"light": "env", "res": "32", "spp": "4"} and result["budget_seconds"] == 5
+    assert result["scene_size"] == [32, 32] and "mesh" in result["references"]
 
 
 @pytest.mark.slow
@@ -127,6 +258,8 @@ def test_make_demo():
     done = subprocess.run(["make", "demo"], cwd=ROOT, capture_output=True, text=True, check=False, timeout=3600)
     assert done.returncode == 0, done.stdout + done.stderr
     check_demo(ROOT / "out" / "demo", 0.9, 0.25, 0.07)
+    result = json.loads((ROOT / "out" / "demo" / "tradeoff" / "tradeoff.json").read_text())
+    assert result["finished"] and len(reading.measured(result["points"])) >= 6
 
 
 @pytest.mark.parametrize("size", [8, 100, 512])

@@ -153,4 +153,15 @@ def test_labels_name_what_differs_from_the_scene():
     assert points.label(point, BASE) == "transmittance_map, maps of 96², 2 logistics, 4 spp"
     assert points.label(Point("raymarch", 1, 2, light_samples=4), BASE) == "raymarch, 4 drawn lights, 1 spp"
     assert points.label(Point(STOCK, 16), BASE) == "volpath, 16 spp"
+
+
+@pytest.mark.parametrize(("point", "environment", "words"), [
+    (Point("transmittance_atlas", 4), True, "atlas, 512 lights, 4 spp"),
+    (Point("transmittance_map", 4, environment_lights=1, map_resolution=96), True, "map, maps of 96², 1 light, 4 spp"),
+    (Point("neural_transmittance", 64, light_samples=16), True, "neural, 16 drawn lights, 64 spp"),
+    (Point("ray_network", 1, light_samples=1), False, "ray network, 1 drawn light, 1 spp"),
+    (Point("raymarch", 1, samples=96), False, "raymarch, 96 steps, 1 spp"),
+    (Point(STOCK, 16, light_samples=4), True, "volpath, 16 spp")])
+def test_short_words(point, environment, words):
+    assert points.short(point, BASE, environment) == words
     assert points.from_dict(point.as_dict()) == point

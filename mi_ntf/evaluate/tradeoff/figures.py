@@ -1,12 +1,15 @@
-"""The curves of the report, as SVG that stands inside the page: points have the ids ``p1``, ``p2``, … of their
-numbers."""
+"""The curves of a study: of its report, as SVG that stands inside the page, where points have the ids ``p1``, ``p2``, …
+of their numbers; and :func:`panel`, the same curve in a figure of others."""
 
 import io
 import re
 from typing import Any
 
+import numpy as np
+
 from ...data.page import GREY, new_figure, plain
 from . import errors
+from .points import from_dict, short
 from .reading import error, groups, measured, total
 
 COLOURS = ("#3b82e0", "#e0433a", "#2f9e44", "#e39b1a", "#8b5cf6", "#0ea5b7", "#d6409f", "#8a6d3b", "#7d7d7d")
@@ -22,10 +25,41 @@ def methods(rows: list[dict[str, Any]]) -> dict[str, tuple[str, str]]:
 
 
 def curve(rows: list[dict[str, Any]]) -> str:
-    """Error over seconds, the front marked."""
+    """Error over seconds, the front marked and numbered."""
     figure = new_figure(9.5, 5.2)
     axes = figure.add_subplot()
     plain(axes)
+    for row in draw(axes, rows):
+        axes.annotate(str(row["number"]), (total(row), row["error"]), xytext=(-6, -11), textcoords="offset points",
+                      fontsize=8, color=GREY, ha="right")
+    _log(axes, "seconds of a picture, maps made anew, kernels compiled", "relative error of a picture")
+    axes.legend(frameon=False, labelcolor=GREY, fontsize=8, loc="upper left", bbox_to_anchor=(1.01, 1))
+    return _svg(figure)
+
+
+def panel(axes, result: dict[str, Any], environment: bool, fontsize: float = 11.0) -> None:
+    """Draw the curve of ``tradeoff.json`` onto `axes` of a larger figure, the points of the front in words.
+
+    environment  the scene has one, see :func:`.points.short`
+    fontsize     points
+    """
+    base, rows = from_dict(result["base"]), result["points"]
+    ends = draw(axes, rows)
+    width, height = result["size"]
+    _log(axes, f"seconds of a picture of {width}×{height} pixels, maps made anew, kernels compiled",
+         "relative error")
+    for text in (axes.xaxis.label, axes.yaxis.label, *axes.get_xticklabels(), *axes.get_yticklabels()):
+        text.set_fontsize(fontsize)
+    axes.tick_params(labelsize=fontsize)
+    axes.grid(True, color=GREY, alpha=0.2)
+    axes.legend(frameon=False, fontsize=fontsize, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    name_below(axes, [(total(row), row["error"], short(from_dict(row["point"]), base, environment)) for row in ends],
+               fontsize)
+
+
+def draw(axes, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Marks of all measured points, thin lines between those that differ in samples a pixel alone, the front as steps.
+    Returns the rows of the front, by seconds."""
     looks = methods(rows)
     for group in groups(rows):
         colour, _ = looks[group[0]["point"]["method"]]
@@ -34,12 +68,51 @@ def curve(rows: list[dict[str, Any]]) -> str:
     axes.plot([total(r) for r in ends], [r["error"] for r in ends], color=GREY, linewidth=2.5, alpha=0.6,
               drawstyle="steps-post", label="Pareto front", zorder=1)
     _points(axes, measured(rows), looks)
-    for row in ends:
-        axes.annotate(str(row["number"]), (total(row), row["error"]), xytext=(-6, -11), textcoords="offset points",
-                      fontsize=8, color=GREY, ha="right")
-    _log(axes, "seconds of a picture, maps made anew, kernels compiled", "relative error of a picture")
-    axes.legend(frameon=False, labelcolor=GREY, fontsize=8, loc="upper left", bbox_to_anchor=(1.01, 1))
-    return _svg(figure)
+    return ends
+
+
+def name_below(axes, named: list[tuple[float, float, str]], fontsize: float) -> None:
+    """Write words beside the points ``(x, y, words)`` of a front on log axes, from its upper left end to its lower
+    right one: each to the left and below of its point, where no point is, and below the words before it. The axes
+    become as much wider as that takes."""
+    if not named:
+        return
+    figure = axes.get_figure(root=True)
+    dot = figure.dpi / 72
+    figure.draw_without_rendering()  # gives axes their size
+    box = axes.get_window_extent()
+    line, gap = 1.25 * fontsize * dot / box.height, 7 * dot
+    texts = [axes.annotate(words, (x, y), fontsize=fontsize, ha="right", va="center", zorder=4,
+                           bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1},
+                           arrowprops={"arrowstyle": "-", "color": GREY, "linewidth": 0.8, "shrinkB": 4,
+                                       "relpos": (1, 0.5)})
+             for x, y, words in named]
+    widths = [text.get_window_extent().width + 2 * gap for text in texts]
+    low, high = np.log10(axes.get_xlim())
+    least = [(f * (high - low) - (np.log10(x) - low)) / (1 - f)
+             for (x, _, _), f in zip(named, (min(w / box.width, 0.9) for w in widths), strict=True)]
+    low -= max(0.0, *least)
+    axes.set_xlim(10**low, 10**high)
+    bottom, top = np.log10(axes.get_ylim())
+    bottom -= (top - bottom) * line * 1.5  # for the words of the lowest point
+    places = _stacked([np.log10(y) for _, y, _ in named], bottom, top, line)
+    while places[-1] < line and bottom > -12:
+        bottom -= 0.1
+        places = _stacked([np.log10(y) for _, y, _ in named], bottom, top, line)
+    axes.set_ylim(10**bottom, 10**top)
+    for (x, _, _), text, place in zip(named, texts, places, strict=True):
+        text.set_position(((np.log10(x) - low) / (high - low) - gap / box.width, place))
+        text.set_anncoords("axes fraction")
+
+
+def _stacked(heights: list[float], bottom: float, top: float, line: float) -> list[float]:
+    """Heights of words in shares of the axes from `bottom` to `top`, one `line` below their point and below each
+    other."""
+    places: list[float] = []
+    for height in heights:
+        place = (height - bottom) / (top - bottom) - 0.8 * line
+        places.append(min(place, places[-1] - line) if places else place)
+    return places
 
 
 def bias_curve(rows: list[dict[str, Any]]) -> str:

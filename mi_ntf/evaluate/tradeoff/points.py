@@ -132,8 +132,25 @@ def neighbours(point: Point, limits: Limits, fine: bool = False) -> list[tuple[P
 
 def label(point: Point, base: Point) -> str:
     """The point for a reader: its method, the dials that differ from the scene's, its samples a pixel."""
-    if point.method == STOCK:
-        return f"{STOCK}, {point.spp} spp"
+    changed = [] if point.method == STOCK else _changed(point, base).values()
+    return ", ".join([point.method, *changed, f"{point.spp} spp"])
+
+
+def short(point: Point, base: Point, environment: bool) -> str:
+    """The same in fewer words, for figures: "atlas, 512 lights, 4 spp". `environment`: the scene has one, which becomes
+    `environment_lights` lights; their number is told then, whether it differs or not."""
+    name = point.method.replace("transmittance", "").strip("_").replace("_", " ")
+    changed = {} if point.method == STOCK else _changed(point, base)
+    if environment and point.method != STOCK:
+        changed.pop("environment_lights", None)
+        several = "s" if (point.light_samples or point.environment_lights) > 1 else ""
+        changed["light_samples"] = (f"{point.light_samples} drawn light{several}" if point.light_samples
+                                    else f"{point.environment_lights} light{several}")
+    return ", ".join([name, *changed.values(), f"{point.spp} spp"])
+
+
+def _changed(point: Point, base: Point) -> dict[str, str]:
+    """Words for the dials of `point` that differ from those of `base`, by their names."""
     words = {
         "max_depth": "single scattering" if point.max_depth == 2 else f"depth {point.max_depth}",
         "samples": f"{point.samples} steps",
@@ -145,5 +162,4 @@ def label(point: Point, base: Point) -> str:
         "map_components": f"{point.map_components} logistic{'s' if point.map_components > 1 else ''}",
         "representation": f"field as {point.representation}",
     }
-    changed = [text for name, text in words.items() if getattr(point, name) != getattr(base, name)]
-    return ", ".join([point.method, *changed, f"{point.spp} spp"])
+    return {name: text for name, text in words.items() if getattr(point, name) != getattr(base, name)}

@@ -78,6 +78,20 @@ class State:
         return begun - sum(f.get("name") == name for f in (*self.of("point"), *self.of("interrupted")))
 
 
+def forget(folder: Path) -> bool:
+    """Remove what a study has found in `folder`, so that the next one there begins anew; whether there was anything.
+    Its report stays. Raises MiNtfError."""
+    path, images = Path(folder) / NAME, Path(folder) / IMAGES
+    there = path.is_file()
+    try:
+        for file in (path, *images.glob("*.npy")):
+            file.unlink(missing_ok=True)
+    except OSError as error:
+        raise MiNtfError(f"cannot remove {error.filename} ({error.strerror}); remove it or choose another folder"
+                         ) from None
+    return there
+
+
 def name_of(values: dict[str, Any]) -> str:
     """A short name of a point's dials."""
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:16]
