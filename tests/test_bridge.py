@@ -107,8 +107,9 @@ def test_version_pins_agree():
     assert pin in project["build-system"]["requires"]
 
 
-def test_twenty_runs_end_well(scene: Path):
-    for _ in range(20):
+@pytest.mark.parametrize("runs", [4, pytest.param(20, marks=pytest.mark.slow)])
+def test_runs_in_a_row_end_well(scene: Path, runs):
+    for _ in range(runs):
         done = run_program("mitsuba", "-m", "llvm_ad_rgb", scene, cwd=scene.parent)
         assert done.returncode == 0, done.stderr
         assert done.stderr == ""

@@ -74,6 +74,7 @@ def test_volpath_reference_agrees(blob_scene):
     assert error < 0.03  # volpath's noise: 8·8·256 paths a block, about 1 %; twice that and the marcher's own
 
 
+@pytest.mark.slow  # the README's own commands are the same chain
 def test_own_mesh_from_photographs_to_a_lit_image(tmp_path):
     pytest.importorskip("torch")
     _run("own_mesh.py", "--out", tmp_path, "--views", 8, "--size", 32, "--spp", 4, "--steps", 80)

@@ -61,10 +61,10 @@ def test_snippet(folder, language, code):
 
 
 def _marks(words) -> list:
-    """How shipped fields were trained takes minutes here too, and three trainings differ by their options alone: `make
-    hard-cases` runs those."""
-    slow = "knot-photographs" in words or "scenes/skull/field.safetensors" in words or words[:3] == [
-        "mi-ntf", "train", "skull_flash"]
+    """How shipped fields were trained takes minutes here too, some trainings differ by their options alone, and prices
+    are measured by other tests: `make hard-cases` runs those."""
+    dear = {"--measure", "mine.safetensors", "knot-photographs", "scenes/skull/field.safetensors"}
+    slow = dear & set(words) or words[:3] == ["mi-ntf", "train", "skull_flash"]
     return [pytest.mark.slow] if slow else []
 
 

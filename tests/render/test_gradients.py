@@ -97,8 +97,9 @@ def test_environment_texels(blobs, light_samples, rel, mode):
     assert mode(*case) == pytest.approx(differences(*case, 0.05), rel=rel)
 
 
-@pytest.mark.parametrize("mode", [forward, backward])
-@pytest.mark.parametrize("visibility", ["raymarch", "neural_transmittance", "transmittance_map", "none"])
+@pytest.mark.parametrize(("mode", "visibility"), [
+    (forward, "raymarch"), *((backward, v) for v in ("raymarch", "neural_transmittance", "transmittance_map", "none")),
+    *(pytest.param(forward, v, marks=pytest.mark.slow) for v in ("neural_transmittance", "transmittance_map", "none"))])
 def test_position(blobs, visibility, mode):
     """The light's distance, its angle, its shadows and the horizon, where the phase function jumps, move. Maps and
     networks stay: derivatives are the march's. Differences see its steps: from 0.05 to 0.1 they vary by 1 %."""

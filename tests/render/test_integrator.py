@@ -23,7 +23,8 @@ def renders(path, integrator, kind, spp, **options):
     return [scenes.render(loaded, seed) for seed in range(SEEDS)]
 
 
-@pytest.mark.parametrize("kind", LIGHTS)
+@pytest.mark.parametrize(
+    "kind", [pytest.param(k, marks=pytest.mark.slow if k == "directional" else ()) for k in LIGHTS])
 def test_agrees_with_volpath(blobs, kind):
     """The same single scattering by delta tracking: z-test per 4×4 block, and 8×8 block means within 2 %."""
     # The environment in both as Mitsuba samples it: `light_samples` draws from the very map.

@@ -153,6 +153,7 @@ def test_skull_stands_where_its_field_does():
     assert radius == pytest.approx(similarity.radius, abs=1e-6)
 
 
+@pytest.mark.slow  # of an asset that changes with its own command alone
 def test_skull_has_no_holes_and_no_plaid():
     """Under the sky its silhouette is one piece without gaps, and nothing in it is much darker or brighter than what is
     around it, as the torn field of an earlier build was. The lamp leaves the side that is turned away dark."""

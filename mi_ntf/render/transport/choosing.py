@@ -19,10 +19,8 @@ from .estimate import Estimate
 from .omissions import OMISSIONS
 from .probing import SAMPLES, Look, Probes, probed
 
-MARGIN = 0.9
-"""Of `max_error`, what the pixels rendered beforehand may be off: they are few."""
-TRIAL = 1.0
-"""Seconds that a trial takes, compilation mostly: what saves less is not tried."""
+TRIAL = 0.5
+"""Seconds that a trial takes: what saves less is not tried."""
 SAVING = 0.1
 """Of the predicted time, what leaving something out must save at least."""
 FINER = {"map_resolution": 256, "map_components": 2}
@@ -108,7 +106,7 @@ class Chooser:
 
     def _marched(self) -> Look:
         """The probes by the march, which also tell how far off the prices are."""
-        self.probes = Probes(self.sensor, self.estimate.media, min(self._spp, SAMPLES))
+        self.probes = Probes(self.sensor, self.estimate.media)
         march = self.settings.but(visibility="raymarch")
         truth = self._looked(march)
         self.estimate.dearer = self._price(truth) / max(self.estimate.seconds(march), 1e-9)
@@ -142,14 +140,14 @@ class Chooser:
 
     def _method(self, truth: Look) -> tuple[Trial, Look]:
         """The cheapest that keeps to the error."""
-        full, limit = self._price(truth), MARGIN * self.limits.error
+        full = self._price(truth)
         for seconds, settings in sorted(((self.estimate.seconds(s), s) for s in self._candidates()),
                                         key=lambda pair: pair[0]):
             if not self._pays(full - seconds):
                 self._tried(settings, seconds, why="saves less than a trial takes")
                 continue
             look = self._looked(settings)
-            good = self.probes.error(look, truth) <= limit
+            good = self.probes.error(look, truth) <= self.limits.error
             if good and len(look.composition.runs) == 1 and self._price(look) < full:
                 return self._judged(look, truth, True, "the cheapest that keeps to max_error"), look
             self._judged(look, truth, False, "no cheaper than the march" if good else
@@ -174,7 +172,7 @@ class Chooser:
                 if share > 1 - SAVING or not self._pays(best.seconds * (1 - share)):
                     break
                 tried = self._looked(settings)
-                good = self.probes.error(tried, truth) <= MARGIN * self.limits.error
+                good = self.probes.error(tried, truth) <= self.limits.error
                 cheaper = self._price(tried) < best.seconds
                 why = ("kept: it is more than max_error allows" if not good else
                        "left out: the picture keeps to max_error" if cheaper else "kept: it costs nothing")
@@ -187,7 +185,7 @@ class Chooser:
     def _by_time(self) -> Choice:
         """The smallest error when the time is over: samples that a march cannot have may be worth a bias."""
         march = self.settings.but(visibility="raymarch")
-        samples = min(self._spp, SAMPLES) * probed(self._size[0] * self._size[1])
+        samples = SAMPLES * probed(self._size[0] * self._size[1])
         if max(self.estimate.each(march) * samples, TRIAL) > SPARED * self._left():
             return self._untried(march)
         truth = self._marched()

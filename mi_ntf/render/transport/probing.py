@@ -1,5 +1,6 @@
 """Some pixels of a picture, rendered beforehand: what they show, how noisy a sample is, and what a picture takes."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -15,7 +16,7 @@ from .composition import Composition
 SHARE = 0.03
 """Of the pixels, those rendered beforehand, at most `MOST` and at least `LEAST`; `SAMPLES` of each."""
 MOST, LEAST, SAMPLES = 1024, 192, 4
-SMALL, WITHIN = 0.01, 48
+SMALL, WITHIN = 0.01, 96
 """A field whose bounds take less than this share of the picture gets as many pixels of its own."""
 
 
@@ -41,15 +42,15 @@ class Probes:
     weight  (probes,): share of the picture that each stands for
     """
 
-    def __init__(self, sensor, media: list, samples: int = SAMPLES):
+    def __init__(self, sensor, media: list):
         width, height = (int(n) for n in sensor.film().crop_size())
-        self._pixels, self.samples = width * height, samples
+        self._pixels = width * height
         rng = np.random.default_rng(0)
         count = round(probed(self._pixels) * self._pixels)
         places, self.weight = _places(rng, count, _small(sensor, media))
         self.count = len(self.weight)
         self._sharpness = _pixels_of(sensor.film().rfilter())
-        place = np.repeat(places, samples, 1)
+        place = np.repeat(places, SAMPLES, 1)
         n = place.shape[1]
         place += (rng.random((2, n)) - 0.5) / np.array([[width], [height]])
         aperture = mi.Point2f(*(mi.Float(v) for v in rng.random((2, n))))
@@ -67,7 +68,7 @@ class Probes:
         (composition, radiance), stages = measurement.watch(lambda: self._trace(compose()))
         built = sum(stages.get(name, 0.0) for name in measurement.BUILT)
         # Probes of small fields are more than their share: the time is that of a picture with as many.
-        each = (sum(stages.values()) - built) * self._pixels / (self.count * self.samples)
+        each = (sum(stages.values()) - built) * self._pixels / (self.count * SAMPLES)
         return Look(composition, radiance, built, each)
 
     def _trace(self, composition: Composition):
@@ -78,19 +79,26 @@ class Probes:
                 light, _ = camera_light.trace(composition, self._ray, self._quadrature, dr.opaque(mi.UInt32, 7))
             total += light * self._weight
             dr.eval(total)
-        return composition, np.array(total).T.reshape(self.count, self.samples, 3)
+        return composition, np.array(total).T.reshape(self.count, SAMPLES, 3)
 
     def error(self, found: Look, truth: Look) -> float:
-        """Relative RMSE of the picture, as far as the probes tell; 0 for a black truth. Both are seen along the same
-        rays: their noise is no part of it."""
-        a, b = (look.radiance.mean(1) for look in (found, truth))
-        power = float(self.weight @ (b**2).mean(1))
-        return float(np.sqrt(self.weight @ ((a - b) ** 2).mean(1) / power)) if power > 0 else 0.0
+        """Relative RMSE of the picture, at most: a standard error more than the probes tell; 0 for a black truth. Both
+        are seen along the same rays, whose noise is no part of it; where lights are drawn, each half of the samples has
+        a noise of its own, and their product knows the bias alone."""
+        off, half = found.radiance - truth.radiance, SAMPLES // 2
+        one, other = off[:, :half].mean(1), off[:, half:].mean(1)
+        if not truth.composition.lights.sampled:
+            one = other = off.mean(1)
+        squares = (one * other).mean(1)
+        mean = float(self.weight @ squares)
+        spread = math.sqrt(float(self.weight**2 @ (squares - mean) ** 2))
+        power = float(self.weight @ (truth.radiance.mean(1) ** 2).mean(1))
+        return math.sqrt(max(mean + spread, 0.0) / power) if power > 0 else 0.0
 
     def noise(self, look: Look) -> float:
         """Relative RMS error of a picture of one sample a pixel, whose filter takes the mean of several."""
         power = float(self.weight @ (look.radiance.mean(1) ** 2).mean(1))
-        variance = float(self.weight @ look.radiance.var(1, ddof=1).mean(1)) if self.samples > 1 else 0.0
+        variance = float(self.weight @ look.radiance.var(1, ddof=1).mean(1))
         return float(np.sqrt(variance / power / self._sharpness)) if power > 0 else 0.0
 
 

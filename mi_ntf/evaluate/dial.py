@@ -1,0 +1,199 @@
+"""What the limits of the integrator ``nrf`` keep to, on the shipped scenes.
+
+    python -m mi_ntf.evaluate.dial error  [--scenes statue globe …] [--lights point sky …] [--size 128] [--spp 4]
+    python -m mi_ntf.evaluate.dial noise  …
+    python -m mi_ntf.evaluate.dial time   …
+
+``error``  `max_error` 2 % with ``auto`` beside every fixed choice: methods, and of environments the number of lights.
+           Seconds of one picture and of twenty (the first and 19 times the second), maps and atlases made in the first,
+           kernels compiled; error is to `raymarch` with the same seeds, or bias alone where light is drawn at random.
+``noise``  `noise_threshold` beside the noise of the picture against one of `TRUTH` samples a pixel.
+``time``   `time_budget` beside the seconds that it took, and the error, noise included, beside that of the best fixed
+           method in the same time.
+
+One line of JSON a case; a table at the end.
+"""
+
+import argparse
+import itertools
+import json
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..render.maps import map_cache
+from .photographs import field_ball
+from .tradeoff.measure import maps_in_memory
+
+SCENES = Path(__file__).parents[2] / "scenes"
+NAMES = ("statue", "globe", "knot", "cloud", "skull")
+LIGHTS = ("point", "directional", "env", "sky", "area")
+LIMIT, FRAMES = 0.02, (1, 20)
+THRESHOLDS = (0.1, 0.03, 0.01)
+BUDGETS = (5.0, 20.0)
+TRUTH = 512
+FIXED: list[dict[str, Any]] = [
+    {"visibility": "raymarch"}, {"visibility": "transmittance_atlas"}, {"visibility": "neural_transmittance"},
+    {"visibility": "transmittance_map"},
+    {"visibility": "transmittance_map", "map_resolution": 256, "map_components": 2}]
+FEWER = (512, 256, 128)
+"""Lights that stand for an environment; the dearest of `FIXED` is left out for those."""
+
+
+def emitter(light: str, name: str, center: np.ndarray, radius: float) -> dict[str, Any]:
+    """Mitsuba dict of one of `LIGHTS`, as bright and where the scene's own point light is; `sky`: a sun of half a
+    degree. The world of ``skull`` is upside down."""
+    up = -1.0 if name == "skull" else 1.0
+    away = np.array([1.4, 1.8 * up, 2.7 if name != "skull" else -2.0])
+    away /= np.linalg.norm(away)
+    place, distance = center + 3.2 * radius * away, 3.2 * radius
+    power = math.pi * distance**2
+    if light == "point":
+        return {"type": "point", "position": place.tolist(), "intensity": power}
+    if light == "directional":
+        return {"type": "directional", "direction": (-away).tolist(), "irradiance": math.pi}
+    if light == "env":
+        return {"type": "envmap", "filename": str(SCENES / "common" / "env.exr")}
+    if light == "area":
+        size = 0.3 * radius
+        return {"type": "sphere", "center": place.tolist(), "radius": size,
+                "light": {"type": "area", "radiance": power / (math.pi * size**2)}}
+    upright = mi.ScalarTransform4f().rotate([1, 0, 0], -90 * up)
+    return {"type": "sunsky", "sun_direction": away.tolist(), "to_world": upright}
+
+
+def scene(name: str, light: str, size: int, spp: int):
+    """A shipped scene by its own camera under one of `LIGHTS`."""
+    path = SCENES / name
+    loaded = mi.load_file(str(path / "scene.xml"), res=str(size), spp=str(spp))
+    ball = field_ball(path / "field.safetensors")
+    center, radius = np.array(ball["center"], float), float(ball["radius"])
+    return mi.load_dict({"type": "scene", "sensor": loaded.sensors()[0], "ball": ball,
+                         "light": emitter(light, name, center, radius)})
+
+
+def integrator(**options):
+    """``nrf`` without the emitters in the picture."""
+    return mi.load_dict({"type": "nrf", "hide_emitters": True, **options})
+
+
+def picture(loaded, nrf, seed: Any = 0, spp: int = 0) -> tuple[np.ndarray, float]:
+    """(h, w, 3) and its seconds."""
+    dr.sync_thread()
+    start = time.perf_counter()
+    image = np.array(mi.render(loaded, integrator=nrf, seed=seed, spp=spp), np.float64)[..., :3]
+    return image, time.perf_counter() - start
+
+
+def relative(image: np.ndarray, truth: np.ndarray) -> float:
+    """Relative RMSE."""
+    return float(np.sqrt(((image - truth) ** 2).mean() / (truth**2).mean()))
+
+
+def frames(loaded, options: dict[str, Any]) -> tuple[np.ndarray, list[float], Any]:
+    """Two pictures (2, h, w, 3), their seconds, maps made anew in the first and kernels compiled before, and the
+    integrator."""
+    with maps_in_memory():
+        picture(loaded, integrator(**options), 9, 0 if "max_error" in options else 1)
+        map_cache.forget()
+        nrf = integrator(**options)
+        images, seconds = zip(*(picture(loaded, nrf, seed) for seed in (0, 1)), strict=True)
+    return np.stack(images), list(seconds), nrf
+
+
+def off(images: np.ndarray, truth: np.ndarray, drawn: bool) -> float:
+    """Relative RMSE of pictures (2, h, w, 3) to others by the same seeds; `drawn`: of what both have in common alone,
+    since light that is drawn makes noise that is each one's own."""
+    one, other = images - truth
+    square = float((one * other).mean()) if drawn else float((one**2 + other**2).mean()) / 2
+    return math.sqrt(max(square, 0.0) / float((truth[0] * truth[1]).mean()))
+
+
+def error_case(name: str, light: str, size: int, spp: int) -> list[dict[str, Any]]:
+    """Rows of `FRAMES`."""
+    loaded, fixed, truth = scene(name, light, size, spp), [], None
+    fewer = FEWER if light in ("env", "sky") else FEWER[:1]
+    for options, count in itertools.product(FIXED[:-1] if len(fewer) > 1 else FIXED, fewer):
+        options = options | {"environment_lights": count}
+        images, seconds, _ = frames(loaded, options)
+        truth = images if truth is None else truth
+        fixed.append((options, off(images, truth, light == "area"), seconds))
+    assert truth is not None
+    rows = []
+    for number in FRAMES:
+        images, seconds, nrf = frames(loaded, {"max_error": LIMIT, "frames": number})
+        best = min((f for f in fixed if f[1] <= LIMIT), key=lambda f: total(f[2], number))
+        taken = [t["name"] for t in nrf.achieved["trials"] if t["taken"]]
+        rows.append({
+            "scene": name, "light": light, "frames": number, "error": off(images, truth, light == "area"),
+            "predicted": nrf.achieved["predicted"], "taken": taken[-1] if taken else nrf.achieved["visibility"],
+            "seconds": total(seconds, number), "best": best[0], "best_seconds": total(best[2], number),
+            "march_seconds": total(fixed[0][2], number)})
+    return rows
+
+
+def total(seconds: list[float], number: int) -> float:
+    """Of so many pictures."""
+    return seconds[0] + (number - 1) * seconds[1]
+
+
+def noise_case(name: str, light: str, size: int, spp: int) -> list[dict[str, Any]]:
+    """Rows of `THRESHOLDS`: the noise found, and |I − truth| over √truth as the threshold counts."""
+    loaded, rows = scene(name, light, size, spp), []
+    truth = np.mean([picture(loaded, integrator(), 100 + k, TRUTH // 4)[0] for k in range(4)], 0)
+    for threshold in THRESHOLDS:
+        nrf = integrator(noise_threshold=threshold)
+        image, seconds = picture(loaded, nrf, 1)
+        off = np.abs(image - truth).sum() / np.sqrt(np.maximum(truth.sum(-1), 0)).sum()
+        rows.append({"scene": name, "light": light, "threshold": threshold, "found": nrf.achieved["noise"],
+                     "noise": float(off), "spp": nrf.achieved["spp"], "seconds": seconds})
+    return rows
+
+
+def time_case(name: str, light: str, size: int, spp: int) -> list[dict[str, Any]]:
+    """Rows of `BUDGETS`; errors against `raymarch` of many samples."""
+    loaded, rows = scene(name, light, size, spp), []
+    truth = picture(loaded, integrator(visibility="raymarch"), 100, 64)[0]
+    for budget in BUDGETS:
+        found = []
+        for options in ({}, *({"visibility": v} for v in ("raymarch", "transmittance_atlas", "transmittance_map"))):
+            with maps_in_memory():
+                picture(loaded, integrator(time_budget=budget, **options), 9)
+                map_cache.forget()
+                nrf = integrator(time_budget=budget, **options)
+                image, seconds = picture(loaded, nrf, 1)
+            found.append((relative(image, truth), seconds, nrf.achieved["spp"], nrf.achieved["visibility"]))
+        best = min(found[1:], key=lambda f: f[0])
+        rows.append({"scene": name, "light": light, "budget": budget, "seconds": found[0][1], "error": found[0][0],
+                     "spp": found[0][2], "taken": found[0][3], "best": best[3], "best_error": best[0]})
+    return rows
+
+
+CASES = {"error": error_case, "noise": noise_case, "time": time_case}
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(prog="python -m mi_ntf.evaluate.dial")
+    parser.add_argument("what", choices=CASES)
+    parser.add_argument("--scenes", nargs="+", default=NAMES, choices=NAMES)
+    parser.add_argument("--lights", nargs="+", default=LIGHTS, choices=LIGHTS)
+    parser.add_argument("--size", type=int, default=128)
+    parser.add_argument("--spp", type=int, default=4)
+    args = parser.parse_args()
+    mi.set_variant("llvm_ad_rgb")
+    from ..render import register
+
+    register()
+    for name, light in itertools.product(args.scenes, args.lights):
+        for row in CASES[args.what](name, light, args.size, args.spp):
+            print(json.dumps(row), flush=True)
+
+
+if __name__ == "__main__":
+    main()
