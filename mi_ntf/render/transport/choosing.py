@@ -147,7 +147,7 @@ class Chooser:
                 self._tried(settings, seconds, why="saves less than a trial takes")
                 continue
             look = self._looked(settings)
-            good = self.probes.error(look, truth) <= self.limits.error
+            good = self.probes.error(look, truth, self._spp) <= self.limits.error
             if good and len(look.composition.runs) == 1 and self._price(look) < full:
                 return self._judged(look, truth, True, "the cheapest that keeps to max_error"), look
             self._judged(look, truth, False, "no cheaper than the march" if good else
@@ -172,7 +172,7 @@ class Chooser:
                 if share > 1 - SAVING or not self._pays(best.seconds * (1 - share)):
                     break
                 tried = self._looked(settings)
-                good = self.probes.error(tried, truth) <= self.limits.error
+                good = self.probes.error(tried, truth, self._spp) <= self.limits.error
                 cheaper = self._price(tried) < best.seconds
                 why = ("kept: it is more than max_error allows" if not good else
                        "left out: the picture keeps to max_error" if cheaper else "kept: it costs nothing")
@@ -215,7 +215,8 @@ class Chooser:
 
     def _ends_at(self, look: Look, truth: Look) -> float:
         """Error of a picture by what is left of the time."""
-        return math.hypot(self.probes.error(look, truth), self._noise(truth, self._left() / max(look.each, 1e-9)))
+        bias = self.probes.error(look, truth, self._spp)
+        return math.hypot(bias, self._noise(truth, self._left() / max(look.each, 1e-9)))
 
     def _noise(self, truth: Look, samples: float) -> float:
         return self.probes.noise(truth) / math.sqrt(max(samples, 1.0))
@@ -232,8 +233,8 @@ class Chooser:
                 f"{each:.3g} s by {settings.visibility}; that will be rendered")
 
     def _judged(self, look: Look, truth: Look, taken: bool, why: str, what: str = "") -> Trial:
-        return self._tried(look.composition.settings, self._price(look), self.probes.error(look, truth), taken, why,
-                           what)
+        error = self.probes.error(look, truth, self._spp)
+        return self._tried(look.composition.settings, self._price(look), error, taken, why, what)
 
     def _tried(self, settings: Settings, seconds: float, error: float = math.nan, taken: bool = False, why: str = "",
                what: str = "") -> Trial:

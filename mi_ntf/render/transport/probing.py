@@ -16,6 +16,8 @@ from .composition import Composition
 SHARE = 0.03
 """Of the pixels, those rendered beforehand, at most `MOST` and at least `LEAST`; `SAMPLES` of each."""
 MOST, LEAST, SAMPLES = 1024, 192, 4
+CAUTION = 0.5
+"""Standard errors that are added to a mean square."""
 SMALL, WITHIN = 0.01, 96
 """A field whose bounds take less than this share of the picture gets as many pixels of its own."""
 
@@ -33,7 +35,7 @@ class Look:
 
 def probed(pixels: int) -> float:
     """The share of so many pixels that is rendered beforehand."""
-    return min(max(SHARE * pixels, LEAST), MOST) / pixels
+    return min(max(SHARE * pixels, LEAST), MOST, pixels) / pixels
 
 
 class Probes:
@@ -81,19 +83,18 @@ class Probes:
             dr.eval(total)
         return composition, np.array(total).T.reshape(self.count, SAMPLES, 3)
 
-    def error(self, found: Look, truth: Look) -> float:
-        """Relative RMSE of the picture, at most: a standard error more than the probes tell; 0 for a black truth. Both
-        are seen along the same rays, whose noise is no part of it; where lights are drawn, each half of the samples has
-        a noise of its own, and their product knows the bias alone."""
+    def error(self, found: Look, truth: Look, spp: int) -> float:
+        """Relative RMSE of a picture of `spp` samples, with a margin for so few pixels; 0 for a black truth. Both are
+        seen along the same rays. Two halves of the samples share a bias, not their noise, which their product leaves
+        out: more samples make that smaller, and where lights are drawn it is not a method's own."""
         off, half = found.radiance - truth.radiance, SAMPLES // 2
-        one, other = off[:, :half].mean(1), off[:, half:].mean(1)
-        if not truth.composition.lights.sampled:
-            one = other = off.mean(1)
-        squares = (one * other).mean(1)
+        both, one, other = off.mean(1), off[:, :half].mean(1), off[:, half:].mean(1)
+        share = 0.0 if truth.composition.lights.sampled else SAMPLES / spp
+        squares = (one * other + share * (both * both - one * other)).mean(1)
         mean = float(self.weight @ squares)
         spread = math.sqrt(float(self.weight**2 @ (squares - mean) ** 2))
         power = float(self.weight @ (truth.radiance.mean(1) ** 2).mean(1))
-        return math.sqrt(max(mean + spread, 0.0) / power) if power > 0 else 0.0
+        return math.sqrt(max(mean + CAUTION * spread, 0.0) / power) if power > 0 else 0.0
 
     def noise(self, look: Look) -> float:
         """Relative RMS error of a picture of one sample a pixel, whose filter takes the mean of several."""
@@ -113,8 +114,10 @@ def _pixels_of(rfilter) -> float:
 
 def _places(rng, count: int, boxes: list) -> tuple[np.ndarray, np.ndarray]:
     """``(places, weights)``: (2, n) of the unit square, `count` all over it and `WITHIN` in each of `boxes`, corners
-    (low, high); what is all over it stands for what is in no box."""
-    places, weights = [rng.random((2, count))], [np.full(count, 1 / count)]
+    (low, high); what is all over it (by the sequence R2 of Roberts 2018) stands for what is in no box."""
+    # Evenly, or what few pixels tell would be how many of them meet the object.
+    index, turn = np.arange(1, count + 1), 1.32471795724474602596
+    places, weights = [np.stack([index / turn, index / turn**2]) % 1], [np.full(count, 1 / count)]
     for low, high in boxes:
         inside = ((places[0] >= low[:, None]) & (places[0] <= high[:, None])).all(0)
         weights[0] = np.where(inside, 0.0, weights[0])

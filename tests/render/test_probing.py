@@ -1,0 +1,65 @@
+"""Pixels rendered beforehand: where they are, and what they tell of error and noise."""
+
+from types import SimpleNamespace
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers import scenes
+from helpers.variants import VARIANT
+
+from mi_ntf.render.transport import probing
+
+
+@pytest.fixture(autouse=True)
+def variant():
+    mi.set_variant(VARIANT)
+
+
+def test_weights_are_shares_of_the_picture(rng):
+    """A box that is a hundredth of it has a hundredth of the weight, whatever the places outside."""
+    box = np.array([0.3, 0.4]), np.array([0.4, 0.5])
+    places, weights = probing._places(rng, 4000, [box])
+    inside = ((places >= box[0][:, None]) & (places <= box[1][:, None])).all(0)
+    assert weights[inside].sum() == pytest.approx(0.01, rel=1e-9) and inside.sum() > probing.WITHIN
+    assert weights.sum() == pytest.approx(1, abs=2e-3)  # 4000 places find the hundredth within so much
+    assert ((places >= 0) & (places < 1)).all()
+
+
+@pytest.mark.parametrize(("name", "expected"), [("box", 1), ("gaussian", np.pi)])
+def test_a_filter_takes_the_mean_of_pixels(name, expected):
+    """(∫f)² / ∫f² over the plane; of a Gaussian of half a pixel 4πσ² (cut off, and lowered to 0, at its radius)."""
+    assert probing._pixels_of(mi.load_dict({"type": name})) == pytest.approx(expected, rel=0.05)
+
+
+def looks(rng, probes, bias, noise, drawn):
+    """(found, truth): a picture of power 1 and one that is `bias` too bright, each with `noise` of its own."""
+    shape = probes.count, probing.SAMPLES, 3
+    truth = np.ones(shape) + noise * rng.normal(size=shape)
+    found = np.full(shape, 1 + bias) + noise * rng.normal(size=shape)
+    lights = SimpleNamespace(lights=SimpleNamespace(sampled=[0] if drawn else []))
+    return (probing.Look(lights, radiance, 0.0, 0.0) for radiance in (found, truth))
+
+
+@pytest.fixture
+def probes():
+    film = {**scenes.film(256), "rfilter": {"type": "box"}}
+    return probing.Probes(mi.load_dict({"type": "perspective", "fov": 30.0, "film": film}), [])
+
+
+def test_noise_of_drawn_lights_is_no_error(rng, probes):
+    found, truth = looks(rng, probes, 0.05, 0.1, True)
+    assert probes.error(found, truth, 4) == pytest.approx(0.05, rel=0.1)
+
+
+@pytest.mark.parametrize("spp", [2, 16])
+def test_noise_of_a_method_is_that_of_its_samples(rng, probes, spp):
+    """√(bias² + 2 noise²/spp); of channels that are alike in bias, not in noise."""
+    found, truth = looks(rng, probes, 0.05, 0.1, False)
+    assert probes.error(found, truth, spp) == pytest.approx(np.sqrt(0.05**2 + 2 * 0.1**2 / spp), rel=0.1)
+
+
+def test_noise_of_one_sample(rng, probes):
+    _, truth = looks(rng, probes, 0.0, 0.3, False)
+    power = 1 + 0.3**2 / probing.SAMPLES
+    assert probes.noise(truth) == pytest.approx(0.3 / np.sqrt(power), rel=0.05)
