@@ -16,11 +16,13 @@ from ..scene import effects
 from ..scene.settings import Limits, Settings
 from .composition import Composition
 from .estimate import Estimate
-from .omissions import OMISSIONS
+from .omissions import LIGHTS, OMISSIONS
 from .probing import SAMPLES, Look, Probes, probed
 
 TRIAL = 0.5
 """Seconds that a trial takes: what saves less is not tried."""
+SHARED = 0.5
+"""Of `max_error`, what fewer lights may err before a method is looked for: of squares a quarter."""
 SAVING = 0.1
 """Of the predicted time, what leaving something out must save at least."""
 FINER = {"map_resolution": 256, "map_components": 2}
@@ -74,6 +76,7 @@ class Chooser:
         self._gone, self._before, self._whole = gone, before, whole
         self._size = tuple(int(n) for n in sensor.film().crop_size())
         self.trials: list[Trial] = []
+        self._errors: dict[Settings, float] = {}
 
     def choose(self) -> Choice:
         """As the limits say. A method that the user named stays, whatever its error."""
@@ -116,9 +119,11 @@ class Chooser:
         """Seconds of a picture, what is built shared among the frames."""
         return look.built / self.settings.frames + look.each * self._spp
 
-    def _pays(self, saved: float) -> bool:
-        """Whether so many seconds less a picture are worth a trial."""
-        return saved * self.settings.frames >= TRIAL
+    def _pays(self, saved: float, settings: Settings | None = None) -> bool:
+        """Whether so many seconds less a picture are worth a trial, and `settings` the maps that are made anew for
+        them."""
+        anew = self.estimate.built(settings) if settings and not REGISTRY[settings.visibility].per_field else 0.0
+        return saved * self.settings.frames >= TRIAL + anew
 
     def _by_error(self) -> Choice:
         named = self.settings.visibility != "auto"
@@ -133,48 +138,53 @@ class Chooser:
             look = self._looked(first)
             best = self._judged(look, truth, True, "named")
         else:
-            best, look = self._method(truth)
+            march = Trial("raymarch", self._price(truth), 0.0, True), truth
+            # Fewer lights are fewer for every method; what they err leaves the method most of the error.
+            lit = march if self._whole else self._without(*march, truth, LIGHTS, SHARED * self.limits.error)
+            best, look = self._method(*lit, truth)
         if not self._whole:
-            best, look = self._without(best, look, truth)
+            best, look = self._without(best, look, truth, OMISSIONS, self.limits.error)
         return Choice(look.composition, self.trials, {"seconds": best.seconds, "error": best.error})
 
-    def _method(self, truth: Look) -> tuple[Trial, Look]:
-        """The cheapest that keeps to the error."""
-        full = self._price(truth)
-        for seconds, settings in sorted(((self.estimate.seconds(s), s) for s in self._candidates()),
-                                        key=lambda pair: pair[0]):
+    def _method(self, march: Trial, marched: Look, truth: Look) -> tuple[Trial, Look]:
+        """The cheapest that keeps to the error, in place of `march`, the cheapest of the march itself."""
+        full, settings = march.seconds, marched.composition.settings
+        for seconds, candidate in sorted(((self.estimate.seconds(s), s) for s in self._candidates(settings)),
+                                         key=lambda pair: pair[0]):
             if not self._pays(full - seconds):
-                self._tried(settings, seconds, why="saves less than a trial takes")
+                self._tried(candidate, seconds, why="saves less than a trial takes")
                 continue
-            look = self._looked(settings)
+            look = self._looked(candidate)
             good = self.probes.error(look, truth, self._spp) <= self.limits.error
             if good and len(look.composition.runs) == 1 and self._price(look) < full:
                 return self._judged(look, truth, True, "the cheapest that keeps to max_error"), look
             self._judged(look, truth, False, "no cheaper than the march" if good else
                          "off by more than max_error allows")
-        return self._tried(truth.composition.settings, full, 0.0, True, "nothing cheaper keeps to max_error"), truth
+        return self._tried(settings, full, march.error, True, "nothing cheaper keeps to max_error"), marched
 
-    def _candidates(self) -> list[Settings]:
+    @staticmethod
+    def _candidates(settings: Settings) -> list[Settings]:
         """What ``auto`` may choose, with the settings' own dials and finer ones."""
         found = []
         for name, method in REGISTRY.items():
             if method.automatic and name != "raymarch":
-                found.append(self.settings.but(visibility=name))
+                found.append(settings.but(visibility=name))
                 if set(FINER) <= set(method.dials):
-                    found.append(self.settings.but(visibility=name, **FINER))
+                    found.append(settings.but(visibility=name, **FINER))
         return found
 
-    def _without(self, best: Trial, look: Look, truth: Look) -> tuple[Trial, Look]:
-        """Like `best`, without what the picture hardly shows."""
-        for name, of in OMISSIONS.items():
+    def _without(self, best: Trial, look: Look, truth: Look, omissions: dict, limit: float) -> tuple[Trial, Look]:
+        """Like `best`, without what the picture hardly shows, by `limit`."""
+        for name, of in omissions.items():
             while (settings := of(look.composition.settings, look.composition)) is not None:
                 share = self.estimate.seconds(settings) / self.estimate.seconds(look.composition.settings)
-                if share > 1 - SAVING or not self._pays(best.seconds * (1 - share)):
+                if (share > 1 - SAVING or not self._pays(best.seconds * (1 - share), settings)
+                        or self._errors.get(settings, 0.0) > limit):
                     break
                 tried = self._looked(settings)
-                good = self.probes.error(tried, truth, self._spp) <= self.limits.error
+                good = self.probes.error(tried, truth, self._spp) <= limit
                 cheaper = self._price(tried) < best.seconds
-                why = ("kept: it is more than max_error allows" if not good else
+                why = (f"kept: it is off by more than {limit:.2%}" if not good else
                        "left out: the picture keeps to max_error" if cheaper else "kept: it costs nothing")
                 trial = self._judged(tried, truth, good and cheaper, why, name)
                 if not trial.taken:
@@ -191,7 +201,7 @@ class Chooser:
         truth = self._marched()
         best, least = truth, self._ends_at(truth, truth)
         self._tried(march, self._price(truth), least, True, "smallest error when the time is over")
-        for settings in self._candidates():
+        for settings in self._candidates(self.settings):
             built = self.estimate.built(settings)
             hoped = self._noise(truth, (self._left() - built) / max(self.estimate.each(settings), 1e-9))
             if built + TRIAL > SPARED * self._left() or hoped > least:
@@ -234,6 +244,7 @@ class Chooser:
 
     def _judged(self, look: Look, truth: Look, taken: bool, why: str, what: str = "") -> Trial:
         error = self.probes.error(look, truth, self._spp)
+        self._errors[look.composition.settings] = error
         return self._tried(look.composition.settings, self._price(look), error, taken, why, what)
 
     def _tried(self, settings: Settings, seconds: float, error: float = math.nan, taken: bool = False, why: str = "",

@@ -48,7 +48,8 @@ def _no_lobes(settings: Settings, composition: Composition) -> Settings | None:
     return settings.but(specular=False) if composition.effects.specular else None
 
 
-OMISSIONS: dict[str, Callable[[Settings, Composition], Settings | None]] = {
-    "further bounces": _no_bounces, "small fields": _no_small_field,
-    "half of the environment's lights": _fewer_lights, "dim lights": _bright_lights, "specular lobes": _no_lobes}
+Omission = Callable[[Settings, Composition], Settings | None]
+LIGHTS: dict[str, Omission] = {"half of the environment's lights": _fewer_lights, "dim lights": _bright_lights}
+OMISSIONS: dict[str, Omission] = {
+    "further bounces": _no_bounces, "small fields": _no_small_field, **LIGHTS, "specular lobes": _no_lobes}
 """What may be left out, in the order in which it is tried."""
