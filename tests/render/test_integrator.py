@@ -13,8 +13,6 @@ from mi_ntf.core import field_file
 from mi_ntf.core.architecture import FAST, Encoding, Header
 from mi_ntf.render.scene import loaded
 
-# test_lights.py compares every emitter, in larger blocks; those of the long run (`make hard-cases`) take two minutes.
-LIGHTS = ("directional", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("point", "env")))
 SEEDS = 4
 
 
@@ -23,8 +21,8 @@ def renders(path, integrator, kind, spp, **options):
     return [scenes.render(loaded, seed) for seed in range(SEEDS)]
 
 
-@pytest.mark.parametrize(
-    "kind", [pytest.param(k, marks=pytest.mark.slow if k == "directional" else ()) for k in LIGHTS])
+@pytest.mark.slow  # test_lights.py compares every emitter, in larger blocks
+@pytest.mark.parametrize("kind", ["directional", "point", "env"])
 def test_agrees_with_volpath(blobs, kind):
     """The same single scattering by delta tracking: z-test per 4×4 block, and 8×8 block means within 2 %."""
     # The environment in both as Mitsuba samples it: `light_samples` draws from the very map.
