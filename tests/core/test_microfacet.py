@@ -191,7 +191,7 @@ def test_soft_skins_are_reciprocal_and_send_no_more_than_flat_ones(wi, wo, rough
 @pytest.mark.parametrize("softness", [0.0, 0.01, 0.1, 1.0])
 def test_white_soft_skin_never_shines(softness):
     """∫ f c_i/(c_i + c_o) dω_i, what a skin of softness k sends to ω_o in a white furnace: at most 1, 1 to above."""
-    mu, weights = np.polynomial.legendre.leggauss(2000)
+    mu, weights = _nodes(2000)
     mu, weights = (mu + 1) / 2, weights / 2
     c_i = microfacet.soft_cosine(ops, mu, softness)
     for cos_o in (1.0, 0.5, 0.1, 0.01):
@@ -222,7 +222,7 @@ def test_opposite_directions_have_no_half_vector_and_no_nan():
     assert diffuse == pytest.approx(0.8 / np.pi) and specular == 0
 
 
-@given(st.floats(-1, 1), st.floats(0.15, 1))
+@given(st.floats(-1, 1).filter(lambda cos: not 0 < cos <= microfacet.HORIZON), st.floats(0.15, 1))
 def test_collocated_form_is_the_general_one_for_equal_directions(cos, roughness):
     w = _sphere(cos, 0.4)
     # 1e-9: the sine between n and h comes from 1 − c² here and from a cross product there.

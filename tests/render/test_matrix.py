@@ -52,7 +52,7 @@ def images(name: str, kind: str, methods) -> dict[str, np.ndarray]:
     return {"fine": fine} | {method: image(method) for method in methods}
 
 
-@pytest.mark.parametrize("name", ["statue", pytest.param("globe", marks=pytest.mark.slow), "knot"])
+@pytest.mark.parametrize("name", ["statue", *(pytest.param(n, marks=pytest.mark.slow) for n in ("globe", "knot"))])
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_method_and_emitter(name, kind):
     found = images(name, kind, TOLERANCE)
