@@ -24,7 +24,7 @@ LLVM_MINIMUM = 17
 EXTRAS = {
     "train": ("torch", "tensorboard", "matplotlib", "PIL", "cv2"),
     "eval": ("skimage", "flip_evaluator", "matplotlib", "PIL"),
-    "mesh": ("skimage", "trimesh"),
+    "mesh": ("skimage", "scipy", "trimesh"),
     "watch": ("tevclient",),
 }
 """Extras of this package and the modules that they bring."""

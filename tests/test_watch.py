@@ -39,7 +39,7 @@ class Viewer:
 
     def __init__(self):
         self.server = socket.create_server(("127.0.0.1", 0))
-        self.address = "127.0.0.1:%d" % self.server.getsockname()[1]
+        self.address = f"127.0.0.1:{self.server.getsockname()[1]}"
         self.names, self.images = [], {}
         threading.Thread(target=self._serve, daemon=True).start()
 
