@@ -17,7 +17,7 @@ from .network import NetworkField
 
 LEVEL = 10.0
 """σ of the surface, 1/(unit-sphere radius). Of 3 to 30 the one whose mean distance to the photographed meshes is least:
-0.26 to 0.47 % of the radius at 256 voxels; lower ones lie outside of them, higher ones tear skins open."""
+0.2 to 0.4 % of the radius at 256 voxels; lower ones lie outside of them, higher ones tear skins open."""
 TIGHT = 0.3
 """Share of the level at which a skin counts as closed when what it encloses is filled: a thin spot is no hole."""
 CRUMB = 1e-4
