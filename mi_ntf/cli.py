@@ -331,6 +331,27 @@ class Bake:
 
 
 @dataclass
+class Export:
+    """Write a field's surface as a mesh with albedo and roughness, for Blender and others."""
+
+    field_file: Annotated[Positional[Path], arg(metavar="FIELD")]
+    """Trained field."""
+    output: Output
+    """Mesh to write: .ply (all attributes), .obj, .glb (colours), .stl."""
+    resolution: int = 256
+    """Voxels per side in which the surface is found, 32 to 512."""
+    level: float | None = None
+    """Density of the surface, 1/(radius of the field's sphere); 10 unless given, less in thin matter."""
+    json: bool = False
+    """Print JSON in place of a table."""
+
+    def run(self) -> None:
+        from mi_ntf.export import export
+
+        _report(export(self.field_file, self.output, self.resolution, self.level), self.json, _print_pairs)
+
+
+@dataclass
 class Info:
     """Describe a field file."""
 
@@ -372,6 +393,7 @@ Command = (
     | Annotated[Tradeoff, subcommand("tradeoff")]
     | Annotated[Reproduce, subcommand("reproduce")]
     | Annotated[Bake, subcommand("bake")]
+    | Annotated[Export, subcommand("export")]
     | Annotated[Info, subcommand("info")]
     | Annotated[Doctor, subcommand("doctor")]
 )

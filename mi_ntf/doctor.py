@@ -24,6 +24,8 @@ LLVM_MINIMUM = 17
 EXTRAS = {
     "train": ("torch", "tensorboard", "matplotlib", "PIL", "cv2"),
     "eval": ("skimage", "flip_evaluator", "matplotlib", "PIL"),
+    "mesh": ("skimage", "scipy", "trimesh"),
+    "watch": ("tevclient",),
 }
 """Extras of this package and the modules that they bring."""
 

@@ -1,13 +1,14 @@
 """`mi-ntf render`: the stock program `mitsuba` in Python, for machines without a C++ compiler.
 
 It takes the stock program's flags and does what `src/mitsuba/mitsuba.cpp` of Mitsuba 3.9.1 does:
-parse, instantiate, render without developing, let the film write the file.
+parse, instantiate, render without developing, let the film write the file. Flags of its own: ``--watch``, and those of
+another environment (:mod:`mi_ntf.render.scene.environment_option`).
 """
 
 import argparse
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,9 @@ import OpenEXR
 from mi_ntf import bridge
 from mi_ntf.core import files
 from mi_ntf.core.errors import MiNtfError
+from mi_ntf.render.scene import scene_file
+from mi_ntf.render.scene.environment_option import Environment
+from mi_ntf.watch import TEV, Tev, printed, watch
 
 VARIANT_PRIORITY = ("cuda_ad_rgb", "llvm_ad_rgb")
 """Without `-m`, the first of these that this machine can run, as in the stock program."""
@@ -29,7 +33,7 @@ MTIME = 2.0
 def parser() -> argparse.ArgumentParser:
     """The stock program's command line."""
     p = argparse.ArgumentParser(
-        prog="mi-ntf render", description="Render Mitsuba scenes; same flags as the program `mitsuba`."
+        prog="mi-ntf render", description="Render Mitsuba scenes; same flags as the program `mitsuba`, and some more."
     )
     p.add_argument("scenes", nargs="+", metavar="SCENE.xml")
     p.add_argument(
@@ -46,6 +50,14 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("-O", type=int, choices=range(6), dest="optimise", metavar="0-5", help="Dr.Jit optimisation level")
     p.add_argument("-S", action="store_true", dest="print_ir", help="print the intermediate representation")
     p.add_argument("-W", action="count", default=0, dest="wavefront", help="wavefronts in place of a megakernel")
+    own = p.add_argument_group("not of the program `mitsuba`")
+    own.add_argument("--env", type=Path, metavar="FILE", help="latitude-longitude image in place of the environment's")
+    own.add_argument("--env-rotate", type=float, default=0.0, metavar="DEG",
+                     help="turn the environment about the world's up axis, further than the scene does")
+    own.add_argument("--env-scale", type=float, default=1.0, metavar="S", help="factor of the environment's radiance")
+    own.add_argument("--watch", action="store_true",
+                     help="render again when a file of the scene changes, until Ctrl-C; sends pictures to tev")
+    own.add_argument("--tev", default=TEV, metavar="HOST:PORT", help=f"where tev may listen (default {TEV})")
     return p
 
 
@@ -63,20 +75,41 @@ def main(arguments: Sequence[str]) -> None:
             p.error(f"-D {item}: expected KEY=VALUE")
         parameters[key] = value
 
+    if args.watch and len(args.scenes) > 1:
+        p.error(f"--watch takes one scene, found {len(args.scenes)}")
     _apply_settings(args)
+    environment = Environment(args.env, args.env_rotate, args.env_scale)
+    common: dict[str, Any] = {"sensor_index": args.sensor, "output": args.output and Path(args.output),
+                              "environment": environment}
+    if args.watch:
+        _watch(Path(args.scenes[0]), parameters, args.tev, common)
+        return
     for scene in args.scenes:
-        render_file(Path(scene), parameters, sensor_index=args.sensor, output=args.output and Path(args.output))
+        render_file(Path(scene), parameters, **common)
 
 
-def render_file(path: Path, parameters: dict[str, str], *, sensor_index: int = 0, output: Path | None = None) -> None:
-    """Render one scene file in the current variant and write the image with the film.
+def _watch(scene: Path, parameters: dict[str, str], address: str, options: dict[str, Any]) -> None:
+    """Render `scene` again and again, see :mod:`mi_ntf.watch`."""
+    tev = Tev(address, printed)
+    if not scene.is_file():
+        raise MiNtfError(f"scene {scene} does not exist")
 
-    `parameters` are the values of `$key` in the scene. The image goes to `output` or, by default,
-    beside the scene; the film sets the extension. Raises MiNtfError if the scene cannot be rendered.
+    def render(seen: Callable[[Path], None]) -> None:
+        film = render_file(scene, parameters, seen=seen, **options)
+        tev.show(str((options["output"] or scene).resolve().with_suffix(".exr")), film.bitmap())
+
+    watch(render, printed)
+
+
+def render_file(path: Path, parameters: dict[str, str], *, sensor_index: int = 0, output: Path | None = None,
+                environment: Environment | None = None, seen: Callable[[Path], None] | None = None) -> Any:
+    """Render one scene file in the current variant, write the image with the film, and return the film.
+
+    `parameters` are the values of `$key` in the scene, `environment` is laid over its own, `seen` is called with each
+    file before it is read. The image goes to `output` or, by default, beside the scene; the film sets the extension.
+    Raises MiNtfError if the scene cannot be rendered.
     """
-    if not path.is_file():
-        raise MiNtfError(f"scene {path} does not exist")
-    scene = mi.load_file(str(path), **parameters)  # type: ignore[arg-type]  # they are $names
+    scene = scene_file.load(path, parameters, environment, seen)
     if not isinstance(scene, mi.Scene):
         raise MiNtfError(f"{path}: the root element must be a <scene>")
     if not 0 <= sensor_index < len(scene.sensors()):
@@ -91,6 +124,7 @@ def render_file(path: Path, parameters: dict[str, str], *, sensor_index: int = 0
     written = (output or path).with_suffix(".exr")  # of EXR films
     if written.is_file() and written.stat().st_mtime > begun - MTIME:
         _annotate(written, getattr(scene.integrator(), "achieved", {}))
+    return sensor.film()
 
 
 def _annotate(path: Path, achieved: dict) -> None:

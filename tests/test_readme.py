@@ -83,6 +83,10 @@ def test_command(folder, words):
         words += [word for k, v in CAPTURE.items() if k not in words for word in (k, v)]
     if words[0] == "mitsuba" and "scenes/" in words[-1]:  # a swapped one is small by itself
         words[1:1] = ["-D", "res=16"]
+    if words[:2] == ["mi-ntf", "render"]:
+        words[2:2] = ["-D", "res=16", "-D", "spp=1"]
+    if words[1] == "export":
+        words += ["--resolution", "48"]
     if words[1] == "reproduce":  # a table without pictures and trainings
         words = [*words[:2], "-o", "reproduced", "--quick", "--scenes", "statue", "--tables", "curves", "--methods",
                  "TM"]
@@ -97,7 +101,7 @@ def test_command(folder, words):
 def test_every_command_is_shown():
     shown = {words[1] if words[0] == "mi-ntf" else words[0] for words in COMMANDS}
     assert shown == {"capture", "inspect", "train", "swap", "mitsuba", "info", "compare", "explain", "bake", "make",
-                     "tradeoff", "reproduce"}
+                     "tradeoff", "reproduce", "export", "render"}
 
 
 def test_readme_is_short():

@@ -8,6 +8,9 @@
     train_filenames, val_filenames, test_filenames    file_path of the frames of each split
     pl_pos, pl_intensity, unit_sphere                 as `schema` has them
 
+Frames whose photograph is not there are left out, as instant-ngp does: blurred ones are deleted and stay in the file,
+its own example (`fox`) among them.
+
 Source: nerfstudio's documentation, "Data conventions"; for k4 its undistortion (`full_images_datamanager`), which
 refuses it as well.
 """
@@ -34,6 +37,11 @@ def read(folder: Path) -> Found:
     data = entries.load(path)
     views = [_view(data, entry, f"{path}, frame {i}", folder) for i, entry in enumerate(data["frames"])]
     splits, notes = _splits(data, views, path)
+    kept = {split: [view for view in chosen if view.image.is_file()] for split, chosen in splits.items()}
+    count, left = (sum(map(len, each.values())) for each in (splits, kept))
+    if left > count / 2 and kept["train"]:  # else it is another folder that is meant, or a copy that was broken off
+        splits = {split: chosen for split, chosen in kept.items() if chosen}
+        notes += [f"{count - left} of {count} frames have no photograph and are left out"] if left < count else []
     return Found(FORM, splits, entries.unit_sphere(data, path), None, notes)
 
 

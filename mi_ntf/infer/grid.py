@@ -40,7 +40,7 @@ class GridField:
 
     def __init__(self, field: NetworkField, resolution: int, dj: ModuleType):
         self.dj, self.resolution, self._field = dj, resolution, field
-        log_sigma = _coefficients(_log_density(field, resolution, dj), dj)
+        log_sigma = _coefficients(baked_log_density(field, resolution, dj), dj)
         self._log_sigma = _texture(log_sigma[..., None], dj)
         coarse = min(resolution, REFLECTANCE_RESOLUTION)
         self._reflectance = None
@@ -78,11 +78,11 @@ def _highest_gloss(grid: GridField, dense: np.ndarray, n: int) -> float:
     return float((specular / (4 * roughness**4)).max(initial=0.0))
 
 
-def _log_density(field: NetworkField, n: int, dj: ModuleType) -> np.ndarray:
+def baked_log_density(field: NetworkField, n: int, dj: ModuleType) -> np.ndarray:
     """ln σ at the centres of n³ voxels (z, y, x); ``LOG_FLOOR`` where a survey found less all around."""
     values = np.full(n**3, LOG_FLOOR, np.float32)
     if n > SURVEY:
-        near = _chebyshev_distance(_log_density(field, SURVEY, dj) > LOG_FLOOR, 2) <= 1
+        near = _chebyshev_distance(baked_log_density(field, SURVEY, dj) > LOG_FLOOR, 2) <= 1
         at = (2 * np.arange(n) + 1) * SURVEY // (2 * n)
         index = np.flatnonzero(near.take(at, 2).take(at, 1).take(at, 0))
     else:

@@ -168,6 +168,19 @@ def test_nerfstudios_lists_of_names(tmp_path):
     assert [len(s.images) for s in load(tmp_path)[0].values()] == [14, 1, 1]
 
 
+def test_frames_without_a_photograph_are_left_out_unless_most_are(tmp_path):
+    """As in instant-ngp's `fox`, of whose 67 frames 17 have none."""
+    forms.nerfstudio(tmp_path)
+    (tmp_path / "images/frame_00003.png").unlink()
+    splits, said = load(tmp_path)
+    assert "1 of 16 frames have no photograph and are left out\n" in said
+    np.testing.assert_allclose(splits["train"].c2w, np.delete(forms.C2W[:-2], 3, 0), atol=1e-6)
+    for i in range(4, 13):
+        (tmp_path / f"images/frame_{i:05d}.png").unlink()
+    with pytest.raises(MiNtfError, match=r"frame_00003\.png does not exist; the data set is incomplete"):
+        load(tmp_path)
+
+
 def test_nerfstudios_masks_and_lights(tmp_path):
     """`mask_path` is meant: it goes before an alpha channel. Lights and the sphere are those of a capture."""
     forms.nerfstudio(tmp_path)

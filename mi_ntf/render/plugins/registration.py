@@ -6,6 +6,8 @@ import mitsuba as mi
 
 from ...core.errors import MiNtfError
 from ...infer.backend import module
+from ..scene import scene_file
+from ..scene.environment_option import Environment
 from .emitter import emitter_class
 from .integrator import integrator_class
 from .medium import medium_class
@@ -39,13 +41,14 @@ def register() -> None:
         mi.detail.add_variant_callback(_on_variant)
 
 
-def load_scene(path: Path, parameters: dict[str, str]):
+def load_scene(path: Path, parameters: dict[str, str], environment: Environment | None = None):
     """The scene of an XML file, `parameters` for its $names, whose integrator is ``nrf``; the variant is
-    ``llvm_ad_rgb`` where none is set. Raises MiNtfError if the integrator is another."""
+    ``llvm_ad_rgb`` where none is set. `environment` is laid over the scene's own. Raises MiNtfError if the integrator
+    is another, or the environment does not fit."""
     if mi.variant() is None:
         mi.set_variant("llvm_ad_rgb")
     register()
-    scene = mi.load_file(str(path), **parameters)  # type: ignore[arg-type]  # they are $names
+    scene = scene_file.load(path, parameters, environment)
     integrator = scene.integrator()
     if not hasattr(integrator, "map_resolution"):
         raise MiNtfError(f'{path}: its integrator is {integrator.class_name()}, expected <integrator type="nrf">')
