@@ -331,6 +331,54 @@ class Bake:
 
 
 @dataclass
+class Sequence_:
+    """Render many frames of a scene in one process: a timeline, or a table of parameters. Run again, it goes on."""
+
+    scene: Positional[Path]
+    """Mitsuba scene."""
+    output: Annotated[Path, arg(aliases=("-o",), metavar="DIR")]
+    """Folder for frame_0000.exr and so on."""
+    timeline: Annotated[Path | None, arg(metavar="T.toml")] = None
+    """What changes over the frames: $names, camera, lights, environment at key frames."""
+    parameters: Annotated[Path | None, arg(metavar="P.csv")] = None
+    """Values of $names, one line a frame."""
+    define: Annotated[UseAppendAction[tuple[str, ...]], arg(aliases=("-D",), metavar="KEY=VALUE")] = field(
+        default_factory=tuple
+    )
+    """Value of $KEY in all frames."""
+    shard: Annotated[str, arg(metavar="i/n")] = "1/1"
+    """Render the i-th of n shards, counted from 1."""
+    check: bool = False
+    """Render nothing; name the frames that are missing, broken or of other parameters (exit code 1)."""
+    mode: Annotated[str, arg(aliases=("-m",), metavar="VARIANT")] = ""
+    """Mitsuba's variant; the first available of cuda_ad_rgb and llvm_ad_rgb unless given."""
+    json: bool = False
+    """Print JSON in place of a summary, and no progress."""
+
+    def run(self) -> int:
+        if self.timeline is not None and self.parameters is not None:
+            raise UsageError("give --timeline or --parameters, not both")
+        fixed = _definitions(self.define)
+        from mi_ntf.sequence import command
+
+        try:
+            i, n = command.shard(self.shard)
+        except ValueError as error:
+            raise UsageError(str(error)) from None
+        line = command.frames_of(self.timeline, self.parameters, fixed)
+        tasks = command.tasks_of(self.scene, self.output, line.frames, variant=self.mode)[i - 1 :: n]
+        if self.check:
+            found = command.check(tasks)
+            faults = command.faults(found)
+            _report(found, self.json, lambda found: print(f"{found['done']} of {found['images']} images are there"))
+            for text in faults:
+                print(f"mi-ntf: {text}", file=sys.stderr)
+            return 1 if faults else 0
+        _report(command.run(tasks, quiet=self.json), self.json, command.print_summary)
+        return 0
+
+
+@dataclass
 class Info:
     """Describe a field file."""
 
@@ -372,6 +420,7 @@ Command = (
     | Annotated[Tradeoff, subcommand("tradeoff")]
     | Annotated[Reproduce, subcommand("reproduce")]
     | Annotated[Bake, subcommand("bake")]
+    | Annotated[Sequence_, subcommand("sequence")]
     | Annotated[Info, subcommand("info")]
     | Annotated[Doctor, subcommand("doctor")]
 )

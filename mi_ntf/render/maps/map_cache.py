@@ -29,6 +29,8 @@ SEAL = hashlib.sha256().digest_size
 """Bytes at the start of a file that depend on all others and on its name; float32 numbers follow."""
 
 _maps: OrderedDict[str, Any] = OrderedDict()
+_used: set[str] = set()
+"""Names of maps since :func:`keep_used` was called last."""
 
 
 def mode() -> str:
@@ -80,6 +82,7 @@ def cached(name: str, make, count: int, limit: float):
     where = mode()
     if where == "off":
         return make()
+    _used.add(name)
     if name in _maps:
         _maps.move_to_end(name)
         return _maps[name]
@@ -96,6 +99,14 @@ def cached(name: str, make, count: int, limit: float):
 def forget() -> None:
     """Drop what is kept in memory."""
     _maps.clear()
+
+
+def keep_used() -> None:
+    """Drop from memory what was not used since the last call: of frames, lights that have moved on leave no maps
+    behind, and all others keep theirs."""
+    for name in set(_maps) - _used:
+        del _maps[name]
+    _used.clear()
 
 
 def _make_room(limit: float) -> None:
