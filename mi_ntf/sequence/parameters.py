@@ -26,7 +26,7 @@ def read(path: str | Path, fixed: dict[str, str] | None = None) -> Timeline:
         if not name or name.startswith("$") or names.count(name) > 1:
             raise MiNtfError(f"parameters {path}: the first line has the name {name!r}, expected each $name of the scene "
                              "once, without the $")
-    frames = []
+    frames: list[Frame] = []
     for line, row in rows[1:]:
         if len(row) != len(names):
             raise MiNtfError(f"parameters {path}, line {line}: {len(row)} values for {len(names)} names")

@@ -131,13 +131,15 @@ def _parameter(said, name: str):
     if isinstance(said, str | int):
         return lambda _: str(said)
     keys = said.get("keys") if isinstance(said, dict) else None
-    listed = isinstance(keys, list) and all(isinstance(k, list) and len(k) == 2 for k in keys)
-    if listed and any(isinstance(k[1], str | bool) for k in keys):
+    values = [k[1] for k in keys if isinstance(k, list) and len(k) == 2] if isinstance(keys, list) else []
+    step = isinstance(said, dict) and said.get("interpolation", "step") == "step"
+    if keys and any(isinstance(v, str | bool) for v in values):
+        if not step:
+            raise MiNtfError(f'{name}: between texts there is nothing, so interpolation must be "step"')
         order = Track({"keys": [[k[0], i] for i, k in enumerate(keys)], "interpolation": "step"}, 1, name)
-        if said.get("interpolation", "step") != "step":
-            raise MiNtfError(f"{name}: between texts there is nothing, so interpolation must be \"step\"")
-        texts = [_parameter(k[1], name)(0) for k in keys]
+        texts = [_parameter(v, name)(0) for v in values]
         return lambda number: texts[int(order.at(number)[0])]
     track = Track(said, 1, name)
-    whole = listed and said.get("interpolation") == "step" and all(isinstance(k[1], int) for k in keys)
-    return lambda number: str(int(track.at(number)[0])) if whole else repr(float(track.at(number)[0]))
+    if isinstance(said, dict) and "interpolation" in said and step and all(isinstance(v, int) for v in values):
+        return lambda number: str(int(track.at(number)[0]))
+    return lambda number: repr(float(track.at(number)[0]))

@@ -56,7 +56,8 @@ def render(task: Task) -> dict[str, Any]:
         ready(task.variant)
         state, name = _parsed(task)
         scene = changed.instantiated(Path(task.scene), _for_many(state, task.count))
-        channels = _render(scene, task)
+        with map_cache.not_written():
+            channels = _render(scene, task)
         record: dict[str, Any] = {"number": task.frame.number, "of": task.frame.told(), "key": name}
         if task.parts > 1:
             record |= {"part": task.part + 1, "parts": task.parts}
@@ -81,7 +82,7 @@ def ready(variant: str = "") -> None:
     """A variant is set, and the plugins are known in it."""
     if variant and variant not in mi.variants():
         raise MiNtfError(f"unknown variant {variant!r}; this Mitsuba has {', '.join(mi.variants())}")
-    if variant and mi.variant() != variant or mi.variant() is None:
+    if (variant and mi.variant() != variant) or mi.variant() is None:
         mi.set_variant(*([variant] if variant else VARIANT_PRIORITY))
     if mi.variant() not in _registered:
         _registered.add(str(mi.variant()))
