@@ -348,6 +348,12 @@ class Sequence_:
     """Value of $KEY in all frames."""
     shard: Annotated[str, arg(metavar="i/n")] = "1/1"
     """Render the i-th of n shards, counted from 1."""
+    lights: Annotated[int, arg(metavar="N")] = 1
+    """Render each frame in N parts by its lights, which shards share; when all are there, they become the frame."""
+    film: Annotated[Path | None, arg(metavar="FILE")] = None
+    """MP4 or WebM of all frames at the end: linear values, clipped to 0..1, with sRGB's curve (extra `video`)."""
+    exposure: float = 0.0
+    """Of the film, in stops."""
     check: bool = False
     """Render nothing; name the frames that are missing, broken or of other parameters (exit code 1)."""
     mode: Annotated[str, arg(aliases=("-m",), metavar="VARIANT")] = ""
@@ -365,8 +371,12 @@ class Sequence_:
             i, n = command.shard(self.shard)
         except ValueError as error:
             raise UsageError(str(error)) from None
+        if self.film and (n > 1 or self.check):
+            raise UsageError("--film shows all frames: give it without --shard and --check when they are there")
+        if self.lights < 1:
+            raise UsageError(f"--lights is {self.lights}, expected the number of parts, 1 or more")
         line = command.frames_of(self.timeline, self.parameters, fixed)
-        tasks = command.tasks_of(self.scene, self.output, line.frames, variant=self.mode)[i - 1 :: n]
+        tasks = command.tasks_of(self.scene, self.output, line.frames, self.lights, self.mode)[i - 1 :: n]
         if self.check:
             found = command.check(tasks)
             faults = command.faults(found)
@@ -374,7 +384,8 @@ class Sequence_:
             for text in faults:
                 print(f"mi-ntf: {text}", file=sys.stderr)
             return 1 if faults else 0
-        _report(command.run(tasks, quiet=self.json), self.json, command.print_summary)
+        film = (self.film, line.fps, self.exposure) if self.film else None
+        _report(command.run(tasks, quiet=self.json, film=film), self.json, command.print_summary)
         return 0
 
 

@@ -88,8 +88,8 @@ def _environment(emitters: list, turn: dict) -> None:
 def _look_at(origin: list, target: list, up: list, name: str):
     way = np.subtract(target, origin)
     if not np.linalg.norm(np.cross(way, up)) > 1e-9 * np.linalg.norm(way) * np.linalg.norm(up):
-        raise MiNtfError(f"{name}: from origin {origin} to target {target} with up {up} there is no upright view; origin "
-                         "and target must differ, and up must point another way")
+        raise MiNtfError(f"{name}: from origin {origin} to target {target} with up {up} there is no upright view; "
+                         "origin and target must differ, and up must point another way")
     return mi.ScalarTransform4f().look_at(origin, target, up)
 
 

@@ -4,6 +4,7 @@ import re
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 
 from ..core import files
 from ..core.errors import MiNtfError
+from . import film as films
 from . import image_file, parameters, timeline
 from .timeline import Frame, Timeline
 from .work import Task, key, render
@@ -57,11 +59,15 @@ def faults(found: dict[str, Any]) -> list[str]:
     return [text for kind in (image_file.MISSING, image_file.BROKEN, image_file.OTHER) for text in found[kind]]
 
 
-def run(tasks: list[Task], work: Callable[[Task], dict[str, Any]] = render, quiet: bool = False) -> dict[str, Any]:
-    """Make what is not there yet by `work`, one image after the other. Returns ``images``, ``kept`` (there before),
+def run(tasks: list[Task], work: Callable[[Task], dict[str, Any]] = render, quiet: bool = False,
+        film: tuple[Path, float, float] | None = None) -> dict[str, Any]:
+    """Make what is not there yet by `work`, one image after the other, and at the end the `film`: file, frames a
+    second, stops of exposure (:mod:`mi_ntf.sequence.film`). Returns ``images``, ``kept`` (there before),
     ``rendered``, ``seconds`` of all, ``first`` and ``each``, the median of the others. What is there, but broken or of
     other parameters, is said and made anew. Raises MiNtfError."""
     begin = time.perf_counter()
+    if film:
+        films.check(film[0])
     if tasks:
         files.make_folder(Path(tasks[0].folder))
     todo, again = [], []
@@ -80,10 +86,12 @@ def run(tasks: list[Task], work: Callable[[Task], dict[str, Any]] = render, quie
             seconds.append(work(task)["seconds"])
             _join(task)
             advance(1)
+    shown = {"film": str(film[0]), "toned": films.write(film[0], (t.whole for t in tasks if not t.part), *film[1:])
+             } if film else {}
     return {"folder": tasks[0].folder if tasks else "", "images": len(tasks), "kept": len(tasks) - len(todo),
             "rendered": len(todo), "seconds": time.perf_counter() - begin,
             "first": seconds[0] if seconds else None,
-            "each": float(np.median(seconds[1:])) if seconds[1:] else None, "each_of": seconds}
+            "each": float(np.median(seconds[1:])) if seconds[1:] else None, "each_of": seconds} | shown
 
 
 def print_summary(found: dict[str, Any]) -> None:
@@ -92,6 +100,8 @@ def print_summary(found: dict[str, Any]) -> None:
           f"{found['kept']} were there")
     if found["each"] is not None:
         print(f"the first in {found['first']:.2f} s, each of the others in {found['each']:.2f} s (median)")
+    if "film" in found:
+        print(f"{found['film']}: {found['toned']}")
 
 
 def _fault(task: Task):
@@ -102,7 +112,25 @@ def _fault(task: Task):
 
 
 def _join(task: Task) -> None:
-    """The whole frame of its parts, where this was the last of them to be made."""
+    """Write the whole frame and remove its parts, where this was the last of them to be made. Several processes may
+    find that at a time: they write the same file."""
+    if task.parts == 1:
+        return
+    name, record = key(task), dict[str, Any]()
+    total: dict[str, np.ndarray] = {}
+    paths = [replace(task, part=part).path for part in range(task.parts)]
+    for path in paths:
+        try:
+            channels, record = image_file.read(path)
+        except MiNtfError:
+            return  # not there yet, or no longer
+        if record["key"] != name or record.get("parts") != task.parts:
+            return
+        total = {n: total[n] + pixels if total else pixels for n, pixels in channels.items()}
+    record = {n: record[n] for n in ("number", "of", "key")}
+    image_file.write(task.whole, total, record)
+    for path in paths:
+        path.unlink(missing_ok=True)
 
 
 def _bar(silent: bool, total: int):
@@ -128,5 +156,3 @@ def _bar(silent: bool, total: int):
 
     return shown()
 
-
-__all__ = ["MiNtfError", "check", "faults", "frames_of", "run", "shard", "tasks_of"]

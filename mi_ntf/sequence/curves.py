@@ -16,8 +16,8 @@ INTERPOLATIONS = ("smooth", "monotone", "catmull-rom", "linear", "step")
 
 
 def at(frame: float, frames: np.ndarray, values: np.ndarray, interpolation: str) -> np.ndarray:
-    """The curve through `values` (n, k) at the key `frames` (n,), increasing, at `frame`: (k,). Before the first key and
-    after the last it is constant."""
+    """The curve through `values` (n, k) at the key `frames` (n,), increasing, at `frame`: (k,). Before the first key
+    and after the last it is constant."""
     frames, values = np.asarray(frames, float), np.asarray(values, float)
     if frame <= frames[0] or len(frames) == 1:
         return values[0]
@@ -45,16 +45,14 @@ def _slopes(frames: np.ndarray, values: np.ndarray, monotone: bool) -> np.ndarra
     if len(frames) == 2:
         return np.concatenate([d, d])
     before, after, left, right = d[:-1], d[1:], h[:-1], h[1:]
+    inner = (right * before + left * after) / (left + right)
+    first, last = 2 * d[0] - inner[0], 2 * d[-1] - inner[-1]  # of the same parabolas
     if monotone:
         # The harmonic mean, weighted; none where the curve turns.
         u, v = 2 * right + left, right + 2 * left
         same = before * after > 0
         inner = np.where(same, (u + v) / (u / np.where(same, before, 1) + v / np.where(same, after, 1)), 0)
-    else:
-        inner = (right * before + left * after) / (left + right)
-    first, last = ((3 * near - far) / 2 for near, far in ((d[0], inner[0]), (d[-1], inner[-1])))
-    if monotone:
-        first, last = (np.where(end * near > 0, np.where(np.abs(end) < 3 * np.abs(near), end, 3 * near), 0)
+        first, last = (np.where(end * near > 0, np.sign(end) * np.minimum(np.abs(end), 3 * np.abs(near)), 0)
                        for end, near in ((first, d[0]), (last, d[-1])))
     return np.concatenate([first[None], inner, last[None]])
 

@@ -1,12 +1,14 @@
 """Frames on disk: EXR files that say what they show, written whole, checked when they are read.
 
 The header's text ``mi_ntf_frame`` is JSON: ``number``; ``of``, the frame's own parameters; ``key``, a hash of all that
-its pixels depend on (:func:`mi_ntf.sequence.work.key`); ``pixels``, a hash of the channels; for parts of a frame
-``part`` and ``parts``. No time and no machine is in it: the same frame is the same file.
+its pixels depend on (:func:`mi_ntf.sequence.work.key`); ``seal``, a hash of the rest and of the pixels; for parts
+of a frame ``part`` and ``parts``. No time and no machine is in it: the same frame is the same file.
 """
 
 import hashlib
+import io
 import json
+from contextlib import redirect_stdout
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +31,7 @@ def path_of(folder: Path, number: int, count: int, part: int = 0, parts: int = 1
 
 def write(path: Path, channels: dict[str, np.ndarray], record: dict) -> None:
     """Write `channels`, arrays (h, w) by name, float16 or float32, with `record`."""
-    text = json.dumps(record | {"pixels": _hash(channels)}, sort_keys=True)
+    text = json.dumps(record | {"seal": _seal(channels, record)}, sort_keys=True)
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, RECORD: text}
     files.make_folder(path.parent)
     with files.replacing(path) as temporary:
@@ -38,19 +40,21 @@ def write(path: Path, channels: dict[str, np.ndarray], record: dict) -> None:
 
 def read(path: Path) -> tuple[dict[str, np.ndarray], dict]:
     """``(channels, record)`` of a frame. Raises MiNtfError where the file is not what was written."""
+    warned = io.StringIO()  # OpenEXR prints what is wrong with pixels
     try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
+        with redirect_stdout(warned), OpenEXR.File(str(path), separate_channels=True) as file:
             channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
             text = file.header().get(RECORD)
     except Exception as error:  # OpenEXR raises bare RuntimeError and ValueError
-        raise MiNtfError(f"{path} is no readable EXR ({str(error).strip() or type(error).__name__})") from None
+        why = warned.getvalue().rpartition(" - ")[2].strip() or str(error).strip() or type(error).__name__
+        raise MiNtfError(f"{path} is no readable EXR ({why})") from None
     try:
         record = json.loads(text)
-        whole = record["pixels"] == _hash(channels)
-    except (TypeError, ValueError, KeyError):
+        whole = record.pop("seal") == _seal(channels, record)
+    except (TypeError, ValueError, KeyError, AttributeError):
         raise MiNtfError(f"{path} does not say which frame it is: `mi-ntf sequence` has not written it") from None
     if not whole:
-        raise MiNtfError(f"{path} has other pixels than were written")
+        raise MiNtfError(f"{path} holds other numbers than were written")
     return channels, record
 
 
@@ -69,9 +73,9 @@ def fault(path: Path, key: str, parts: int = 1) -> tuple[str, str] | None:
     return None
 
 
-def _hash(channels: dict[str, np.ndarray]) -> str:
-    """SHA-256 of names, sizes and numbers, hexadecimal."""
-    digest = hashlib.sha256()
+def _seal(channels: dict[str, np.ndarray], record: dict) -> str:
+    """SHA-256 of the record and of names, sizes and numbers of the channels, hexadecimal."""
+    digest = hashlib.sha256(json.dumps(record, sort_keys=True).encode())
     for name, pixels in sorted(channels.items()):
         digest.update(f"{name} {pixels.shape} {pixels.dtype.str};".encode())
         digest.update(np.ascontiguousarray(pixels).data)

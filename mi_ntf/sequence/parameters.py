@@ -24,8 +24,8 @@ def read(path: str | Path, fixed: dict[str, str] | None = None) -> Timeline:
     names = [name.strip() for name in rows[0][1]]
     for name in names:
         if not name or name.startswith("$") or names.count(name) > 1:
-            raise MiNtfError(f"parameters {path}: the first line has the name {name!r}, expected each $name of the scene "
-                             "once, without the $")
+            raise MiNtfError(f"parameters {path}: the first line has the name {name!r}, expected each $name of the "
+                             "scene once, without the $")
     frames: list[Frame] = []
     for line, row in rows[1:]:
         if len(row) != len(names):

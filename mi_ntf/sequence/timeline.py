@@ -12,7 +12,7 @@
     target = [0.1, 0.8, 0]
 
     [lights.point]                   # an emitter by its id, or by its plugin where there is one of it
-    position = { start = [1.5, 2.6, 2.7], centre = [0.1, 0, 0], axis = [0, 1, 0], degrees = { keys = [[0, 0], [120, 360]] } }
+    position = { start = [2, 3, 3], centre = [0, 0, 0], axis = [0, 1, 0], degrees = { keys = [[0, 0], [120, 360]] } }
 
     [environment]
     degrees = { keys = [[0, 0], [120, 360]], interpolation = "linear" }
@@ -124,8 +124,8 @@ def _values(tracks: dict[str, Track], number: int) -> dict[str, Any]:
 
 
 def _parameter(said, name: str):
-    """A function of the frame's number to the text of a $name. Texts and whole numbers stay as they are written; keys of
-    texts hold until the next."""
+    """A function of the frame's number to the text of a $name. Texts and whole numbers stay as they are written; keys
+    of texts hold until the next."""
     if isinstance(said, bool):
         return lambda _: str(said).lower()
     if isinstance(said, str | int):

@@ -20,6 +20,7 @@ from ..core.errors import MiNtfError, sentence
 from ..launcher import VARIANT_PRIORITY
 from ..render.maps import map_cache
 from ..render.scene import changed
+from ..render.scene.settings import Limits
 from . import changes, image_file
 from .timeline import Frame
 
@@ -57,7 +58,8 @@ def render(task: Task) -> dict[str, Any]:
         state, name = _parsed(task)
         scene = changed.instantiated(Path(task.scene), _for_many(state, task.count))
         with map_cache.not_written():
-            channels = _render(scene, task)
+            # Parts keep the digits that their sum needs.
+            channels = _render(scene, task, _precision(state) if task.parts == 1 else np.float32)
         record: dict[str, Any] = {"number": task.frame.number, "of": task.frame.told(), "key": name}
         if task.parts > 1:
             record |= {"part": task.part + 1, "parts": task.parts}
@@ -135,12 +137,22 @@ def _for_many(state, count: int):
     return state
 
 
-def _render(scene, task: Task) -> dict[str, np.ndarray]:
+def _precision(state) -> type:
+    """Of the film's numbers, which only its file has: ``component_format`` of the first one."""
+    films = [node.props for node in state.nodes if node.type == mi.ObjectType.Film]
+    name = films[0].get("component_format", "float16") if films else ""
+    return np.float16 if str(name).lower() == "float16" else np.float32
+
+
+def _render(scene, task: Task, precision: type) -> dict[str, np.ndarray]:
     """The channels of the picture."""
     integrator, sensors = scene.integrator(), scene.sensors()
     if integrator is None or not sensors:
         raise MiNtfError(f"{task.scene} needs an integrator and a sensor")
     ours = hasattr(integrator, "patches")
+    if task.parts > 1:
+        _check_parts(integrator, ours)
+        integrator.share = task.part, task.parts
     if ours:
         integrator.patches = _kept.get("patches")
     integrator.render(scene, sensors[0], develop=False)
@@ -150,4 +162,17 @@ def _render(scene, task: Task) -> dict[str, np.ndarray]:
     pixels = np.array(bitmap)
     pixels = pixels.reshape(*pixels.shape[:2], -1)
     names = [field.name for field in bitmap.struct_()]
-    return {name: pixels[..., i] for i, name in enumerate(names)}
+    # Parts keep all digits for their sum.
+    return {name: pixels[..., i].astype(precision) for i, name in enumerate(names)}
+
+
+def _check_parts(integrator, ours: bool) -> None:
+    """Raise MiNtfError where images of parts of the lights do not add up to the picture."""
+    why = (
+        f"the integrator is {integrator.class_name()}, and only nrf sums over lights" if not ours else
+        "further outputs (aovs) are no sums over lights" if integrator.aovs else
+        "light_samples draws from all lights at once" if integrator.light_samples else
+        "a limit (noise_threshold, max_error, time_budget) is of the whole picture" if integrator.limits != Limits()
+        else "")
+    if why:
+        raise MiNtfError(f"a frame in parts by its lights: {why}; give whole frames to shards")
