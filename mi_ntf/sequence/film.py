@@ -1,6 +1,9 @@
 """Frames as a film, MP4 (H.264) or WebM (VP9), by ffmpeg (extra ``video``)."""
 
+import itertools
+import subprocess
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +23,7 @@ def check(path: Path) -> None:
     """Raise MiNtfError, before any work, where no film could be written to `path`."""
     if path.suffix.lower() not in CODECS:
         raise MiNtfError(f"film {path}: unknown ending {path.suffix!r}; give .mp4 or .webm")
-    _encoder()
+    _ffmpeg()
     files.check(path)
 
 
@@ -42,29 +45,43 @@ def said(exposure: float) -> str:
 def write(path: Path, frames: Iterable[Path], fps: float, exposure: float = 0.0) -> str:
     """Write the film of `frames`, EXR files, with `fps` frames a second; returns how they were toned, which the file
     says, too. The last row or column of odd sizes is shown twice. Raises MiNtfError."""
-    encoder = _encoder()
+    note, pictures = said(exposure), (_even(toned(image_file.read(frame)[0], exposure)) for frame in frames)
+    first = next(pictures)
     codec, container, quality = CODECS[path.suffix.lower()]
-    note = said(exposure)
+    size = f"{first.shape[1]}x{first.shape[0]}"
+    words = [
+        _ffmpeg(), "-y", "-v", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", str(fps), "-i", "-",
+        "-c:v", codec, "-pix_fmt", "yuv420p", *quality, *COLOURS, "-metadata", f"comment={note}", "-f", container]
     with files.replacing(path) as temporary:
-        writer = None
-        for frame in frames:
-            pixels = toned(image_file.read(frame)[0], exposure)
-            pixels = np.pad(pixels, [(0, pixels.shape[0] % 2), (0, pixels.shape[1] % 2), (0, 0)], mode="edge")
-            if writer is None:
-                writer = encoder.write_frames(
-                    str(temporary), pixels.shape[1::-1], fps=fps, codec=codec, macro_block_size=2,
-                    ffmpeg_log_level="error",
-                    output_params=[*quality, *COLOURS, "-metadata", f"comment={note}", "-f", container])
-                writer.send(None)
-            writer.send(np.ascontiguousarray(pixels))
-        if writer is not None:
-            writer.close()
+        with subprocess.Popen([*words, str(temporary)], stdin=subprocess.PIPE, stderr=subprocess.PIPE) as program:
+            assert program.stdin is not None and program.stderr is not None
+            try:
+                for picture in itertools.chain([first], pictures):
+                    if picture.shape != first.shape:
+                        raise MiNtfError(f"film {path}: frames of {first.shape[1::-1]} and {picture.shape[1::-1]} "
+                                         "pixels; a film has one size")
+                    program.stdin.write(picture.data)
+                program.stdin.close()
+            except BrokenPipeError:  # it says why
+                with suppress(OSError):
+                    program.stdin.close()
+            except BaseException:
+                program.kill()
+                raise
+            complaint = program.stderr.read().decode(errors="replace").strip()
+        if program.returncode:
+            raise MiNtfError(f"film {path}: ffmpeg ended with {program.returncode}: {complaint}")
     return note
 
 
-def _encoder():
+def _even(pixels: np.ndarray) -> np.ndarray:
+    return np.pad(pixels, [(0, pixels.shape[0] % 2), (0, pixels.shape[1] % 2), (0, 0)], mode="edge")
+
+
+def _ffmpeg() -> str:
+    """The program."""
     try:
         import imageio_ffmpeg
     except ImportError:
         raise MiNtfError("a film is written by ffmpeg: pip install 'mi-ntf[video]'") from None
-    return imageio_ffmpeg
+    return imageio_ffmpeg.get_ffmpeg_exe()

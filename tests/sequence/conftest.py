@@ -14,7 +14,8 @@ SCENE = """<scene version="3.9.0">
         <transform name="to_world"><lookat origin="2, 1.5, 6" target="0.4, -0.2, 0.3" up="0, 1, 0"/></transform>
         <sampler type="independent"><integer name="sample_count" value="$spp"/></sampler>
         <film type="hdrfilm"><integer name="width" value="$res"/><integer name="height" value="$res"/>
-            <string name="pixel_format" value="rgba"/><string name="component_format" value="float32"/><rfilter type="box"/></film></sensor>
+            <string name="pixel_format" value="rgba"/><string name="component_format" value="float32"/>
+            <rfilter type="box"/></film></sensor>
     LIGHTS
     <shape type="sphere"><point name="center" x="0.4" y="-0.2" z="0.3"/><float name="radius" value="1.5"/>
         <bsdf type="null"/><medium type="nrf" name="interior"><string name="filename" value="FIELD"/>
