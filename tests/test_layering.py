@@ -1,4 +1,4 @@
-"""The direction of dependencies: core ← infer ← render ← evaluate and sequence, core ← data ← train.
+"""The direction of dependencies: core ← infer ← render ← sequence ← evaluate, core ← data ← train.
 
 Training never imports Mitsuba or Dr.Jit, rendering never imports PyTorch.
 """
@@ -23,7 +23,7 @@ MAY_IMPORT = {
     "render": {"core", "infer", "render"},
     "data": {"core", "data"},
     "train": {"core", "data", "train"},
-    "evaluate": {"core", "infer", "render", "data", "evaluate"},
+    "evaluate": {"core", "infer", "render", "data", "evaluate", "sequence"},
     "sequence": {"core", "infer", "render", "sequence"},
 }
 """Which folders of the package a folder may import."""

@@ -116,14 +116,16 @@ def _join(task: Task) -> None:
     find that at a time: they write the same file."""
     if task.parts == 1:
         return
+    paths = [replace(task, part=part).path for part in range(task.parts)]
+    if not all(path.is_file() for path in paths):
+        return
     name, record = key(task), dict[str, Any]()
     total: dict[str, np.ndarray] = {}
-    paths = [replace(task, part=part).path for part in range(task.parts)]
     for path in paths:
         try:
             channels, record = image_file.read(path)
         except MiNtfError:
-            return  # not there yet, or no longer
+            return  # no longer there
         if record["key"] != name or record.get("parts") != task.parts:
             return
         total = {n: total[n] + pixels if total else pixels for n, pixels in channels.items()}
