@@ -352,6 +352,65 @@ class Export:
 
 
 @dataclass
+class Sequence_:
+    """Render many frames of a scene in one process: a timeline, or a table of parameters. Run again, it goes on."""
+
+    scene: Positional[Path]
+    """Mitsuba scene."""
+    output: Annotated[Path, arg(aliases=("-o",), metavar="DIR")]
+    """Folder for frame_0000.exr and so on."""
+    timeline: Annotated[Path | None, arg(metavar="T.toml")] = None
+    """What changes over the frames: $names, camera, lights, environment at key frames."""
+    parameters: Annotated[Path | None, arg(metavar="P.csv")] = None
+    """Values of $names, one line a frame."""
+    define: Annotated[UseAppendAction[tuple[str, ...]], arg(aliases=("-D",), metavar="KEY=VALUE")] = field(
+        default_factory=tuple
+    )
+    """Value of $KEY in all frames."""
+    shard: Annotated[str, arg(metavar="i/n")] = "1/1"
+    """Render the i-th of n shards, counted from 1."""
+    lights: Annotated[int, arg(metavar="N")] = 1
+    """Render each frame in N parts by its lights, which shards share; when all are there, they become the frame."""
+    film: Annotated[Path | None, arg(metavar="FILE")] = None
+    """MP4 or WebM of all frames at the end: linear values, clipped to 0..1, with sRGB's curve (extra `video`)."""
+    exposure: float = 0.0
+    """Of the film, in stops."""
+    check: bool = False
+    """Render nothing; name the frames that are missing, broken or of other parameters (exit code 1)."""
+    mode: Annotated[str, arg(aliases=("-m",), metavar="VARIANT")] = ""
+    """Mitsuba's variant; the first available of cuda_ad_rgb and llvm_ad_rgb unless given."""
+    json: bool = False
+    """Print JSON in place of a summary, and no progress."""
+
+    def run(self) -> int:
+        if self.timeline is not None and self.parameters is not None:
+            raise UsageError("give --timeline or --parameters, not both")
+        fixed = _definitions(self.define)
+        from mi_ntf.sequence import command
+
+        try:
+            i, n = command.shard(self.shard)
+        except ValueError as error:
+            raise UsageError(str(error)) from None
+        if self.film and (n > 1 or self.check):
+            raise UsageError("--film shows all frames: give it without --shard and --check when they are there")
+        if self.lights < 1:
+            raise UsageError(f"--lights is {self.lights}, expected the number of parts, 1 or more")
+        line = command.frames_of(self.timeline, self.parameters, fixed)
+        tasks = command.tasks_of(self.scene, self.output, line.frames, self.lights, self.mode)[i - 1 :: n]
+        if self.check:
+            found = command.check(tasks)
+            faults = command.faults(found)
+            _report(found, self.json, lambda found: print(f"{found['done']} of {found['images']} images are there"))
+            for text in faults:
+                print(f"mi-ntf: {text}", file=sys.stderr)
+            return 1 if faults else 0
+        film = (self.film, line.fps, self.exposure) if self.film else None
+        _report(command.run(tasks, quiet=self.json, film=film), self.json, command.print_summary)
+        return 0
+
+
+@dataclass
 class Info:
     """Describe a field file."""
 
@@ -394,6 +453,7 @@ Command = (
     | Annotated[Reproduce, subcommand("reproduce")]
     | Annotated[Bake, subcommand("bake")]
     | Annotated[Export, subcommand("export")]
+    | Annotated[Sequence_, subcommand("sequence")]
     | Annotated[Info, subcommand("info")]
     | Annotated[Doctor, subcommand("doctor")]
 )

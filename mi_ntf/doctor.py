@@ -23,6 +23,7 @@ MITSUBA = "3.9.1"
 LLVM_MINIMUM = 17
 EXTRAS = {
     "train": ("torch", "tensorboard", "matplotlib", "PIL", "cv2"),
+    "video": ("imageio_ffmpeg",),
     "eval": ("skimage", "flip_evaluator", "matplotlib", "PIL"),
     "mesh": ("skimage", "scipy", "trimesh"),
     "watch": ("tevclient",),

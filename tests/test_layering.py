@@ -1,4 +1,4 @@
-"""The direction of dependencies: core ← infer ← render ← evaluate, core ← data ← train.
+"""The direction of dependencies: core ← infer ← render ← sequence ← evaluate, core ← data ← train.
 
 Training never imports Mitsuba or Dr.Jit, rendering never imports PyTorch.
 """
@@ -23,7 +23,8 @@ MAY_IMPORT = {
     "render": {"core", "infer", "render"},
     "data": {"core", "data"},
     "train": {"core", "data", "train"},
-    "evaluate": {"core", "infer", "render", "data", "evaluate"},
+    "evaluate": {"core", "infer", "render", "data", "evaluate", "sequence"},
+    "sequence": {"core", "infer", "render", "sequence"},
 }
 """Which folders of the package a folder may import."""
 
@@ -35,6 +36,7 @@ FORBIDDEN = {
     "render": TORCH,
     "data": TORCH,
     "train": RENDERER,
+    "sequence": TORCH,
     # Metrics that live in PyTorch are offered where it is installed; the demo does without.
     "evaluate": set(),
 }
@@ -43,8 +45,8 @@ FORBIDDEN = {
 ROOMS = ("user_cache", "cost", "scene", "lights", "maps", "transport", "plugins", "commands")
 """Of `render`: each may import those before it."""
 
-PACKAGE_OF = {"cv2": "opencv-python-headless", "drjit": "mitsuba", "flip_evaluator": "flip-evaluator", "PIL": "pillow",
-              "skimage": "scikit-image"}
+PACKAGE_OF = {"cv2": "opencv-python-headless", "drjit": "mitsuba", "flip_evaluator": "flip-evaluator",
+              "imageio_ffmpeg": "imageio-ffmpeg", "PIL": "pillow", "skimage": "scikit-image"}
 """What brings a module of another name."""
 
 TOP_LEVEL_FORBIDDEN = TORCH

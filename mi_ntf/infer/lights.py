@@ -42,11 +42,14 @@ class LightTable:
 
     def part(self, first: int, last: int) -> "LightTable":
         """The lights `first` … `last` − 1 as a table of their own."""
-        where, power, is_point, scale, dj, cones = self._arguments
-        rows = slice(first, last)
-        part = LightTable(where[rows], power[rows], is_point[rows], scale, dj, None if cones is None else cones[rows])
+        part = self.chosen(slice(first, last))
         part.first, part.total = self.first + first, self.total
         return part
+
+    def chosen(self, rows) -> "LightTable":
+        """The lights `rows`, a slice or indices, as a table that knows of no others."""
+        where, power, is_point, scale, dj, cones = self._arguments
+        return LightTable(where[rows], power[rows], is_point[rows], scale, dj, None if cones is None else cones[rows])
 
     def attach(self, where, power, axes=None) -> None:
         """Let gradients flow to `where`, `power` and, if there are cones, their `axes`: 3-tuples of arrays of a number

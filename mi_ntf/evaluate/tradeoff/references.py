@@ -13,11 +13,12 @@ import numpy as np
 
 from ...core.errors import MiNtfError
 from ...render.cost.measurement import once
+from ...render.scene import changed
 from ..compare import read_image
 from . import errors
 from .measure import colours
 from .points import STOCK, Point
-from .subject import Picture, Subject, load_changed, resize
+from .subject import Picture, Subject, resize
 
 FIRST_SEED = 1 << 20
 """Seeds of references begin here: none is a point's."""
@@ -227,7 +228,7 @@ def _traced(subject: Subject, path: Path, picture: Picture, seconds: float) -> R
         if node.type == mi.ObjectType.Film:
             resize(node.props, picture)
 
-    scene = load_changed(path, subject.parameters, change, strict=False)
+    scene = changed.load(path, subject.parameters, change, strict=False)
     integrator, spp = scene.integrator(), 16
     images: list[np.ndarray] = []
     seed: Any

@@ -1,8 +1,6 @@
 """The scene of a study, loaded with other properties than its own, whatever they are in its XML."""
 
 import hashlib
-from collections.abc import Callable
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +12,7 @@ from ...render.commands.explain import works
 from ...render.cost import model
 from ...render.lights import scene_lights
 from ...render.plugins.registration import load_scene
-from ...render.scene import effects
+from ...render.scene import changed, effects
 from ...render.scene.media import find_media
 from ...render.scene.settings import Settings
 from .points import STOCK, Limits, Point
@@ -68,7 +66,7 @@ class Subject:
             elif node.props.plugin_name() == "nrf" and node.type == mi.ObjectType.Medium:
                 node.props["representation"] = point.representation
 
-        return load_changed(self.path, self.parameters, change)
+        return changed.load(self.path, self.parameters, change)
 
     def integrator(self, point: Point, timeout: float = -1.0):
         """The integrator of `point`; `timeout`: seconds."""
@@ -99,49 +97,8 @@ class Subject:
 
     def key(self) -> str:
         """Hash of the scene's text, includes and $names in it, and of its fields."""
-        with _beside(self.path):
-            text = mi.parser.write_string(_parsed(self.path, self.parameters))
+        text = mi.parser.write_string(changed.parsed(self.path, self.parameters))
         return hashlib.sha256(repr((text, self.digests)).encode()).hexdigest()
-
-
-def load_changed(path: Path, parameters: dict[str, str], change: Callable[[Any], None], strict: bool = True):
-    """The scene of an XML file after `change` has seen every node of it, each with a ``type`` and ``props``. `strict`:
-    values for names that the file lacks are an error."""
-    with _beside(path):
-        state = _parsed(path, parameters, strict)
-        for node in state.nodes:
-            change(node)
-        mi.parser.transform_all(_config(strict), state)
-        found = mi.parser.instantiate(_config(strict), state)
-    scene = found[0] if isinstance(found, list) else found
-    if not isinstance(scene, mi.Scene):
-        raise MiNtfError(f"{path}: the root element must be a <scene>")
-    return scene
-
-
-def _config(strict: bool = True):
-    config = mi.parser.ParserConfig(str(mi.variant()))
-    if not strict:
-        config.unused_parameters = mi.LogLevel.Debug
-    return config
-
-
-def _parsed(path: Path, parameters: dict[str, str], strict: bool = True):
-    return mi.parser.parse_file(_config(strict), str(path), **parameters)
-
-
-@contextmanager
-def _beside(path: Path):
-    """Within, files are looked for beside `path` first, as where Mitsuba loads a file by itself."""
-    before = mi.file_resolver()  # type: ignore[operator]  # an object in the stub
-    within = mi.FileResolver(before)
-    within.prepend(str(Path(path).parent))
-    put: Any = mi.set_file_resolver
-    put(within)
-    try:
-        yield
-    finally:
-        put(before)
 
 
 def resize(props, picture: Picture) -> None:

@@ -212,7 +212,7 @@ def frames(lights: LightTable, hull: np.ndarray, resolution: int) -> np.ndarray:
     distance = np.maximum(np.linalg.norm(lights.where, axis=1), 1e-9)
     axis = -lights.where / distance[:, None]
     k = np.where(lights.is_point, 1 / distance, 0.0)
-    depth = 1 + k * (hull @ axis.T)  # (hull points, n)
+    depth = 1 + k * _along(hull, axis)  # (hull points, n)
     helper = np.where(np.abs(axis[:, :1]) > 0.9, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
     side = np.cross(axis, helper)
     side /= np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
@@ -240,10 +240,15 @@ def frames(lights: LightTable, hull: np.ndarray, resolution: int) -> np.ndarray:
     return np.concatenate([p.reshape(lights.count, -1) for p in parts], axis=1)
 
 
+def _along(points, axes):
+    """⟨point, axis⟩, (points, axes), each by itself: a product of matrices would round by how many there are."""
+    return sum(points[:, i, None] * axes[None, :, i] for i in range(3))
+
+
 def _window(u, v, hull, depth):
     """Middle and half width, along u and v, of what holds `hull` on the plane through the origin, as each light sees
     it: two (n, 2)."""
     for along in (u, v):
-        place = hull @ along.T / depth
+        place = _along(hull, along) / depth
         low, high = place.min(0), place.max(0)
         yield np.stack([(low + high) / 2, np.maximum((high - low) / 2, 1e-3)], axis=1)

@@ -38,7 +38,8 @@ class Method:
                  moving lights are followed more finely; None: the others. ``keep(width, step, make)`` → ``make()``, or
                  ``make(values)`` where what it would make, `width` float32 numbers for each of the squared
                  ``map_resolution`` rays of each light, marched in steps of `step`, is at hand; for a field's own maps
-                 their table of directions and their options come after `make`
+                 their table of directions and their options come after `make`. ``some=``: a function of rows of
+                 `table` that makes a map of these lights alone, where each light's numbers are its own
     pair         ``(work, prices)`` → nanoseconds of a point and light; `work`: :class:`mi_ntf.render.cost.model.Work`,
                  `prices`: :class:`mi_ntf.render.cost.model.Constants`
     prices       name → nanoseconds on two cores of 2024; the first is what `pair` counts in, the second what `making`

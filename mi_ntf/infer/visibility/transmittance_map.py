@@ -140,7 +140,11 @@ def build(medium, table, options: Options, dj, keep) -> TransmittanceMap:
     def make(values=None):
         return TransmittanceMap(table, options.map_resolution, medium.field.grid.hull, source, dj, values)
 
-    return keep(width(medium, table, options), step, make)
+    def some(rows):
+        return TransmittanceMap(table.chosen(rows), options.map_resolution, medium.field.grid.hull, source, dj)
+
+    # What a network's source makes of a light depends on where the others are.
+    return keep(width(medium, table, options), step, make, some=None if network else some)
 
 
 def per_ray(work, prices) -> float:

@@ -56,7 +56,7 @@ def build(method: str, medium, table, options: Options):
     and whose moving lights a march follows more finely; None serves the others.
     """
 
-    def keep(width: int, step: float, make, directions=None, own: Options = options):
+    def keep(width: int, step: float, make, directions=None, own: Options = options, some=None):
         lights = directions or table
         if own.map_file:
             resolver = mi.file_resolver()  # type: ignore[operator]  # an object in the stub
@@ -67,6 +67,7 @@ def build(method: str, medium, table, options: Options):
         name = map_cache.key(medium, lights, own, width, step)
         # Of several runs of lights, each needs all of the memory, and none of their maps comes again in this picture.
         limit = own.map_memory * 2**20 if lights.count == lights.total else 0
-        return map_cache.cached(name, make, lights.count * own.map_resolution**2 * width, limit)
+        known = map_cache.lights(medium, lights, own, width, step) if some and limit and lights.count > 1 else None
+        return map_cache.cached(name, make, lights.count * own.map_resolution**2 * width, limit, known, some)
 
     return REGISTRY[method].build(medium, table, options, mi, keep)

@@ -10,7 +10,8 @@ what was written counts as none. The environment variable ``MI_NTF_MAP_CACHE`` s
 import hashlib
 import os
 from collections import OrderedDict
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,11 @@ SEAL = hashlib.sha256().digest_size
 """Bytes at the start of a file that depend on all others and on its name; float32 numbers follow."""
 
 _maps: OrderedDict[str, Any] = OrderedDict()
+_lights: dict[str, list] = {}
+"""Of those that say it, what each of their lights is called (:func:`lights`)."""
+_written = True
+_used: set[str] = set()
+"""Names of maps since :func:`keep_used` was called last."""
 
 
 def mode() -> str:
@@ -60,42 +66,97 @@ def key(medium, table, options, width: int, step: float) -> str:
     """Name of the map of `table`'s lights; `width`: numbers a texel; `step`: of the march that makes it, field
     units."""
     grid = medium.field.grid
-    facts = (
-        _program(), _libraries(), medium.field.digest, medium.representation, grid.resolution, options.step, step,
-        options.map_resolution, options.map_source, options.map_components, width, mi.variant(),
-    )
-    digest = hashlib.sha256(repr(facts).encode())
+    digest = hashlib.sha256(repr(_facts(medium, options, width, step)).encode())
     for part in (table.where, table.is_point, grid.hull):
         digest.update(np.ascontiguousarray(part).data)
     return digest.hexdigest()
 
 
-def cached(name: str, make, count: int, limit: float):
+def _facts(medium, options, width: int, step: float) -> tuple:
+    """What texels depend on besides the lights and the hull, which is the field's."""
+    return (
+        _program(), _libraries(), medium.field.digest, medium.representation, medium.field.grid.resolution,
+        options.step, step, options.map_resolution, options.map_source, options.map_components, width, mi.variant(),
+    )
+
+
+def lights(medium, table, options, width: int, step: float) -> list:
+    """A name for the map of each light of `table` by itself."""
+    facts = _facts(medium, options, width, step)
+    rows = zip(table.where, table.is_point, strict=True)
+    return [(facts, where.tobytes(), bool(is_point)) for where, is_point in rows]
+
+
+def cached(name: str, make, count: int, limit: float, each: list | None = None, some=None):
     """The map called `name`, of `count` numbers: from memory, else ``make(values)`` of those in its file, else
     ``make()``, which is then kept on disk.
 
     `limit`: bytes that maps in memory may take, this one and its making included; a map that takes more is not kept
-    there.
+    there. `each`: :func:`lights`, where a map in memory may hold some of them already; ``some(rows)`` then makes the
+    map of the others.
     """
     where = mode()
     if where == "off":
         return make()
+    _used.add(name)
     if name in _maps:
         _maps.move_to_end(name)
         return _maps[name]
-    _make_room(limit - 4 * count)
     values = _read(name, count) if where == "on" else None
-    result = make() if values is None else make(values)
-    if where == "on" and values is None and 4 * count <= LARGEST_FILE:
+    known = _joined(each, some, count) if values is None and each and some else None
+    _make_room(limit - 4 * count)
+    result = make() if values is None and known is None else make(known if values is None else values)
+    if where == "on" and values is None and _written and 4 * count <= LARGEST_FILE:
         _write(name, result.values)
     if 4 * count <= limit:
         _maps[name] = result
+        if each:
+            _lights[name] = each
+    for gone in set(_lights) - set(_maps):
+        del _lights[gone]
     return result
+
+
+def _joined(each: list, some, count: int) -> np.ndarray | None:
+    """The `count` numbers of a map of the lights `each`: from the map in memory that has most of them, and of the rest,
+    if there is one, by ``some(rows)``; None where no map has any."""
+    places: dict[str, dict] = {name: {light: i for i, light in enumerate(has)} for name, has in _lights.items()
+                               if name in _maps}
+    best = max(places, key=lambda name: sum(light in places[name] for light in each), default=None)
+    if best is None or not any(light in places[best] for light in each):
+        return None
+    have = np.array([places[best].get(light, -1) for light in each])
+    values = np.empty((len(each), count // len(each)), np.float32)
+    values[have >= 0] = _maps[best].values.reshape(-1, values.shape[1])[have[have >= 0]]
+    missing = np.flatnonzero(have < 0)
+    if len(missing):
+        values[missing] = some(missing).values.reshape(len(missing), -1)
+    return values.ravel()
+
+
+@contextmanager
+def not_written() -> Iterator[None]:
+    """Within, maps are read from disk, but none is written there: lights of a film that move leave one a frame."""
+    global _written
+    before, _written = _written, False
+    try:
+        yield
+    finally:
+        _written = before
 
 
 def forget() -> None:
     """Drop what is kept in memory."""
     _maps.clear()
+    _lights.clear()
+
+
+def keep_used() -> None:
+    """Drop from memory what was not used since the last call: of frames, lights that have moved on leave no maps
+    behind, and all others keep theirs."""
+    for name in set(_maps) - _used:
+        del _maps[name]
+    _used.clear()
 
 
 def _make_room(limit: float) -> None:

@@ -104,6 +104,7 @@ def integrator_class() -> type:
             self.chosen = None  # under limits, for the next frame
             self.achieved = {}  # by the last render
             self.lights_seen = 0
+            self.share = (0, 1)  # of the lights: all (Settings)
             self.patches = None  # of the fields rendered last, by radiosity
             props["timeout"] = -1.0
             mi.SamplingIntegrator.__init__(self, props)

@@ -61,6 +61,10 @@ class Frame:
         """Unit 3-tuple → unit vector of the scene."""
         return mi.Vector3f(self._rotation @ mi.Vector3f(*d))
 
+    def placement(self) -> tuple:
+        """Numbers that tell frames apart."""
+        return self._matrix.tobytes(), self.origin.tobytes(), self.length
+
     def world_to_field_numpy(self, p: np.ndarray, direction: bool = False) -> np.ndarray:
         """(n, 3) scene points (or directions) → field, in float64 on the host."""
         return p @ self._matrix if direction else (p - self.origin) @ self._matrix / self.length

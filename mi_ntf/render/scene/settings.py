@@ -7,7 +7,8 @@ from dataclasses import dataclass, fields, replace
 class Settings:
     """As in the plugin's table, and what is left out of what the scene calls for: `specular`, whether specular lobes
     take part; `dimmest`, share of all light that the dimmest lights have which do not; `without`, numbers of the media
-    that do not."""
+    that do not; `share`, (part, parts): the discrete lights of one part, and in part 0 all else: parts add up to the
+    picture."""
 
     visibility: str
     samples: int
@@ -25,6 +26,7 @@ class Settings:
     specular: bool = True
     dimmest: float = 0.0
     without: tuple[int, ...] = ()
+    share: tuple[int, int] = (0, 1)
 
     @classmethod
     def of(cls, integrator) -> "Settings":

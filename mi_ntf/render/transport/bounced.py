@@ -23,8 +23,8 @@ class Patches:
 
     def __init__(self, composition):
         rng = np.random.default_rng(SEED)
-        self.media = [part.medium for part in composition.parts]
-        self.skins = [Skin(medium, rng) for medium in self.media]
+        self._key = _key(composition)
+        self.skins = [Skin(part.medium, rng) for part in composition.parts]
         for skin, (x, d, _) in zip(self.skins, self._trace(composition, radiosity.FEW, rng), strict=True):
             skin.add(x, d)
         self.first = np.cumsum([0, *(len(s.position) for s in self.skins)])
@@ -40,9 +40,8 @@ class Patches:
         self.hits = hits.reshape(-1, radiosity.SIDE**2)
 
     def of(self, composition) -> bool:
-        """Whether these are the patches of `composition`, too."""
-        media = [part.medium for part in composition.parts]
-        return len(media) == len(self.media) and all(a is b for a, b in zip(media, self.media, strict=True))
+        """Whether these are the patches of `composition`, too: of the same fields in the same places."""
+        return self._key == _key(composition)
 
     def _trace(self, composition, side: int, rng) -> list:
         """`side`² rays from each patch: for each skin the points (k, 3) where it is met, the rays' directions (k, 3),
@@ -76,12 +75,19 @@ class Patches:
         return result
 
 
+def _key(composition) -> tuple:
+    """What patches depend on."""
+    fields = [(m.field.digest, m.representation, m.field.grid.resolution, m.frame.placement())
+              for m in (part.medium for part in composition.parts)]
+    return mi.variant(), min(radiosity.STEPS, composition.settings.samples), tuple(fields)
+
+
 class Bounced:
     """Light that fields of `composition` scatter more than once, between their `patches`: skins taken for diffuse
     surfaces that reflect as much as both lobes. `max_depth`: longest path in edges, −1 for any."""
 
     def __init__(self, composition, patches: Patches, max_depth: int):
-        self._patches = patches
+        self._media = [part.medium for part in composition.parts]
         pairs = zip(composition.parts, patches.skins, strict=True)
         direct = np.concatenate([_direct(composition, part, skin) for part, skin in pairs])
         light = radiosity.solve(patches.hits, patches.albedo, direct, max(max_depth - 2, -1))
@@ -90,7 +96,7 @@ class Bounced:
 
     def reflect(self, part, points) -> list:
         """Radiance that `points` of `part` send on of it."""
-        index = next(i for i, m in enumerate(self._patches.media) if m is part.medium)
+        index = next(i for i, m in enumerate(self._media) if m is part.medium)
         light = self._irradiance[index](points.x, points.normal)
         albedo = points.reflectance.diffuse_albedo()
         return [k * e * microfacet.INV_PI for k, e in zip(albedo, light, strict=True)]

@@ -1,6 +1,7 @@
 """Fields, surfaces and lights of a scene, prepared for one render: what hides, shades and dims what. Camera rays go
 through them in :mod:`mi_ntf.render.transport.camera_light`."""
 
+import itertools
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -56,13 +57,14 @@ class Composition:
         self._media = [m for m in media if m.field.grid.majorant > 0]
         self._seen = [m for m, visible in zip(media, self.effects.in_view, strict=True) if visible]
         self.runs, self.run = self._runs(), -1  # none yet
-        self.select(0)
+        self.own = self._own()
+        self.select(self.own[0] if self.own else 0)
         self.surfaces = None
         if self.effects.surfaces:
             shapes = ordinary_shapes(scene)
             self.surfaces = Surfaces(scene, shapes, settings.hide_emitters, self.transmittance)
         self.bounced = None
-        if self.effects.bounces == "radiosity" and self.parts:
+        if self.effects.bounces == "radiosity" and self.parts and 0 in self.own:
             with measurement.by_clock("bounces"):
                 found = patches if patches and patches.of(self) else Patches(self)
                 self.bounced = self.with_all_lights(lambda: Bounced(self, found, settings.max_depth))
@@ -76,7 +78,8 @@ class Composition:
             return [None]
         table = self.lights.table(self._media[0].frame)
         options = building.options(self.settings)
-        runs = building.parts(found.visibility, self._media, table, options)
+        runs = [(first + a, first + b) for first, last in self._shares(table.count)
+                for a, b in building.parts(found.visibility, self._media, table.part(first, last), options)]
         if found.gradients and len(runs) > 1:
             size = sum(building.size_per_light(found.visibility, m, table, options) for m in self._media)
             raise MiNtfError(
@@ -85,6 +88,21 @@ class Composition:
                 "choose visibility=raymarch, which holds none"
             )
         return [None] if found.gradients else runs
+
+    def _shares(self, count: int) -> list:
+        """Rows (first, last) of each part of the lights that has some; part 0 is always there."""
+        parts = self.settings.share[1]
+        ends = [-(-count * i // parts) for i in range(parts + 1)]
+        return [(a, b) for i, (a, b) in enumerate(itertools.pairwise(ends)) if b > a or i == 0]
+
+    def _own(self) -> list:
+        """Which runs this part of the lights renders: all of them, unless the settings say otherwise."""
+        part, parts = self.settings.share
+        if parts == 1 or self.runs == [None]:
+            return [] if part else list(range(len(self.runs)))
+        count = self.runs[-1][1]
+        begin, end = (-(-count * i // parts) for i in (part, part + 1))
+        return [k for k, (first, _) in enumerate(self.runs) if begin <= first < end or (k == 0 and part == 0)]
 
     def select(self, run: int) -> None:
         """Prepare the lights of run `run`: the first adds all else that shines as well, later ones these lights alone,

@@ -112,7 +112,7 @@ def _trace(integrator, composition, pixels: Reconstruction, picture, seed, count
     camera = pixels.camera
     alpha = mi.has_flag(camera.film.flags(), mi.FilmFlags.Alpha)
     chunks = range(0, camera.count, max(1, CHUNK // camera.spp))
-    for run, first in itertools.product(range(len(composition.runs)), chunks):
+    for run, first in itertools.product(composition.own, chunks):
         if integrator.should_stop() or counted.overtime(integrator.timeout):
             _stop(pixels, run, first, len(composition.runs))
             counted.ended = "timeout"
@@ -125,8 +125,10 @@ def _trace(integrator, composition, pixels: Reconstruction, picture, seed, count
         sums = picture and picture.sums(dr.width(ray), run, composition.runs[run])
         with composition.lights.bare():
             radiance, opacity = camera_light.trace(composition, ray, camera.quadrature(count), stream, sums)
-        once = [*([opacity] if alpha else []), dr.ones(mi.Float, dr.width(ray))]
-        pixels.add(first, position, [*(radiance * weight), *([None] * len(once) if run else once)])
+        # Opacity comes with the scene's first run, the filter's weights with the first that is rendered here.
+        begins = run == composition.own[0]
+        once = [*([None if run else opacity] if alpha else []), dr.ones(mi.Float, dr.width(ray)) if begins else None]
+        pixels.add(first, position, [*(radiance * weight), *once])
         if picture and sums:
             picture.put(first, position, sums)
     return True
