@@ -19,6 +19,7 @@ def variant(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
 
+@pytest.mark.slow  # a minute
 def test_every_line_runs(tmp_path, capsys):
     report = bench.bench(quick=True, out=tmp_path)
     bench.print_table(report)

@@ -12,7 +12,13 @@ from hypothesis import settings
 import mi_ntf.render
 
 # Properties are deterministic: the same examples in every run, no deadline, since the machine may be busy.
-settings.register_profile("hard", deadline=None, derandomize=True, max_examples=6, print_blob=True)
+# The catalogue takes more of them; `pytest_configure` comes before the tests are imported.
+settings.register_profile("hard", deadline=None, derandomize=True, max_examples=4, print_blob=True)
+
+
+def pytest_configure(config):
+    if config.getoption("--catalogue", False):
+        settings.register_profile("hard", settings.get_profile("hard"), max_examples=12)
 
 
 def pytest_addoption(parser):

@@ -83,7 +83,7 @@ def test_intensity(blobs, visibility, mode):
     assert mode(*case) == pytest.approx(differences(*case, 10.0), rel=1e-3)
 
 
-@pytest.mark.parametrize("mode", [forward, backward])
+@pytest.mark.parametrize("mode", [pytest.param(forward, marks=pytest.mark.slow), backward])
 @pytest.mark.parametrize(("light_samples", "rel"), [(0, 0.01), (4, 0.05)])
 def test_environment_texels(blobs, light_samples, rel, mode):
     """A patch of texels brightens. Exhaustively, cells and their centres of radiance move with them, which the

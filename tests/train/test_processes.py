@@ -42,6 +42,7 @@ def undisturbed(photographs, tmp_path_factory):
     return result(out)
 
 
+@pytest.mark.slow  # tests/hard_cases/test_kill.py kills at chance moments
 def test_a_run_killed_twice_ends_where_an_undisturbed_one_ends(photographs, undisturbed, tmp_path):
     """Bit for bit: same tensors, same validations, same losses after each start."""
     out = tmp_path / "f"
