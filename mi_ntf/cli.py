@@ -18,7 +18,9 @@ from tyro.conf import Positional, UseAppendAction, arg, subcommand
 
 from mi_ntf.core import errors
 from mi_ntf.evaluate.limits import Limits, broken, given
+from mi_ntf.jobs.options import Workers
 
+Shared = Annotated[Workers, arg(name="")]
 Output = Annotated[Path, arg(aliases=("-o",), metavar="FILE")]
 
 
@@ -46,8 +48,10 @@ class Capture:
     """Seed of view directions and samples."""
     flash_offset: Annotated[str | None, arg(metavar="R,U,F")] = None
     """Flash beside the lens: right,up,forward of it in scene lengths."""
+    workers: Shared = field(default_factory=Workers)
 
     def run(self) -> None:
+        _fitting(self.workers)
         from mi_ntf.data.capture import capture
 
         capture(
@@ -59,6 +63,7 @@ class Capture:
             spp=self.spp,
             seed=self.seed,
             flash_offset=_offset(self.flash_offset) or (0.0, 0.0, 0.0),
+            workers=self.workers,
         )
 
 
@@ -496,6 +501,14 @@ def _offset(text: str | None) -> tuple[float, float, float] | None:
         raise UsageError(f"--flash-offset is '{text}', expected three numbers right,up,forward (write "
                          "--flash-offset=-1,2,0 where the first is negative)") from None
     return right, up, forward
+
+
+def _fitting(workers: Workers) -> None:
+    """Raise the UsageError of options that do not fit together."""
+    try:
+        workers.check()
+    except errors.MiNtfError as error:
+        raise UsageError(str(error)) from None
 
 
 def _definitions(items: Sequence[str]) -> dict[str, str]:

@@ -27,6 +27,7 @@ EXTRAS = {
     "eval": ("skimage", "flip_evaluator", "matplotlib", "PIL"),
     "mesh": ("skimage", "scipy", "trimesh"),
     "watch": ("tevclient",),
+    "cluster": ("submitit", "distributed", "bokeh"),
 }
 """Extras of this package and the modules that they bring."""
 

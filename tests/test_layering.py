@@ -1,4 +1,4 @@
-"""The direction of dependencies: core ← infer ← render ← sequence ← evaluate, core ← data ← train.
+"""The direction of dependencies: core ← infer ← render ← sequence ← evaluate, core ← jobs ← data ← train.
 
 Training never imports Mitsuba or Dr.Jit, rendering never imports PyTorch.
 """
@@ -19,19 +19,22 @@ PACKAGE = Path(__file__).parents[1] / "mi_ntf"
 
 MAY_IMPORT = {
     "core": {"core"},
+    "jobs": {"core", "jobs"},
     "infer": {"core", "infer"},
     "render": {"core", "infer", "render"},
-    "data": {"core", "data"},
+    "data": {"core", "jobs", "data"},
     "train": {"core", "data", "train"},
-    "evaluate": {"core", "infer", "render", "data", "evaluate", "sequence"},
-    "sequence": {"core", "infer", "render", "sequence"},
+    "evaluate": {"core", "jobs", "infer", "render", "data", "evaluate", "sequence"},
+    "sequence": {"core", "jobs", "infer", "render", "sequence"},
 }
 """Which folders of the package a folder may import."""
 
+ENGINES = {"submitit", "distributed", "dask"}
 RENDERER, TORCH = {"mitsuba", "drjit"}, {"torch", "torchmetrics", "tensorboard", "lpips"}
 
 FORBIDDEN = {
     "core": RENDERER | TORCH,
+    "jobs": TORCH,  # Dr.Jit's threads are set there, where it is installed
     "infer": TORCH,
     "render": TORCH,
     "data": TORCH,
@@ -129,8 +132,8 @@ def test_third_parties_are_declared_where_they_are_used_and_nowhere_else():
     declared = {kind: {re.split("[=<>[]", name)[0].lower() for name in names} for kind, names in kinds.items()}
     shipped = set().union(*(declared[kind] for kind in kinds if kind != "dev"))
     tops = {name.split(".")[0] for file in FILES for name in imports_of(file)} - {"mi_ntf"} - sys.stdlib_module_names
-    # tensorboard is used by way of torch.utils.tensorboard.
-    assert {PACKAGE_OF.get(name, name.lower()) for name in tops} | {"tensorboard"} == shipped
+    # tensorboard is used by way of torch.utils.tensorboard, bokeh by distributed.
+    assert {PACKAGE_OF.get(name, name.lower()) for name in tops} | {"tensorboard", "bokeh"} == shipped
     for extra, modules in doctor.EXTRAS.items():
         assert {PACKAGE_OF.get(name, name.lower()) for name in modules} == declared[extra]
 
@@ -145,6 +148,8 @@ def test_relative_imports_are_resolved(tmp_path: Path, monkeypatch: pytest.Monke
     ("modules", "absent"),
     [
         ("mi_ntf, mi_ntf.cli, mi_ntf.core.field_file", RENDERER | TORCH),
+        ("mi_ntf.jobs, mi_ntf.jobs.worker, mi_ntf.jobs.local_engine", RENDERER | TORCH | ENGINES | {"numpy"}),
+        ("mi_ntf.data.capture", ENGINES),
         ("mi_ntf.bridge, mi_ntf.launcher, mi_ntf.doctor", TORCH),
     ],
 )

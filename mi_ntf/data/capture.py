@@ -10,12 +10,13 @@ that uses Mitsuba.
 import hashlib
 import json
 import time
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from mi_ntf import jobs
 from mi_ntf.core import files, spheres
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.data import schema
@@ -73,7 +74,7 @@ def _load(path: Path):
     if integrator is None or integrator.class_name() not in VOLUME_INTEGRATORS | (set() if media else
                                                                                    SURFACE_INTEGRATORS):
         integrator = mi.load_dict({"type": "volpath" if media else "path", "max_depth": 6, "hide_emitters": True})
-    return shapes, integrator
+    return sorted(shapes, key=lambda shape: (_fingerprint(shape), shape.id())), integrator  # Mitsuba's order is chance
 
 
 def _outline(shapes: list) -> np.ndarray:
@@ -95,12 +96,12 @@ def _outline(shapes: list) -> np.ndarray:
     return np.concatenate(points).astype(np.float64)
 
 
-def _fingerprint(scene) -> str:
-    """Hash of all parameters of a Mitsuba scene (vertices, materials): tells a changed object from the same one."""
+def _fingerprint(thing) -> str:
+    """Hash of all parameters of a Mitsuba object (vertices, materials): tells a changed one from the same one."""
     import mitsuba as mi
 
     digest = hashlib.sha256()
-    for key, value in sorted(mi.traverse(scene), key=lambda item: item[0]):
+    for key, value in sorted(mi.traverse(thing), key=lambda item: item[0]):
         digest.update(key.encode())
         digest.update(np.array(value).tobytes() if hasattr(value, "__len__") else repr(value).encode())
     return digest.hexdigest()[:16]
@@ -156,58 +157,112 @@ def _plan(counts: dict[str, int], center: np.ndarray, radius: float, offset: np.
     return plan
 
 
+@dataclass(frozen=True)
+class Request:
+    """What :func:`capture` was asked for. `variant`: Mitsuba's; `object`: the fingerprint of what is photographed."""
+
+    scene: Path
+    out: Path
+    views: int
+    size: int
+    test_views: int
+    spp: int
+    seed: int
+    flash_offset: tuple[float, float, float]
+    variant: str = ""
+    object: str = ""
+
+
+class Session:
+    """The studio and the frames of a request, and the photographs one by one. Raises MiNtfError."""
+
+    def __init__(self, request: Request):
+        import mitsuba as mi
+
+        if request.variant:
+            mi.set_variant(request.variant)
+        shapes, integrator = _load(request.scene)
+        self.center, radius = bounding_sphere(_outline(shapes))
+        self.radius = MARGIN * radius
+        self.angle = float(2.0 * np.arcsin(1.0 / DISTANCE))
+        self.studio = _studio(shapes, integrator, self.angle, request.size)
+        self.request = replace(request, variant=str(mi.variant()), object=_fingerprint(self.studio))
+        self.offset = np.array(request.flash_offset, dtype=np.float64)
+        far = DISTANCE * self.radius
+        if self.offset.shape != (3,) or not np.isfinite(self.offset).all() or self.offset[2] > 0.5 * far:
+            raise MiNtfError(f"capture: flash_offset is {request.flash_offset}, must be three finite lengths right,up,"
+                             f"forward of the lens, forward at most half of the way to the object ({far:.4g})")
+        counts = {"train": request.views, "val": max(4, request.views // 20), "test": request.test_views}
+        self.plan = _plan(counts, self.center, self.radius, self.offset, request.seed)
+        self.frames = [frame for split in self.plan.values() for frame in split]
+        self._params = mi.traverse(self.studio)
+
+    def photograph(self, index: int) -> None:
+        """Render and write frame `index`."""
+        import mitsuba as mi
+
+        request, frame = self.request, self.frames[index]
+        self._params["sensor.to_world"] = mi.Transform4f(mi.Matrix4f(schema.mitsuba_to_opengl(frame.c2w).tolist()))
+        self._params["light.position"] = mi.Point3f(frame.light_pos.tolist())
+        self._params["light.intensity.value"] = mi.Color3f(frame.light_intensity.tolist())
+        self._params.update()
+        stream: Any = request.seed * len(self.frames) + index  # a number, where Mitsuba's stub asks for an array
+        image = np.array(mi.render(self.studio, spp=request.spp, seed=stream))
+        if bad := np.count_nonzero(~np.isfinite(image).all(-1)):
+            raise MiNtfError(f"{request.scene}: {bad} pixels of view {frame.file} are NaN or infinite; look for "
+                             "extreme values in its materials and media, or give it another integrator")
+        path = request.out / frame.file
+        files.make_folder(path.parent)
+        schema.write_exr(path, image)
+
+
+_kept: list[Session] = []
+"""The session of this process, kept from view to view."""
+
+
+def photograph(task: tuple[Request, int]) -> None:
+    """Write one view, in any process: a request as its session has completed it, and the number of the frame."""
+    request, index = task
+    if not _kept or _kept[0].request != request:
+        _kept[:] = [Session(request)]
+    if _kept[0].request != request:
+        raise MiNtfError(f"{request.scene} is not the scene that this capture was begun with; wait for all machines to "
+                         "see the same file, or use another folder")
+    _kept[0].photograph(index)
+
+
 def capture(scene: Path, out: Path, *, views: int = 100, size: int = 128, test_views: int = 20, spp: int = 64,
-            seed: int = 0, flash_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> dict:
+            seed: int = 0, flash_offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
+            workers: jobs.Workers = jobs.Workers()) -> dict:  # noqa: B008
     """Photograph `scene` (Mitsuba XML: surfaces, media) into the data set `out`; resumes what an earlier run began.
 
     `views` train, max(4, views // 20) val and `test_views` test photographs of size x size pixels, `spp` paths a pixel.
-    `flash_offset`: right, up and forward from the lens to the flash, scene lengths.
+    `flash_offset`: right, up and forward from the lens to the flash, scene lengths. `workers`: who renders them.
     Returns center, radius, the number of images rendered and kept, and the seconds taken. Raises MiNtfError for a scene
-    that cannot be photographed and for a folder that holds a capture with other settings.
+    that cannot be photographed, for a folder that holds a capture with other settings, and for views that fail, after
+    the others.
     """
-    import mitsuba as mi
-
     for name, value in (("views", views), ("size", size), ("test_views", test_views), ("spp", spp)):
         if value < 1:
             raise MiNtfError(f"capture: {name} is {value}, must be 1 or more")
+    workers.check()
     start = time.monotonic()
-    out = Path(out)
-    shapes, integrator = _load(scene)
-    center, radius = bounding_sphere(_outline(shapes))
-    radius *= MARGIN
-    angle = float(2.0 * np.arcsin(1.0 / DISTANCE))
-    studio = _studio(shapes, integrator, angle, size)
-    offset = np.array(flash_offset, dtype=np.float64)
-    if offset.shape != (3,) or not np.isfinite(offset).all() or offset[2] > 0.5 * DISTANCE * radius:
-        raise MiNtfError(f"capture: flash_offset is {flash_offset}, must be three finite lengths right,up,forward of "
-                         f"the lens, forward at most half of the way to the object ({DISTANCE * radius:.4g})")
-    counts = {"train": views, "val": max(4, views // 20), "test": test_views}
+    out = Path(out).absolute()
+    session = Session(Request(Path(scene).absolute(), out, views, size, test_views, spp, seed, flash_offset))
+    request, frames = session.request, session.frames
     files.make_folder(out)
-    _open_manifest(out, {"scene": Path(scene).name, "object": _fingerprint(studio),
-                         "integrator": " ".join(str(studio.integrator()).split()), "views": views, "size": size,
-                         "test_views": test_views, "spp": spp, "seed": seed, "flash_offset": offset.tolist()})
-    plan = _plan(counts, center, radius, offset, seed)
-    frames = [frame for split in plan.values() for frame in split]
-    params, rendered = mi.traverse(studio), 0
-    columns = (TextColumn("capture"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, transient=True) as progress:
-        for index, frame in enumerate(progress.track(frames)):
-            path = out / frame.file
-            if path.exists():
-                continue
-            files.make_folder(path.parent)
-            params["sensor.to_world"] = mi.Transform4f(mi.Matrix4f(schema.mitsuba_to_opengl(frame.c2w).tolist()))
-            params["light.position"] = mi.Point3f(frame.light_pos.tolist())
-            params["light.intensity.value"] = mi.Color3f(frame.light_intensity.tolist())
-            params.update()
-            stream: Any = seed * len(frames) + index  # a number, where Mitsuba's stub asks for an array
-            image = np.array(mi.render(studio, spp=spp, seed=stream))
-            if bad := np.count_nonzero(~np.isfinite(image).all(-1)):
-                raise MiNtfError(f"{scene}: {bad} pixels of view {frame.file} are NaN or infinite; look for extreme "
-                                 "values in its materials and media, or give it another integrator")
-            schema.write_exr(path, image)
-            rendered += 1
-    for split, entries in plan.items():
-        schema.write_transforms(out, split, schema.Transforms(angle, size, size, center, radius, entries))
-    return {"center": center.tolist(), "radius": radius, "rendered": rendered, "kept": len(frames) - rendered,
-            "seconds": time.monotonic() - start}
+    _open_manifest(out, {"scene": Path(scene).name, "object": request.object,
+                         "integrator": " ".join(str(session.studio.integrator()).split()), "views": views, "size": size,
+                         "test_views": test_views, "spp": spp, "seed": seed, "flash_offset": session.offset.tolist()})
+    left = [index for index, frame in enumerate(frames) if not (out / frame.file).exists()]
+    _kept[:] = [session]
+    try:
+        jobs.run(photograph, [(request, index) for index in left], workers, title="photographs",
+                 names=[frames[index].file for index in left], folder=out)
+    finally:
+        _kept.clear()
+    for split, entries in session.plan.items():
+        found = schema.Transforms(session.angle, size, size, session.center, session.radius, entries)
+        schema.write_transforms(out, split, found)
+    return {"center": session.center.tolist(), "radius": session.radius, "rendered": len(left),
+            "kept": len(frames) - len(left), "seconds": time.monotonic() - start}

@@ -1,0 +1,77 @@
+"""Which workers to use, as options of commands."""
+
+import importlib
+import os
+import subprocess
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from ..core.errors import MiNtfError
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Who does the tasks. Without options it is this process, one task after the other."""
+
+    engine: Literal["local", "submitit", "dask"] = "local"
+    """local: processes of this machine. submitit: a Slurm array, or subprocesses where there is no Slurm. dask: the
+    workers of --scheduler, or of this machine."""
+    workers: int | None = None
+    """Processes that work at the same time."""
+    threads: int | None = None
+    """Threads of each; its share of this machine's cores unless given."""
+    scheduler: str | None = None
+    """Address of a running Dask scheduler, as tcp://HOST:8786."""
+
+    @property
+    def here(self) -> bool:
+        """Whether the tasks are done in this process."""
+        return self == Workers() or self == Workers(workers=1)
+
+    def check(self) -> None:
+        """Raise the MiNtfError of options that do not fit together."""
+        if self.engine not in ("local", "submitit", "dask"):
+            raise MiNtfError(f"engine is '{self.engine}', must be local, submitit or dask")
+        for name in ("workers", "threads"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise MiNtfError(f"{name} is {value}, must be 1 or more")
+        if self.scheduler is not None and self.engine != "dask":
+            raise MiNtfError(f"scheduler is '{self.scheduler}' with the engine {self.engine}; it is one of Dask: add "
+                             "--engine dask")
+        if self.scheduler is not None and self.workers is not None:
+            raise MiNtfError(f"workers is {self.workers}, but a scheduler has the workers that were started for it; "
+                             "leave --workers out")
+        if self.engine != "local" and self.workers is None and self.scheduler is None:
+            more = ", or --scheduler ADDRESS" if self.engine == "dask" else ""
+            raise MiNtfError(f"the engine {self.engine} needs a number of workers; give --workers N{more}")
+
+    def share(self) -> int:
+        """Threads of a worker of this machine."""
+        return self.threads or max(1, cores() // (self.workers or 1))
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def gpus() -> list[str]:
+    """GPUs of this machine, in the words of CUDA_VISIBLE_DEVICES; those alone where that is set."""
+    if (own := os.environ.get("CUDA_VISIBLE_DEVICES")) is not None:
+        return [word for word in own.split(",") if word]
+    try:
+        listed = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, timeout=60, check=True).stdout
+    except (OSError, subprocess.SubprocessError):
+        return []
+    return [str(i) for i, _ in enumerate(line for line in listed.splitlines() if line.startswith("GPU "))]
+
+
+def load(engine: str) -> Any:
+    """The library of an engine. Raises MiNtfError where it is not installed."""
+    module = {"dask": "distributed"}.get(engine, engine)
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise MiNtfError(f"the engine {engine} needs {module} ({error}); install it with: "
+                         "pip install 'mi-ntf[cluster]'") from None
