@@ -303,13 +303,16 @@ class Reproduce:
     methods: tuple[str, ...] = ()
     """Of NRF, TM, AG, "No AG", NeRV, "TM of AG", "TM field", March; all unless given. The first two and the last two
     train nothing."""
+    workers: Shared = field(default_factory=Workers)
     json: bool = False
     """Print JSON in place of a summary."""
 
     def run(self) -> int:
+        _fitting(self.workers)
         from mi_ntf.evaluate.reproduce import print_table, reproduce
 
-        found = reproduce(self.output, self.quick, self.scenes, self.environments, self.tables, self.methods)
+        found = reproduce(self.output, self.quick, self.scenes, self.environments, self.tables, self.methods,
+                          workers=self.workers)
         _report(found, self.json, print_table)
         return 1 if found["failed"] else 0
 

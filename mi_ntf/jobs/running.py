@@ -3,7 +3,7 @@
 import pickle
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Generator, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -64,8 +64,8 @@ def run(work: Callable[[Any], Any], tasks: Sequence[Any], workers: Workers = Wor
 
 
 def each(work: Callable[[Any], Any], tasks: Sequence[Any], workers: Workers = Workers(), *,  # noqa: B008
-         title: str = "tasks", names: Sequence[str] = (), folder: Path | None = None,
-         quiet: bool = False) -> Iterator[Done]:
+         title: str = "tasks", names: Sequence[str] = (), needs: Sequence[Collection[int]] = (),
+         folder: Path | None = None, quiet: bool = False) -> Generator[Done, None, None]:
     """Every task's end as it comes, in any order. To close the iterator ends the work.
 
     Args:
@@ -74,6 +74,8 @@ def each(work: Callable[[Any], Any], tasks: Sequence[Any], workers: Workers = Wo
         workers: who does them. In this process a task is tried once, by others `ATTEMPTS` times.
         title: what tasks are, in the plural, for the bar.
         names: of the tasks, for messages; their numbers unless given.
+        needs: for each task the numbers of those before it in the list that it waits for. Where one of them fails, the
+            task is not begun and fails, too.
         folder: where the engine ``submitit`` keeps its files, seen by all machines; removed where all went well.
         quiet: no bar.
 
@@ -84,36 +86,73 @@ def each(work: Callable[[Any], Any], tasks: Sequence[Any], workers: Workers = Wo
     if not tasks:
         return
     with _bar(title, len(tasks), quiet) as (tell, advance):
+        order = _Order(len(tasks), names, needs)
         if workers.here:
-            for index, task in enumerate(tasks):
-                yield _here(work, index, task)
+            for done in _here(work, tasks, order):
+                yield done
                 advance()
             return
         engine = _engine(workers, _pickled(work), folder, tell)
         try:
             if engine.about:
                 tell(engine.about)
-            for done in _tried(engine, tasks, names, BARREN + 2 * (workers.workers or 0), tell):
+            for done in _tried(engine, tasks, names, order, BARREN + 2 * (workers.workers or 0), tell):
                 yield done
                 advance()
         finally:
             engine.close()
 
 
-def _here(work: Callable[[Any], Any], index: int, task: Any) -> Done:
-    try:
-        return Done(index, work(task))
-    except Exception as error:
-        return Done(index, error=told(error))
+class _Order:
+    """Which tasks may begin, and which never will, after others have ended."""
+
+    def __init__(self, count: int, names: Sequence[str], needs: Sequence[Collection[int]]):
+        self._names, self._open = names, {k: set(needs[k]) if needs else set() for k in range(count)}
+
+    def ready(self) -> list[int]:
+        """Tasks that wait for nothing, each told once."""
+        found = [k for k, open_ in self._open.items() if not open_]
+        for k in found:
+            del self._open[k]
+        return found
+
+    def ended(self, done: Done) -> list[Done]:
+        """Those that can no longer be done now that `done` is."""
+        waiting = [k for k, open_ in self._open.items() if done.index in open_]
+        if not done.error:
+            for k in waiting:
+                self._open[k].discard(done.index)
+            return []
+        failed: list[Done] = []
+        for k in waiting:
+            if self._open.pop(k, None) is not None:
+                lost = Done(k, error=f"{_name(done.index, self._names)} failed, which it needs")
+                failed += [lost, *self.ended(lost)]
+        return failed
 
 
-def _tried(engine: Engine, tasks: Sequence[Any], names: Sequence[str], barren: int,
+def _here(work: Callable[[Any], Any], tasks: Sequence[Any], order: _Order) -> Iterator[Done]:
+    """The ends of all tasks, done in this process."""
+    while ready := order.ready():
+        for k in ready:
+            try:
+                done = Done(k, work(tasks[k]))
+            except Exception as error:
+                done = Done(k, error=told(error))
+            yield done
+            yield from order.ended(done)
+
+
+def _tried(engine: Engine, tasks: Sequence[Any], names: Sequence[str], order: _Order, barren: int,
            tell: Callable[[str], None]) -> Iterator[Done]:
     """The ends of all tasks, each tried until it is done or has failed often enough."""
-    for index, task in enumerate(tasks):
-        engine.submit(index, task)
-    left, tries, lost = len(tasks), Counter[int](), 0
-    while left:
+    tries, lost, going = Counter[int](), 0, 0
+    while True:
+        for k in order.ready():
+            engine.submit(k, tasks[k])
+            going += 1
+        if not going:
+            return
         answer = engine.answer()
         k = answer.index
         tries[k] += 1
@@ -125,8 +164,10 @@ def _tried(engine: Engine, tasks: Sequence[Any], names: Sequence[str], barren: i
             tell(f"{_name(k, names)}: {answer.error}; it is tried again")
             engine.submit(k, tasks[k], answer.where)
             continue
-        left -= 1
-        yield Done(k, error=answer.error) if answer.error else Done(k, pickle.loads(answer.value))
+        going -= 1
+        done = Done(k, error=answer.error) if answer.error else Done(k, pickle.loads(answer.value))
+        yield done
+        yield from order.ended(done)
 
 
 def _engine(workers: Workers, work: bytes, folder: Path | None, tell: Callable[[str], None]) -> Engine:

@@ -22,6 +22,7 @@ from mi_ntf.evaluate import transmittance
 from mi_ntf.evaluate.bench_measure import QUICK as BENCH
 from mi_ntf.evaluate.reproduce import compared, lights, networks, state
 from mi_ntf.evaluate.reproduce.jobs import Job
+from mi_ntf.jobs import Workers, running
 
 TINY = replace(compared.QUICK, pixels=24, points=2, skies=1, spp=(4, 1), reference_spp=16, cells=6, map_resolution=24,
                views=4, photograph=16, steps=8, stages=(0.25, 1), study=(16, 1, 2), build=(1, 2), bench=BENCH)
@@ -168,6 +169,52 @@ def test_all_of_it_on_a_tiny_field(scene, trained, tmp_path, monkeypatch):
     assert again == ["reference/balls/point-001"]
 
 
+def test_several_workers_give_the_rows_of_one(scene, tmp_path, monkeypatch):
+    mi.set_variant(VARIANT)
+    monkeypatch.setattr(package, "QUICK", TINY)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
+    wanted = {"quick": True, "scenes": [str(scene)], "tables": ["table2"], "methods": ["TM"]}
+    package.reproduce(tmp_path / "one", **wanted)
+    found = package.reproduce(Path("two"), **wanted, workers=Workers("local", 2))  # a relative folder
+    assert (found["done"], found["failed"], found["waiting"]) == (found["jobs"], {}, [])
+    one, two = ({r["job"]: r for r in rows(tmp_path / folder)} for folder in ("one", "two"))
+    assert one.keys() == two.keys() and sum("metrics" in r for r in one.values()) == 3
+    for name, row in one.items():
+        assert row.get("metrics") == two[name].get("metrics") and row.get("file") == two[name].get("file")
+        assert "shared" in two[name] and "shared" not in row
+    for path in (tmp_path / "one").rglob("*.exr"):
+        assert path.read_bytes() == (tmp_path / "two" / path.relative_to(tmp_path / "one")).read_bytes()
+    assert "3 of them were made by several workers" in (tmp_path / "two" / "report.html").read_text()
+
+
+def test_what_fails_at_several_workers_leaves_the_rest(scene, tmp_path, monkeypatch):
+    mi.set_variant(VARIANT)
+    monkeypatch.setattr(package, "QUICK", TINY)
+    monkeypatch.setattr(running, "ATTEMPTS", 1)
+    wanted = {"quick": True, "scenes": [str(scene)], "tables": ["table2"], "methods": ["TM field"]}
+    (tmp_path / "out" / "references").mkdir(parents=True)
+    (tmp_path / "out" / "references" / "balls").touch()  # where a folder is to be made
+    found = package.reproduce(tmp_path / "out", **wanted, workers=Workers("local", 2))
+    assert sorted(found["failed"]) == [f"reference/balls/{light}" for light in ("environment-000", "point-000",
+                                                                                "point-001")]
+    assert all("cannot make the folder" in why for why in found["failed"].values())
+    assert len(found["waiting"]) == 3 and found["done"] == 0
+    (tmp_path / "out" / "references" / "balls").unlink()
+    assert package.reproduce(tmp_path / "out", **wanted, workers=Workers("local", 2))["done"] == found["jobs"]
+
+
+def test_times_are_measured_alone_after_the_rest(tmp_path, monkeypatch):
+    order = []
+    monkeypatch.setattr(package.sharing, "work", lambda jobs, *_: order.extend(j.name for j in jobs) or {"bad"})
+    alone = {"alone": True}
+    work = [job("time", lambda: order.append("time") or {}, **alone), job("picture"), job("bad"),
+            job("late", partial(pytest.fail, "it needs what failed"), needs=("bad",), **alone)]
+    with state.State(tmp_path) as held:
+        assert package._shared(work, held, None, Workers("dask", 2)) == {"bad", "late"}
+    assert order == ["picture", "bad", "time"]
+
+
 def test_what_cannot_be_trained_leaves_the_other_columns(scene, tmp_path, monkeypatch):
     mi.set_variant(VARIANT)
     monkeypatch.setattr(package, "QUICK", TINY)
@@ -198,12 +245,14 @@ def test_bad_names_are_refused_before_the_work(options, message, tmp_path):
 def test_the_command_line(monkeypatch, capsys):
     calls = []
     result = {"failed": {}, "drops": {}, "done": 3, "jobs": 3, "report": "r.html", "latex": "t.tex"}
-    monkeypatch.setattr(package, "reproduce", lambda *args: calls.append(args) or result)
+    monkeypatch.setattr(package, "reproduce", lambda *args, workers: calls.append((*args, workers)) or result)
     assert cli.main(["reproduce"]) == 0
     assert cli.main(["reproduce", "-o", "x", "--quick", "--scenes", "statue", "knot", "--tables", "table2",
-                     "--methods", "NRF", "No AG", "--environments", "maps", "--json"]) == 0
-    assert calls == [(Path("reproduce"), False, (), None, (), ()),
-                     (Path("x"), True, ("statue", "knot"), Path("maps"), ("table2",), ("NRF", "No AG"))]
+                     "--methods", "NRF", "No AG", "--environments", "maps", "--json", "--engine", "dask", "--workers",
+                     "2"]) == 0
+    assert calls == [(Path("reproduce"), False, (), None, (), (), Workers()),
+                     (Path("x"), True, ("statue", "knot"), Path("maps"), ("table2",), ("NRF", "No AG"),
+                      Workers("dask", 2))]
     assert "3 of 3 jobs done\nr.html\nt.tex" in capsys.readouterr().out
     result["failed"] = {"a": "why"}
     assert cli.main(["reproduce", "--json"]) == 1

@@ -46,6 +46,15 @@ def unsendable(task):
     return lambda: task
 
 
+def read(task: Path) -> tuple[int, ...]:
+    """Shape of an image, by Mitsuba."""
+    import mitsuba as mi
+    import numpy as np
+
+    mi.set_variant("llvm_ad_rgb")
+    return np.array(mi.Bitmap(str(task))).shape
+
+
 def photograph(task) -> None:
     """A view of a capture; the first process that comes to frame 5 is killed as by `kill -9` before it."""
     request, index = task

@@ -77,11 +77,16 @@ def test_submitit_leaves_nothing_where_all_went_well(tmp_path):
 
 def test_workers_are_processes_with_their_threads_and_a_gpu_each(monkeypatch):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5")
-    found = jobs.run(chores.place, range(8), jobs.Workers("local", 2, threads=1), quiet=True)
+    found = jobs.run(chores.place, range(8), jobs.Workers("local", 2, threads=3), quiet=True)
     gpus = {pid: about.pop("CUDA_VISIBLE_DEVICES") for pid, about in found}
     assert sorted(gpus.values()) == ["3", "5"] and os.getpid() not in gpus
-    assert all(about == {"OMP_NUM_THREADS": "1", "drjit": 1} for _, about in found)
+    assert all(about == {"OMP_NUM_THREADS": "3", "drjit": 3} for _, about in found)
     assert os.environ.get("OMP_NUM_THREADS") is None
+
+
+def test_a_worker_of_one_thread_reads_exr_files():
+    environment = Path(__file__).parents[2] / "scenes" / "common" / "env.exr"
+    assert jobs.run(chores.read, [environment], jobs.Workers("local", 1, threads=1), quiet=True) == [(32, 64, 3)]
 
 
 def test_gpus_are_counted_without_loading_anything(monkeypatch, tmp_path):

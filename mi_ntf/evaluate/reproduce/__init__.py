@@ -8,30 +8,28 @@
 A job that fails is a line that says why; those that need it wait, and the next run tries it again.
 """
 
-import os
-import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
-import mitsuba as mi
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from ...core import errors
-from ...render import register
+from ...jobs import Workers
 from ...render.cost.measurement import maps_made_anew
 from .. import bench
-from . import compared, lights
-from .compared import FULL, METHODS, QUICK, TABLES, Scene, Sizes
-from .images import Studio
-from .jobs import Job, Plan
+from . import sharing
+from .compared import FULL, QUICK, Sizes
+from .jobs import Job
 from .report import Report
+from .sharing import Request, timed
 from .state import State
 
 
 def reproduce(out: Path, quick: bool = False, scenes: Sequence[str] = (), environments: Path | None = None,
-              tables: Sequence[str] = (), methods: Sequence[str] = (), sizes: Sizes | None = None) -> dict:
+              tables: Sequence[str] = (), methods: Sequence[str] = (), sizes: Sizes | None = None,
+              workers: Workers = Workers()) -> dict:  # noqa: B008
     """Do what is not done yet, and write the report of all that is; its figures, JSON.
 
     Args:
@@ -42,23 +40,20 @@ def reproduce(out: Path, quick: bool = False, scenes: Sequence[str] = (), enviro
         tables: names of :data:`.compared.TABLES`; none: all.
         methods: names of :data:`.compared.METHODS`; none: all.
         sizes: in place of those of full size or `quick`.
+        workers: who does the jobs; what measures times is done here, after the rest.
 
     Ends at Ctrl-C with a report of what is there. Raises MiNtfError for bad names, files that are missing, and a folder
     that another run is at work in.
     """
     out = Path(out)
-    sizes = sizes or (QUICK if quick else FULL)
-    names, columns = compared.chosen("table", tables, TABLES), compared.chosen("method", methods, METHODS)
-    found = compared.scenes(scenes)
-    if mi.variant() is None:
-        mi.set_variant("llvm_ad_rgb")
-    register()
-    skies = lights.environments(sizes.skies if quick or environments is None else 0, environments)
-    plan = Plan(out, sizes, found, {s.name: _points(s, sizes) + skies for s in found}, names, columns)
+    workers.check()
+    request = Request(out, sizes or (QUICK if quick else FULL), quick, tuple(scenes), environments, tuple(tables),
+                      tuple(methods))
+    plan = request.plan()
     with State(out) as state, maps_made_anew():
         interrupted, failed = None, set()
         try:
-            failed = _work(plan.jobs, state)
+            failed = _work(plan.jobs, state) if workers.here else _shared(plan.jobs, state, request, workers)
         except KeyboardInterrupt as error:
             interrupted = error
         done = {j.name: state.rows[j.name] for j in plan.jobs if _done(j, state)}
@@ -73,18 +68,14 @@ def reproduce(out: Path, quick: bool = False, scenes: Sequence[str] = (), enviro
             "tables": shown}
 
 
-def _points(scene: Scene, sizes: Sizes) -> list[lights.Light]:
-    studio = Studio(scene, sizes)
-    return lights.point_lights(sizes.points, studio.centre, studio.radius, studio.eye)
-
-
 def _done(job: Job, state: State) -> bool:
     return state.done(job.name, job.about) and (job.makes is None or job.makes.exists())
 
 
-def _work(jobs: list[Job], state: State) -> set[str]:
-    """Do the jobs that are not done; names of those that are not, since they or what they need failed."""
-    failed: set[str] = set()
+def _work(jobs: list[Job], state: State, before: Collection[str] = ()) -> set[str]:
+    """Do the jobs that are not done; names of those that are not, since they or what they need failed. `before`: names
+    of others that failed."""
+    failed = set(before)
     console = Console(stderr=True)
     with Progress(TextColumn("{task.description:40}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
                   TextColumn("left"), TimeRemainingColumn(), console=console) as progress:
@@ -105,15 +96,20 @@ def _work(jobs: list[Job], state: State) -> set[str]:
 
 def do(job: Job) -> dict[str, Any]:
     """The row of a job, whatever becomes of it."""
-    row: dict[str, Any] = {"job": job.name, "about": job.about, **job.tags}
-    start = time.perf_counter()
     try:
-        row |= job.run()
+        return timed(job)
     except Exception as error:
         if errors.debug():
             raise
-        row["error"] = errors.sentence(error)
-    return row | {"wall_seconds": round(time.perf_counter() - start, 3), "load": round(os.getloadavg()[0], 2)}
+        return {"job": job.name, "about": job.about, **job.tags, "error": errors.sentence(error)}
+
+
+def _shared(jobs: list[Job], state: State, request: Request, workers: Workers) -> set[str]:
+    """The same by `workers`; jobs that measure times are done here when the others are over."""
+    left = [job for job in jobs if not _done(job, state)]
+    failed = sharing.work([job for job in left if not job.alone], request, workers, state.add)
+    alone = [job for job in left if job.alone]
+    return failed | _work(alone, state, failed) if alone else failed
 
 
 def print_table(found: dict) -> None:

@@ -20,7 +20,8 @@ FOR_COSTS = {"table1", "runtime", "maps", "complexity"}
 @dataclass(frozen=True)
 class Job:
     """`about`: a hash of all that decides the result; `run` → its row, JSON; `needs`: jobs before it; `makes`: a file
-    without which it is not done; `tags`: members of the row that are known before."""
+    without which it is not done; `tags`: members of the row that are known before; `alone`: it measures times, and
+    nothing else may run beside it."""
 
     name: str
     about: str
@@ -28,6 +29,7 @@ class Job:
     needs: tuple[str, ...] = ()
     makes: Path | None = None
     tags: dict = field(default_factory=dict)
+    alone: bool = False
 
 
 class Plan:
@@ -84,13 +86,13 @@ class Plan:
         s, tables = self.sizes, set(self.tables)
         bench = self._about(None, asdict(s.bench))
         if tables & FOR_COSTS:
-            yield Job("costs", bench, partial(costs.measure, s.bench))
+            yield Job("costs", bench, partial(costs.measure, s.bench), alone=True)
         if "runtime" in tables:
-            yield Job("scaling", bench, partial(costs.scaling, s.bench))
+            yield Job("scaling", bench, partial(costs.scaling, s.bench), alone=True)
         if "maps" in tables:
             for scene in self.scenes:
                 yield Job(f"build/{scene.name}", self._about(scene, s.build, s.map_resolution),
-                          partial(costs.build, scene, s))
+                          partial(costs.build, scene, s), alone=True)
         if "curves" in tables:
             yield self._curves()
         if "ablation" in tables:
@@ -116,7 +118,8 @@ class Plan:
                 folder = networks.folder(scene, self.out)
                 yield Job(f"ablation/{scene.name}/{network or 'shipped'}", self._trained(scene, network, s.study),
                           partial(curves.ablation, scene, path, folder, s),
-                          (training.job,) if network else (), tags={"scene": scene.name, "network": network})
+                          (training.job,) if network else (), tags={"scene": scene.name, "network": network},
+                          alone=True)
 
     def _trained(self, scene: Scene, network: str, *more) -> str:
         s = self.sizes

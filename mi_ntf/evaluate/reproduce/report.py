@@ -89,6 +89,9 @@ class Report:
                     sorted(self.accuracy.seconds.items(), key=lambda item: (item[0][0] != "point", item[0][1]))]
             page.table(["light", "method", "pictures", "seconds, median"], body,
                        folded="Pictures, and the time that one takes here")
+            if self.accuracy.shared:
+                page.text(f"{self.accuracy.shared} of them were made by several workers at a time: their seconds are "
+                          "longer than those of a picture alone.")
 
     def _runtime(self, page: Page) -> None:
         if not self.costs:

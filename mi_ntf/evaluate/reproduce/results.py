@@ -30,15 +30,17 @@ def drop(metric: str, value: float, base: float) -> float:
 
 
 class Accuracy:
-    """Measures of pictures: `rows` of finished jobs of :mod:`.images`."""
+    """Measures of pictures: `rows` of finished jobs of :mod:`.images`; `shared`: how many were made beside others."""
 
     def __init__(self, rows: Iterable[dict], scenes: list[Scene]):
         self.scenes = scenes
         self._found: dict[tuple, dict[str, dict]] = {}
         self.seconds: dict[tuple[str, str], list[float]] = {}
+        self.shared = 0
         for row in rows:
             self._found.setdefault((row["scene"], row["kind"], row["method"]), {})[row["light"]] = row["metrics"]
             self.seconds.setdefault((row["kind"], row["method"]), []).append(row["seconds"])
+            self.shared += "shared" in row
 
     def methods(self, known: Iterable[str]) -> list[str]:
         """Those of `known` with a picture."""
