@@ -271,10 +271,12 @@ class Tradeoff:
     """How long the study may take: 90s, 5m, 1h."""
     reference: Annotated[Path | None, arg(metavar="FILE")] = None
     """The path-traced mesh, an EXR picture or the XML file of its scene; shipped scenes have theirs."""
+    workers: Shared = field(default_factory=Workers)
     json: bool = False
     """Print JSON in place of a table, and no progress."""
 
     def run(self) -> None:
+        _fitting(self.workers)
         parameters = _definitions(self.define)
         from mi_ntf.evaluate.tradeoff import study
 
@@ -282,8 +284,8 @@ class Tradeoff:
             seconds = study.seconds(self.budget)
         except ValueError as error:
             raise UsageError(str(error)) from None
-        _report(study.tradeoff(self.scene, self.output, parameters, seconds, self.reference, self.json), self.json,
-                study.print_table)
+        _report(study.tradeoff(self.scene, self.output, parameters, seconds, self.reference, self.json,
+                               workers=self.workers), self.json, study.print_table)
 
 
 @dataclass

@@ -60,7 +60,7 @@ def _times(work: Any, tasks: list, workers: Workers) -> list[float]:
 def main(engines: list[str]) -> None:
     """Print a line an engine."""
     for engine in engines or ["local", "submitit", "dask"]:
-        found, load = measure(engine, 4000), os.getloadavg()[0]
+        found, load = measure(engine, 1000), os.getloadavg()[0]
         print(f"{engine:9} start {found['start']:.2f} s, a task {1000 * found['per_task']:.2f} ms, load {load:.1f}; "
               f"two workers {speedup(engine):.2f} times as fast as one, load {os.getloadavg()[0]:.1f}", flush=True)
 

@@ -3,6 +3,8 @@
 import contextlib
 import itertools
 import logging
+import time
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -14,6 +16,10 @@ from .worker import Answer, Setup, attempt, environment
 
 PATIENCE = 20
 """Seconds to wait for a scheduler to answer."""
+AHEAD, LEAST = 4, 32
+"""Tasks that the scheduler has for each of its workers, and in all at least: it is slow with very many."""
+COUNT = 5.0
+"""Seconds between counts of the workers."""
 TALK = ("distributed.scheduler", "distributed.client")
 """Loggers that have four lines for every worker that is lost; the one of its restart, of another, stays."""
 
@@ -33,6 +39,8 @@ class Dask:
             back.callback(self._client.close)
             self._ended = distributed.as_completed([], loop=self._client.loop, raise_errors=False, with_results=True)
             self._going: dict[Any, int] = {}
+            self._waiting: deque[tuple[int, Any, str]] = deque()
+            self._room, self._counted = LEAST, -COUNT
             self._number = itertools.count()
             self.about = f"Dask's dashboard: {self._client.dashboard_link}"
             if not self._workers():
@@ -52,25 +60,36 @@ class Dask:
         return cluster
 
     def submit(self, index: int, task: Any, avoid: str = "") -> None:
-        """Hand it to the scheduler."""
-        others = [name for name in self._workers() if name != avoid] if avoid else []
-        future = self._client.submit(
-            try_task, self._work, index, task, self._threads, self._gpus, key=f"mi-ntf-{index}-{next(self._number)}",
-            pure=False, workers=others or None, allow_other_workers=bool(others))
-        self._going[future] = index
-        self._ended.add(future)
+        """Put a task behind the others."""
+        self._waiting.append((index, task, avoid))
 
     def answer(self) -> Answer:
-        """The next one."""
+        """The next one; the scheduler is given work before."""
+        self._fill()
         future, found = next(self._ended)
         index = self._going.pop(future)
         if isinstance(found, Answer):
             return found
+        if self._client.status != "running":
+            raise MiNtfError(f"the Dask scheduler is gone (connection {self._client.status}); start it and run the "
+                             "same command again")
         error = future.exception() if future.status == "error" else None
         if isinstance(error, distributed.KilledWorker):
             return Answer(index, error=f"every worker that took it ended, {error.last_worker.address} the last; had "
                           "they enough memory?", last=True)
         return Answer(index, error=f"Dask gave it up ({error or future.status})", lost=True)
+
+    def _fill(self) -> None:
+        if self._waiting and time.monotonic() - self._counted > COUNT:
+            self._room, self._counted = max(LEAST, AHEAD * len(self._workers())), time.monotonic()
+        while self._waiting and len(self._going) < self._room:
+            index, task, avoid = self._waiting.popleft()
+            others = [name for name in self._workers() if name != avoid] if avoid else []
+            future = self._client.submit(
+                try_task, self._work, index, task, self._threads, self._gpus, pure=False,
+                key=f"mi-ntf-{index}-{next(self._number)}", workers=others or None, allow_other_workers=bool(others))
+            self._going[future] = index
+            self._ended.add(future)
 
     def _workers(self) -> list[str]:
         """Addresses."""

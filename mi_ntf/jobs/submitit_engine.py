@@ -21,7 +21,8 @@ from .worker import Answer, Setup, do_share, read_answers
 MINUTES = 24 * 60
 """Of a job; SBATCH_TIMELIMIT overrides it, as other variables of sbatch do the rest."""
 WAIT = {"local": 0.05, "slurm": 2.0}
-"""Seconds between looks at what the jobs have written."""
+"""Seconds between looks at what the jobs have written; `LOOKS` files a second at most."""
+LOOKS = 100
 CHECK = 60.0
 """Seconds between questions to Slurm whether jobs are lost."""
 
@@ -58,7 +59,7 @@ class Submitit:
             self._begin()
             self._look()
             if not self._answers:
-                time.sleep(WAIT.get(self._kind, 2.0))
+                time.sleep(max(WAIT.get(self._kind, 2.0), len(self._jobs) / LOOKS if self._kind == "slurm" else 0.0))
         found = self._answers.popleft()
         self._failed |= bool(found.error)
         return found

@@ -17,6 +17,7 @@ from mi_ntf.core.errors import MiNtfError
 from mi_ntf.evaluate.tradeoff import reading, references, report, search, state, study
 from mi_ntf.evaluate.tradeoff.points import Point
 from mi_ntf.evaluate.tradeoff.subject import Picture, Subject
+from mi_ntf.jobs import Workers
 
 SCENE = """<scene version="3.9.0">
     <default name="res" value="32"/>
@@ -284,3 +285,26 @@ def test_thumbnails_are_small_and_show_the_difference():
     assert thumbs.picture(reference).shape == (100, 66, 3)
     np.testing.assert_allclose(thumbs.picture(reference), report.BRIGHT)
     assert thumbs.difference(reference).max() < 10 < 200 < thumbs.difference(2 * reference).max()
+
+
+def test_workers_render_the_passes_of_the_reference(folder, tmp_path):
+    subject, picture = Subject(folder / "scene.xml", {"res": "16"}), Picture()
+    here = references.converge(subject, picture, 0.0, lambda text: None)
+    shared = references.converge(subject, picture, 0.0, lambda text: None, Workers("local", 2), tmp_path)
+    assert (shared.passes, shared.spp) == (here.passes, here.spp) == (4, 4)
+    assert abs(shared.image.mean() / here.image.mean() - 1) < 0.05 and shared.noise < 0.3
+    task = references.Pass(subject.path.absolute(), (("res", "16"),), VARIANT, picture, 2, references.FIRST_SEED + 7)
+    own = references.Renderer(subject, references.way(subject), picture)
+    np.testing.assert_array_equal(references.one_pass(task), own(2, references.FIRST_SEED + 7)[0])
+
+
+def test_points_are_measured_here_whoever_renders_the_reference(folder, tmp_path, monkeypatch):
+    chosen = []
+    image = np.ones((32, 32, 3), np.float32)
+    monkeypatch.setattr(references, "converge",
+                        lambda *a: chosen.append(a[4]) or references.Reference(image, 0.0, 4, 4, 1.0, "ones"))
+    monkeypatch.setattr(study.Study, "_search", lambda self: search.Search(self.subject.base, [], self.subject.limits,
+                                                                         lambda point: (0.0, 0.0), 1.0))
+    monkeypatch.setattr(references, "hold_against_stock", lambda *a: {"verdict": "none"})
+    study.tradeoff(folder / "scene.xml", tmp_path, {"res": "32"}, 5.0, quiet=True, workers=Workers("local", 2))
+    assert chosen == [Workers("local", 2)]

@@ -1,9 +1,11 @@
 """What points are held against: the same field by `raymarch` taken to convergence, itself held against stock `volpath`;
 and, where there is one, the path-traced mesh."""
 
+import contextlib
+import itertools
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,8 @@ import mitsuba as mi
 import numpy as np
 
 from ...core.errors import MiNtfError
+from ...jobs import Workers, each
+from ...render import register
 from ...render.cost.measurement import once
 from ...render.scene import changed
 from ..compare import read_image
@@ -109,8 +113,57 @@ def choose_picture(subject: Subject, seconds: float) -> tuple[Picture, str]:
                              "the seconds per sample, building the same. A larger --budget takes larger pictures.")
 
 
-def converge(subject: Subject, picture: Picture, seconds: float, tell: Callable[[str], None]) -> Reference:
-    """The field by `raymarch` until its noise is below `TARGET` or `seconds` are over, four passes at least."""
+@dataclass(frozen=True)
+class Pass:
+    """One pass of the reference of a scene file, for a worker."""
+
+    path: Path
+    parameters: tuple[tuple[str, str], ...]
+    variant: str
+    picture: Picture
+    spp: int
+    seed: int
+
+    @property
+    def subject(self) -> tuple:
+        """What it has in common with the others."""
+        return self.path, self.parameters, self.variant, self.picture
+
+
+_kept: list[tuple[tuple, Renderer]] = []
+"""Of this process, from pass to pass."""
+
+
+def one_pass(task: Pass) -> np.ndarray:
+    """Its picture (h, w, 3), in any process."""
+    if not _kept or _kept[0][0] != task.subject:
+        mi.set_variant(task.variant)
+        register()
+        subject = Subject(task.path, dict(task.parameters))
+        _kept[:] = [(task.subject, Renderer(subject, way(subject), task.picture))]
+    return _kept[0][1](task.spp, task.seed)[0]
+
+
+def _passes(render: Renderer, spp: int, subject: Subject, picture: Picture, workers: Workers,
+            folder: Path | None) -> Generator[np.ndarray, None, None]:
+    """Pictures of one seed after the other, by `render` here or by `workers`, without an end."""
+    if workers.here:
+        for seed in itertools.count(FIRST_SEED):
+            yield render(spp, seed)[0]
+    parameters = tuple(sorted(subject.parameters.items()))
+    tasks = [Pass(subject.path.absolute(), parameters, str(mi.variant()), picture, spp, FIRST_SEED + k)
+             for k in range(1 << 12)]
+    with contextlib.closing(each(one_pass, tasks, workers, title="passes", folder=folder, quiet=True)) as ends:
+        for done in ends:
+            if done.error:
+                raise MiNtfError(f"a pass of the reference failed: {done.error}")
+            yield done.value
+
+
+def converge(subject: Subject, picture: Picture, seconds: float, tell: Callable[[str], None],
+             workers: Workers = Workers(), folder: Path | None = None) -> Reference:  # noqa: B008
+    """The field by `raymarch` until its noise is below `TARGET` or `seconds` are over, four passes at least. The passes
+    are those of `workers`, `folder` for their files; how large one is, is measured here."""
     point = way(subject)
     start = time.perf_counter()
     render = Renderer(subject, point, picture)
@@ -118,24 +171,31 @@ def converge(subject: Subject, picture: Picture, seconds: float, tell: Callable[
     left = max(seconds - (time.perf_counter() - start), 0.0)
     spp = int((left / PASSES - fixed) / per_sample)
     spp = max(1, min(spp, LARGEST_PASS // render.pixels))
+    with contextlib.closing(_passes(render, spp, subject, picture, workers, folder)) as images:
+        found = _mean(images, spp, seconds, start, tell)
+    lights = f"{point.light_samples} drawn lights a point" if point.light_samples else "all lights"
+    found.about = (f"`raymarch`, {point.samples} steps, {lights}, {found.spp} samples a pixel in {found.passes} "
+                   f"passes, {found.seconds:.0f} s")
+    return found
+
+
+def _mean(images: Iterable[np.ndarray], spp: int, seconds: float, start: float,
+          tell: Callable[[str], None]) -> Reference:
+    """The mean of so many of `images`, of `spp` samples a pixel each, that it suffices. `start`: when it was begun."""
     total: Any = 0.0
     squares: Any = 0.0
-    count = 0
-    while True:
-        image, _ = render(spp, FIRST_SEED + count)
+    for count, image in enumerate(images, 1):
         image = image.astype(np.float64)
-        total, squares, count = total + image, squares + image**2, count + 1
-        if count < 4:
+        total, squares = total + image, squares + image**2
+        if count < PASSES:
             continue
         mean = total / count
         variance = max(float(np.mean(squares / count - mean**2)), 0.0) / (count - 1)
         found = Reference(mean.astype(np.float32), variance, count * spp, count, time.perf_counter() - start)
         tell(f"reference: {found.spp} samples a pixel, noise {found.noise:.2%}")
         if found.noise <= TARGET or found.seconds * (1 + 1 / count) > seconds:
-            lights = f"{point.light_samples} drawn lights a point" if point.light_samples else "all lights"
-            found.about = (f"`raymarch`, {point.samples} steps, {lights}, {found.spp} samples a pixel in {count} "
-                           f"passes, {found.seconds:.0f} s")
-            return found
+            break
+    return found
 
 
 def crop_of(image: np.ndarray, size: int = CROP) -> tuple[int, int, int, int]:

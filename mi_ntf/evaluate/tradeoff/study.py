@@ -14,6 +14,7 @@ from ... import __version__
 from ...core import files
 from ...core.errors import MiNtfError, sentence
 from ...infer.visibility import REGISTRY
+from ...jobs import Workers
 from ...render.cost import model
 from . import errors, reading, references, report
 from .measure import measure
@@ -46,9 +47,12 @@ def seconds(text: str) -> float:
 
 
 class Study:
-    """One run of the study. `tell` hears what is done."""
+    """One run of the study. `tell` hears what is done; `workers` render the passes of the reference. Points are
+    measured here, one after the other: beside others their seconds would be no measure."""
 
-    def __init__(self, subject: Subject, out: Path, budget: float, reference: Path | None, tell: Tell):
+    def __init__(self, subject: Subject, out: Path, budget: float, reference: Path | None, tell: Tell,
+                 workers: Workers = Workers()):  # noqa: B008
+        self._workers = workers
         self.subject, self.budget, self._tell = subject, budget, tell
         self.state = State(out, _key(subject, reference))
         self._mesh_path = reference or references.find_mesh(subject)
@@ -102,7 +106,7 @@ class Study:
             self.tell(about, True)
         self.picture = Picture(found["shrink"])
         self.reference = self._kept("reference", lambda: references.converge(
-            self.subject, self.picture, max(share - self.spent, 0.0), self.tell))
+            self.subject, self.picture, max(share - self.spent, 0.0), self.tell, self._workers, self.state.folder))
         if not self.state.one("check"):
             self.tell("the reference against stock volpath")
             check = self._add("check", **references.hold_against_stock(
@@ -201,22 +205,25 @@ class Study:
 
 
 def tradeoff(scene: Path, out: Path = Path("tradeoff"), parameters: dict[str, str] | None = None,
-             budget: float = 300.0, reference: Path | None = None, quiet: bool = False) -> dict[str, Any]:
+             budget: float = 300.0, reference: Path | None = None, quiet: bool = False,
+             workers: Workers = Workers()) -> dict[str, Any]:  # noqa: B008
     """Study `scene` (with `parameters` for its $names) for `budget` seconds and write ``index.html``, ``tradeoff.csv``
     and ``tradeoff.json`` to `out`, where an interrupted study of the same scene goes on.
 
     reference  the path-traced mesh: an EXR picture or the XML file of its scene; None: what shipped scenes have
     quiet      no progress on stderr
+    workers    who renders the passes of the reference; points are measured here
 
     Returns what ``tradeoff.json`` holds. Raises MiNtfError for what cannot be rendered, and KeyboardInterrupt as it
     comes, after the report of what is there.
     """
+    workers.check()
     subject = Subject(scene, parameters or {})
     if reference is not None and not reference.is_file():
         raise MiNtfError(f"reference {reference} does not exist; give an EXR picture or the XML file of a mesh scene")
     files.make_folder(out)
     with report.progress(budget, quiet) as tell:
-        study = Study(subject, out, budget, reference, tell)
+        study = Study(subject, out, budget, reference, tell, workers)
         try:
             study.run()
         finally:
