@@ -3,9 +3,11 @@
 import contextlib
 import itertools
 import logging
+import signal
+import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import distributed
@@ -53,9 +55,10 @@ class Dask:
         variables = Setup(self._threads).variables()
         back.enter_context(environment(variables))  # Dask sets them in this process, too, and leaves them
         # No limit of memory: the share that Dask would kill at is no measure of what a picture needs for a moment.
-        cluster = distributed.LocalCluster(
-            n_workers=workers.workers, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0",
-            memory_limit=0, env=variables)
+        with _ctrl_c_is_ours():
+            cluster = distributed.LocalCluster(
+                n_workers=workers.workers, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0",
+                memory_limit=0, env=variables)
         back.callback(cluster.close)
         return cluster
 
@@ -108,6 +111,19 @@ def try_task(work: bytes, index: int, task: Any, threads: int | None, devices: l
     worker: Any = distributed.get_worker()
     gpu = devices[int(worker.name) % len(devices)] if devices else None
     return attempt(Setup(threads or worker.state.nthreads, gpu), work, index, task, worker.address)
+
+
+@contextlib.contextmanager
+def _ctrl_c_is_ours() -> Iterator[None]:
+    """Within, processes are started that do not hear Ctrl-C: this one ends them, and they would all print frames."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _connect(address: Any) -> distributed.Client:
