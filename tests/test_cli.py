@@ -11,6 +11,7 @@ from helpers.programs import run_program
 from mi_ntf import cli, doctor
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.evaluate.tradeoff.study import seconds
+from mi_ntf.jobs import Workers
 
 
 @pytest.fixture
@@ -48,12 +49,14 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list:
         (
             "capture s.xml data --views 7 --size 32",
             (Path("s.xml"), Path("data")),
-            {"views": 7, "size": 32, "test_views": 20, "spp": 64, "seed": 0, "flash_offset": (0.0, 0.0, 0.0)},
+            {"views": 7, "size": 32, "test_views": 20, "spp": 64, "seed": 0, "flash_offset": (0.0, 0.0, 0.0),
+             "workers": Workers()},
         ),
         (
             "capture s.xml data --flash-offset=-1,2e-1,0",
             (Path("s.xml"), Path("data")),
-            {"views": 100, "size": 128, "test_views": 20, "spp": 64, "seed": 0, "flash_offset": (-1.0, 0.2, 0.0)},
+            {"views": 100, "size": 128, "test_views": 20, "spp": 64, "seed": 0, "flash_offset": (-1.0, 0.2, 0.0),
+             "workers": Workers()},
         ),
         (
             "train data -o f.safetensors --minutes 2.5",
@@ -103,8 +106,11 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list:
         ("compare a.exr b.exr -o c.png", (Path("a.exr"), Path("b.exr"), Path("c.png")), {}),
         ("explain s.xml -D spp=4 -D light=env", (Path("s.xml"), {"spp": "4", "light": "env"}, False), {}),
         ("explain s.xml --measure", (Path("s.xml"), {}, True), {}),
-        ("tradeoff s.xml -D a=4 --budget 2m", (Path("s.xml"), Path("tradeoff"), {"a": "4"}, 120.0, None, False), {}),
-        ("tradeoff s.xml -o d --reference m.xml", (Path("s.xml"), Path("d"), {}, 300.0, Path("m.xml"), False), {}),
+        ("tradeoff s.xml -D a=4 --budget 2m", (Path("s.xml"), Path("tradeoff"), {"a": "4"}, 120.0, None, False),
+         {"workers": Workers()}),
+        ("tradeoff s.xml -o d --reference m.xml --engine dask --scheduler tcp://a:8786 --threads 2",
+         (Path("s.xml"), Path("d"), {}, 300.0, Path("m.xml"), False),
+         {"workers": Workers("dask", None, 2, "tcp://a:8786")}),
         ("info f.safetensors", (Path("f.safetensors"),), {}),
     ],
 )
