@@ -389,12 +389,14 @@ class Sequence_:
     """Render nothing; name the frames that are missing, broken or of other parameters (exit code 1)."""
     mode: Annotated[str, arg(aliases=("-m",), metavar="VARIANT")] = ""
     """Mitsuba's variant; the first available of cuda_ad_rgb and llvm_ad_rgb unless given."""
+    workers: Shared = field(default_factory=Workers)
     json: bool = False
     """Print JSON in place of a summary, and no progress."""
 
     def run(self) -> int:
         if self.timeline is not None and self.parameters is not None:
             raise UsageError("give --timeline or --parameters, not both")
+        _fitting(self.workers)
         fixed = _definitions(self.define)
         from mi_ntf.sequence import command
 
@@ -416,7 +418,7 @@ class Sequence_:
                 print(f"mi-ntf: {text}", file=sys.stderr)
             return 1 if faults else 0
         film = (self.film, line.fps, self.exposure) if self.film else None
-        _report(command.run(tasks, quiet=self.json, film=film), self.json, command.print_summary)
+        _report(command.run(tasks, quiet=self.json, film=film, workers=self.workers), self.json, command.print_summary)
         return 0
 
 

@@ -4,6 +4,7 @@ import re
 import sys
 import time
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import numpy as np
 
 from ..core import files
 from ..core.errors import MiNtfError
+from ..jobs import Workers, each
 from . import film as films
 from . import image_file, parameters, timeline
 from .timeline import Frame, Timeline
@@ -60,11 +62,11 @@ def faults(found: dict[str, Any]) -> list[str]:
 
 
 def run(tasks: list[Task], work: Callable[[Task], dict[str, Any]] = render, quiet: bool = False,
-        film: tuple[Path, float, float] | None = None) -> dict[str, Any]:
-    """Make what is not there yet by `work`, one image after the other, and at the end the `film`: file, frames a
-    second, stops of exposure (:mod:`mi_ntf.sequence.film`). Returns ``images``, ``kept`` (there before),
-    ``rendered``, ``seconds`` of all, ``first`` and ``each``, the median of the others. What is there, but broken or of
-    other parameters, is said and made anew. Raises MiNtfError."""
+        film: tuple[Path, float, float] | None = None, workers: Workers = Workers()) -> dict[str, Any]:  # noqa: B008
+    """Make what is not there yet by `work`, one image after the other or by several `workers`, and at the end the
+    `film`: file, frames a second, stops of exposure (:mod:`mi_ntf.sequence.film`). Returns ``images``, ``kept`` (there
+    before), ``rendered``, ``seconds`` of all, ``first`` and ``each``, the median of the others. What is there, but
+    broken or of other parameters, is said and made anew. Raises MiNtfError."""
     begin = time.perf_counter()
     if film:
         films.check(film[0])
@@ -79,10 +81,12 @@ def run(tasks: list[Task], work: Callable[[Task], dict[str, Any]] = render, quie
                 again.append(wrong[1])
     for text in again:
         print(f"mi-ntf: made anew: {text}", file=sys.stderr)
-    seconds = []
-    with _bar(quiet or not todo, len(tasks)) as advance:
-        advance(len(tasks) - len(todo))
-        for task in todo:
+    workers.check()
+    seconds = [] if workers.here else _shared(todo, work, workers, quiet)
+    todo_here = todo if workers.here else []
+    with _bar(quiet or not todo_here, len(tasks)) as advance:
+        advance(len(tasks) - len(todo_here))
+        for task in todo_here:
             seconds.append(work(task)["seconds"])
             _join(task)
             advance(1)
@@ -92,6 +96,28 @@ def run(tasks: list[Task], work: Callable[[Task], dict[str, Any]] = render, quie
             "rendered": len(todo), "seconds": time.perf_counter() - begin,
             "first": seconds[0] if seconds else None,
             "each": float(np.median(seconds[1:])) if seconds[1:] else None, "each_of": seconds} | shown
+
+
+def _shared(tasks: list[Task], work: Callable[[Task], dict[str, Any]], workers: Workers, quiet: bool) -> list[float]:
+    """Seconds of the images, made by `workers`, in the order in which they came. Raises MiNtfError where some fail,
+    after the others."""
+    if not tasks:
+        return []
+    folder = Path(tasks[0].folder).absolute()
+    sent = [replace(t, scene=str(Path(t.scene).absolute()), folder=str(folder)) for t in tasks]
+    names = [t.path.name for t in tasks]
+    seconds, failed = [], []
+    with closing(each(work, sent, workers, title="frames", names=names, folder=folder, quiet=quiet)) as ends:
+        for done in ends:
+            if done.error:
+                failed.append(done.error)
+            else:
+                seconds.append(done.value["seconds"])
+                _join(tasks[done.index])
+    if failed:
+        raise MiNtfError(f"{len(failed)} of {len(tasks)} images failed, the others are done: {'; '.join(failed[:3])}. "
+                         "Run the same command again once that is mended")
+    return seconds
 
 
 def print_summary(found: dict[str, Any]) -> None:
