@@ -55,10 +55,14 @@ class Dask:
         variables = Setup(self._threads).variables()
         back.enter_context(environment(variables))  # Dask sets them in this process, too, and leaves them
         # No limit of memory: the share that Dask would kill at is no measure of what a picture needs for a moment.
-        with _ctrl_c_is_ours():
-            cluster = distributed.LocalCluster(
-                n_workers=workers.workers, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0",
-                memory_limit=0, env=variables)
+        try:
+            with _ctrl_c_is_ours():
+                cluster = distributed.LocalCluster(
+                    n_workers=workers.workers, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0",
+                    memory_limit=0, env=variables)
+        except RuntimeError as error:
+            raise MiNtfError(f"the Dask cluster of this machine did not start ({error}); a script that starts one needs "
+                             "to be a file that begins its work below `if __name__ == '__main__':`") from None
         back.callback(cluster.close)
         return cluster
 
