@@ -61,8 +61,8 @@ class Dask:
                     n_workers=workers.workers, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0",
                     memory_limit=0, env=variables)
         except RuntimeError as error:
-            raise MiNtfError(f"the Dask cluster of this machine did not start ({error}); a script that starts one needs "
-                             "to be a file that begins its work below `if __name__ == '__main__':`") from None
+            raise MiNtfError(f"the Dask cluster of this machine did not start ({error}); a script that starts one must "
+                             "be a file that begins its work below `if __name__ == '__main__':`") from None
         back.callback(cluster.close)
         return cluster
 
