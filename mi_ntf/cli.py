@@ -377,6 +377,12 @@ class Sequence_:
         default_factory=tuple
     )
     """Value of $KEY in all frames."""
+    env: Annotated[Path | None, arg(metavar="FILE")] = None
+    """Latitude-longitude image in place of the environment's."""
+    env_rotate: Annotated[float, arg(metavar="DEG")] = 0.0
+    """Turn the environment about the world's up axis, further than scene and timeline do."""
+    env_scale: Annotated[float, arg(metavar="S")] = 1.0
+    """Factor of the environment's radiance."""
     shard: Annotated[str, arg(metavar="i/n")] = "1/1"
     """Render the i-th of n shards, counted from 1."""
     lights: Annotated[int, arg(metavar="N")] = 1
@@ -398,6 +404,7 @@ class Sequence_:
             raise UsageError("give --timeline or --parameters, not both")
         _fitting(self.workers)
         fixed = _definitions(self.define)
+        from mi_ntf.render.scene.environment_option import Environment
         from mi_ntf.sequence import command
 
         try:
@@ -409,7 +416,8 @@ class Sequence_:
         if self.lights < 1:
             raise UsageError(f"--lights is {self.lights}, expected the number of parts, 1 or more")
         line = command.frames_of(self.timeline, self.parameters, fixed)
-        tasks = command.tasks_of(self.scene, self.output, line.frames, self.lights, self.mode)[i - 1 :: n]
+        environment = Environment(self.env, self.env_rotate, self.env_scale)
+        tasks = command.tasks_of(self.scene, self.output, line.frames, self.lights, self.mode, environment)[i - 1 :: n]
         if self.check:
             found = command.check(tasks)
             faults = command.faults(found)

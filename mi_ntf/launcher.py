@@ -110,8 +110,6 @@ def render_file(path: Path, parameters: dict[str, str], *, sensor_index: int = 0
     Raises MiNtfError if the scene cannot be rendered.
     """
     scene = scene_file.load(path, parameters, environment, seen)
-    if not isinstance(scene, mi.Scene):
-        raise MiNtfError(f"{path}: the root element must be a <scene>")
     if not 0 <= sensor_index < len(scene.sensors()):
         raise MiNtfError(f"{path} has {len(scene.sensors())} sensors, so there is no sensor {sensor_index}")
     if scene.integrator() is None:

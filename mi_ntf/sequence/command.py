@@ -14,6 +14,7 @@ import numpy as np
 from ..core import files
 from ..core.errors import MiNtfError
 from ..jobs import Workers, each
+from ..render.scene.environment_option import Environment
 from . import film as films
 from . import image_file, parameters, timeline
 from .timeline import Frame, Timeline
@@ -36,9 +37,10 @@ def frames_of(line: Path | None, table: Path | None, fixed: dict[str, str]) -> T
     return parameters.read(table, fixed) if table is not None else Timeline([Frame(0, dict(fixed))])
 
 
-def tasks_of(scene: Path, folder: Path, frames: list[Frame], parts: int = 1, variant: str = "") -> list[Task]:
+def tasks_of(scene: Path, folder: Path, frames: list[Frame], parts: int = 1, variant: str = "",
+             environment: Environment | None = None) -> list[Task]:
     """One for each image of the sequence, frame by frame."""
-    return [Task(str(scene), str(folder), frame, len(frames), part, parts, variant)
+    return [Task(str(scene), str(folder), frame, len(frames), part, parts, variant, environment)
             for frame in frames for part in range(parts)]
 
 

@@ -19,7 +19,8 @@ from .. import __version__, bridge
 from ..core.errors import MiNtfError, sentence
 from ..launcher import VARIANT_PRIORITY
 from ..render.maps import map_cache
-from ..render.scene import changed
+from ..render.scene import changed, environment_option
+from ..render.scene.environment_option import Environment
 from ..render.scene.settings import Limits
 from . import changes, image_file
 from .timeline import Frame
@@ -28,7 +29,8 @@ from .timeline import Frame
 @dataclass(frozen=True)
 class Task:
     """Render `frame`, one of `count`, of the XML file `scene` into `folder`; of its lights the `part` of `parts`.
-    `variant`: "" for the one that is set, or else the first that this machine can run."""
+    `variant`: "" for the one that is set, or else the first that this machine can run. `environment` is laid over the
+    scene's own, before the frame changes it."""
 
     scene: str
     folder: str
@@ -37,6 +39,7 @@ class Task:
     part: int = 0
     parts: int = 1
     variant: str = ""
+    environment: Environment | None = None
 
     @property
     def path(self) -> Path:
@@ -105,6 +108,7 @@ def _parsed(task: Task):
         raise MiNtfError(f"scene {scene} does not exist")
     with changed.beside(scene):
         state = changed.parsed(scene, task.frame.parameters)
+        environment_option.apply(task.environment or Environment(), state, scene)
         changes.apply(state.nodes, task.frame)
         digest = hashlib.sha256(json.dumps([__version__, mi.__version__, task.frame.told()]).encode())
         digest.update(mi.parser.write_string(state).encode())

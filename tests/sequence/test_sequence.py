@@ -73,6 +73,10 @@ def test_an_environment_turns_as_its_to_world_does(scene, tmp_path):
         work.render(task)
     still, turned, around = (pixels(tmp_path / f"out/frame_000{i}.exr") for i in range(3))
     np.testing.assert_allclose(around, still, atol=1e-4)
+    words = ("sequence", path, "-o", tmp_path / "laid", "--env-rotate", "90", "--env-scale", "2", "-m", mi.variant())
+    assert cli.main([str(word) for word in words]) == 0
+    laid = pixels(tmp_path / "laid/frame_0000.exr")
+    np.testing.assert_allclose(laid[..., :3], 2 * turned[..., :3], atol=1e-4 * laid.max())  # turned in two precisions
     assert np.abs(turned - still).max() > 0.05
     path.write_text(path.read_text().replace('value="sky.exr"/>', 'value="sky.exr"/><transform name="to_world">'
                                              '<rotate y="1" angle="90"/></transform>'))

@@ -7,7 +7,7 @@ from typing import Any, cast
 import mitsuba as mi
 
 from ...core.errors import MiNtfError
-from . import environment_option
+from . import changed, environment_option
 from .environment_option import Environment
 
 FILES = ("filename", "map_file")
@@ -16,7 +16,7 @@ FILES = ("filename", "map_file")
 
 def load(path: Path, parameters: dict[str, str], environment: Environment | None = None,
          seen: Callable[[Path], None] | None = None) -> Any:
-    """What the XML file `path` describes in the current variant, `parameters` for its $names: a scene, as a rule.
+    """The scene of the XML file `path` in the current variant, `parameters` for its $names.
 
     `environment` is laid over the scene's own (:class:`Environment`). `seen` is called with each file that the scene
     reads as soon as it is known, in most cases before it is read: the XML file, its includes, fields, images, meshes.
@@ -28,25 +28,14 @@ def load(path: Path, parameters: dict[str, str], environment: Environment | None
     seen(path.resolve())
     if not path.is_file():
         raise MiNtfError(f"scene {path} does not exist")
-    variant = mi.variant()
-    assert variant is not None
-    config = mi.parser.ParserConfig(variant)
-    mitsuba = cast(Any, mi)  # its stub takes these functions for objects
-    before = mitsuba.file_resolver()
-    resolver = mi.FileResolver(before)
-    resolver.prepend(str(path.parent))
-    mitsuba.set_file_resolver(resolver)
-    try:
-        state = mi.parser.parse_file(config, str(path), **parameters)
+    with changed.beside(path):
+        state = changed.parsed(path, parameters)
         for name in state.files:
             seen(Path(str(name)).resolve())
         environment_option.apply(environment or Environment(), state, path)
         for file in _named(state):
             seen(file)
-        mi.parser.transform_all(config, state)
-        return mi.parser.instantiate(config, state)
-    finally:
-        mitsuba.set_file_resolver(before)
+        return changed.instantiated(path, state)
 
 
 def _named(state) -> set[Path]:
