@@ -310,6 +310,32 @@ class Reproduce:
 
 
 @dataclass
+class View:
+    """Show a scene in a browser: orbit, drag lights, turn environments, compare methods, save what was changed."""
+
+    scene: Positional[Path]
+    """Scene with an nrf medium and integrator."""
+    define: Annotated[UseAppendAction[tuple[str, ...]], arg(aliases=("-D",), metavar="KEY=VALUE")] = field(
+        default_factory=tuple
+    )
+    """Value of $KEY in the scene."""
+    size: int = 256
+    """The picture has about SIZE² pixels."""
+    samples: int = 64
+    """Samples a pixel of a picture at rest."""
+    host: str = "127.0.0.1"
+    """Address to serve; 0.0.0.0: to everyone who reaches this machine."""
+    port: int = 8080
+    """Port to serve at; a later one if it is taken."""
+
+    def run(self) -> None:
+        parameters = _definitions(self.define)
+        from mi_ntf.view import view
+
+        view(self.scene, parameters, self.size, self.samples, self.host, self.port)
+
+
+@dataclass
 class Bake:
     """Write the transmittance maps of a scene's lights, one part of an EXR file each."""
 
@@ -371,6 +397,7 @@ Command = (
     | Annotated[Bench, subcommand("bench")]
     | Annotated[Tradeoff, subcommand("tradeoff")]
     | Annotated[Reproduce, subcommand("reproduce")]
+    | Annotated[View, subcommand("view")]
     | Annotated[Bake, subcommand("bake")]
     | Annotated[Info, subcommand("info")]
     | Annotated[Doctor, subcommand("doctor")]

@@ -23,6 +23,7 @@ MITSUBA = "3.9.1"
 LLVM_MINIMUM = 17
 EXTRAS = {
     "train": ("torch", "tensorboard", "matplotlib", "PIL", "cv2"),
+    "view": ("viser",),
     "eval": ("skimage", "flip_evaluator", "matplotlib", "PIL"),
 }
 """Extras of this package and the modules that they bring."""

@@ -24,6 +24,7 @@ MAY_IMPORT = {
     "data": {"core", "data"},
     "train": {"core", "data", "train"},
     "evaluate": {"core", "infer", "render", "data", "evaluate"},
+    "view": {"core", "infer", "render", "evaluate", "view"},
 }
 """Which folders of the package a folder may import."""
 
@@ -37,6 +38,7 @@ FORBIDDEN = {
     "train": RENDERER,
     # Metrics that live in PyTorch are offered where it is installed; the demo does without.
     "evaluate": set(),
+    "view": TORCH,
 }
 """Third parties that a folder must not import, not even inside a function."""
 

@@ -91,6 +91,7 @@ def _look(emitter, p: np.ndarray):
     """Direction towards `emitter` (1, 3), its weight (1, 3) and distance, sampled at the scene point `p`."""
     it = dr.zeros(mi.Interaction3f)
     it.p = mi.Point3f(p.tolist())
+    dr.make_opaque(it.p)  # or every place of a light would be compiled anew
     ds, weight = emitter.sample_direction(it, mi.Point2f(0.5), True)
     to_host = (np.array(v, np.float64).reshape(1, 3) for v in (ds.d, weight))
     return *to_host, float(np.ravel(ds.dist)[0])

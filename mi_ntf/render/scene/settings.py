@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 class Settings:
     """As in the plugin's table, and what is left out of what the scene calls for: `specular`, whether specular lobes
     take part; `dimmest`, share of all light that the dimmest lights have which do not; `without`, numbers of the media
-    that do not."""
+    that do not; `only`, numbers of the emitters that shine, None: all (of a scene without surfaces)."""
 
     visibility: str
     samples: int
@@ -25,6 +25,7 @@ class Settings:
     specular: bool = True
     dimmest: float = 0.0
     without: tuple[int, ...] = ()
+    only: tuple[int, ...] | None = None
 
     @classmethod
     def of(cls, integrator) -> "Settings":
