@@ -35,13 +35,14 @@ def pose_of(sensor, parameters: Parameters, center: np.ndarray) -> Pose:
     """That of a sensor; its target is the point of its axis that is nearest to `center`. Raises MiNtfError where it is
     no camera with a pinhole or a lens."""
     if sensor.class_name() not in KINDS:
-        raise MiNtfError(f"the scene's sensor is {sensor.class_name()}; mi-ntf view turns perspective and thinlens ones")
+        raise MiNtfError(f"the scene's sensor is {sensor.class_name()}; mi-ntf view turns perspective and thinlens "
+                         "ones")
     matrix = numbers(parameters.get(sensor, "to_world"))
     origin, forward, up = matrix[:3, 3], _unit(matrix[:3, 2]), _unit(matrix[:3, 1])
     away = max(float((center - origin) @ forward), 1e-3)
     width, height = (int(n) for n in sensor.film().crop_size())
     fov = fov_of_height(float(numbers(parameters.get(sensor, "x_fov"))[0]), width / height)
-    return Pose(_three(origin), _three(origin + away * forward), _three(up), fov)
+    return Pose(three(origin), three(origin + away * forward), three(up), fov)
 
 
 def fov_of_height(x_fov: float, aspect: float) -> float:
@@ -65,5 +66,6 @@ def _unit(v) -> np.ndarray:
     return np.asarray(v, np.float64) / max(float(np.linalg.norm(v)), 1e-12)
 
 
-def _three(v) -> tuple[float, float, float]:
+def three(v) -> tuple[float, float, float]:
+    """As plain numbers."""
     return float(v[0]), float(v[1]), float(v[2])

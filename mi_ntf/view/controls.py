@@ -1,5 +1,6 @@
 """A view's controls in a browser (viser): nothing is fetched from, or shared with, another machine."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -9,13 +10,13 @@ import viser
 from mi_ntf.infer.visibility import names
 
 from . import environments
-from .camera import Pose
+from .camera import Pose, three
 from .lights import Light
 from .save import save
 from .session import SEEN, Session
 from .viewer import Viewer
 
-LIGHT = "light"
+LIGHT, NOTHING = "light", "–"
 JPEG = 90
 
 
@@ -77,8 +78,8 @@ class Controls:
         turn = viser.transforms.SO3(np.array(view.wxyz)).as_matrix()
         position, aspect = np.array(view.position, np.float64), float(view.aspect)
         away = float(np.linalg.norm(np.array(view.look_at) - position))
-        pose = Pose(*(tuple(float(c) for c in v) for v in (position, position + away * turn[:, 2], -turn[:, 1])),
-                    float(np.degrees(view.fov)))  # type: ignore[arg-type]
+        pose = Pose(three(position), three(position + away * turn[:, 2]), three(-turn[:, 1]),
+                    float(np.degrees(view.fov)))
 
         def do() -> None:
             size = self.session.edge
@@ -97,41 +98,48 @@ class Controls:
                                    hint="2: light scatters once; more of it when the picture rests")
             shown = gui.add_dropdown("shown", (LIGHT, *SEEN), initial_value=LIGHT)
             stops = gui.add_slider("exposure", -6.0, 6.0, 0.1, 0.0, hint="stops")
-            other = gui.add_dropdown("compared with", ("–", *names()), initial_value="–")
+            other = gui.add_dropdown("compared with", (NOTHING, *names()), initial_value=NOTHING)
             share = gui.add_slider("split", 0.0, 1.0, 0.01, 0.5)
             error = gui.add_button("Error against raymarch")
-        visibility.on_update(lambda _: viewer.change("visibility", lambda v=visibility.value: session.choose(v)))
-        depth.on_update(lambda _: viewer.change("depth", lambda v=int(depth.value): session.choose(max_depth=v)))
-        shown.on_update(lambda _: viewer.change(
-            "shown", lambda v=shown.value: session.choose(shown="" if v == LIGHT else v)))
-        other.on_update(lambda _: viewer.change(
-            "other", lambda v=other.value: session.choose(other="" if v == "–" else v)))
-        stops.on_update(lambda _: viewer.change("stops", lambda v=stops.value: setattr(viewer, "stops", v), "shown"))
-        share.on_update(lambda _: viewer.change("share", lambda v=share.value: setattr(viewer, "share", v), "shown"))
+        self._link(visibility, "visibility", lambda v: session.choose(visibility=v))
+        self._link(depth, "depth", lambda v: session.choose(max_depth=int(v)))
+        self._link(shown, "shown", lambda v: session.choose(shown="" if v == LIGHT else v))
+        self._link(other, "other", lambda v: session.choose(other="" if v == NOTHING else v))
+        self._link(stops, "stops", lambda v: setattr(viewer, "stops", v), "shown")
+        self._link(share, "share", lambda v: setattr(viewer, "share", v), "shown")
         error.on_click(lambda _: viewer.change("error", self._measure, "shown"))
+
+    def _link(self, handle: Any, name: str, do: Callable[[Any], Any], kind: str = "other") -> None:
+        """`do` with the value of a control whenever it has another."""
+
+        def update(event) -> None:
+            if event.client is not None:  # not where this program set it
+                value = handle.value
+                self.viewer.change(name, lambda: do(value), kind)
+
+        handle.on_update(update)
 
     def _measure(self) -> None:
         found = ", ".join(f"{100 * e:.2f} %" for e in self.session.error())
         self._tell(f"Relative RMSE against raymarch: {found}")
 
     def _light_folder(self, light: Light) -> None:
-        gui, viewer = self.server.gui, self.viewer
-        name = f"{light.number} {light.kind}"
+        gui, name = self.server.gui, f"{light.number} {light.kind}"
         if light.can_move or light.can_point:
             self._gizmo(light, name)
         if not (light.can_move or light.can_turn or light.can_dim):
             return
         with gui.add_folder(name):
             if light.can_move:
-                place = gui.add_vector3("position", tuple(float(c) for c in light.position), step=0.01)
-                place.on_update(lambda event: event.client and self._typed(light, place.value))
+                place = gui.add_vector3("position", three(light.position), step=0.01)
+                self._link(place, f"light {name}", lambda v: self._typed(light, v), "light")
                 self.gizmos[light.number].place = place
             if light.can_turn:
                 turn = gui.add_slider("rotation", -180.0, 180.0, 1.0, 0.0, hint="degrees about the camera's up axis")
-                turn.on_update(lambda _: viewer.change(f"turn {name}", lambda v=turn.value: light.turn(v), "light"))
+                self._link(turn, f"turn {name}", light.turn, "light")
             if light.can_dim:
                 dim = gui.add_slider("brightness", -4.0, 4.0, 0.1, 0.0, hint="stops")
-                dim.on_update(lambda _: viewer.change(f"dim {name}", lambda v=dim.value: light.dim(2.0**v), "light"))
+                self._link(dim, f"dim {name}", lambda v: light.dim(2.0**v), "light")
 
     def _gizmo(self, light: Light, name: str) -> None:
         """Handles at a light, or, of one from far away, beside the fields."""
@@ -155,13 +163,13 @@ class Controls:
             light.move(position)
             place = self.gizmos[light.number].place
             if place is not None:
-                place.value = tuple(float(c) for c in position)
+                place.value = three(position)
         if light.can_point:
             light.point(viser.transforms.SO3(wxyz).as_matrix()[:, 2])
 
     def _typed(self, light: Light, value) -> None:
+        light.move(value)
         self.gizmos[light.number].controls.position = value
-        self.viewer.change(f"light {light.number}", lambda: light.move(value), "light")
 
     def _environments(self) -> None:
         """A choice of files for the environment: those beside its own."""
@@ -211,5 +219,5 @@ class Controls:
 class _Gizmo:
     """The handles of a light, and the numbers that show its place, if there are any."""
 
-    def __init__(self, controls):
-        self.controls, self.place = controls, None
+    def __init__(self, controls: Any):
+        self.controls, self.place = controls, None  # type: Any, Any

@@ -104,7 +104,8 @@ class Light:
     def dim(self, brightness: float) -> None:
         """Let it emit `brightness` times what it does in the scene."""
         self.brightness = float(brightness)
-        power = self._power * self.brightness
+        power = self.power
+        assert power is not None  # see can_dim
         self._set(POWER[self.emitter.class_name()], power if len(power) > 1 else float(power[0]))
 
     def _get(self, name: str):
@@ -125,6 +126,6 @@ def rotation(axis: np.ndarray, degrees: float) -> np.ndarray:
     """(4, 4), by the right hand about the unit vector `axis` (Rodrigues)."""
     angle, k = np.radians(degrees), np.cross(np.eye(3), axis)
     matrix = np.eye(4)
-    matrix[:3, :3] -= np.sin(angle) * k
+    matrix[:3, :3] += np.sin(angle) * k
     matrix[:3, :3] += (1 - np.cos(angle)) * k @ k
     return matrix

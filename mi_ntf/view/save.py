@@ -98,7 +98,7 @@ def _write_pose(root: ET.Element, session: Session) -> None:
     if sensor is None:
         raise MiNtfError(f"{session.path} has no <sensor> at its top level, so the camera cannot be saved")
     pose, transform = session.pose, ET.Element("transform", name="to_world")
-    ET.SubElement(transform, "lookat", **{
+    ET.SubElement(transform, "lookat", {
         name: ", ".join(map(_text, value))
         for name, value in (("origin", pose.origin), ("target", pose.target), ("up", pose.up))})
     _replace(sensor, ("to_world",), transform)

@@ -55,6 +55,9 @@ class Session:
         self.stop: Callable[[], bool] = lambda: False
         self.shown, self.other = "", ""
         self.environment: Path | None = None
+        self._passes, self._samples = 0, 0
+        self._sums: list[np.ndarray] = []
+        self._versions: dict[int, int] = {}  # of the lights, as they were rendered last
         self._load(load_scene(self.path, self.define))
         self.center = np.mean([m.frame.origin for m in self.media], axis=0)
         self.pose = self.opened = camera.pose_of(self.sensor, self.parameters, self.center)
@@ -120,7 +123,7 @@ class Session:
         start = time.perf_counter()
         self._place(self.size)
         images = [self._image(p, self._passes, spp, False) for p in self._finals]
-        if self._sums is None:
+        if not self._sums:
             self._sums = [np.zeros_like(image) for image in images]
         for total, image in zip(self._sums, images, strict=True):
             total += spp * image
@@ -146,12 +149,15 @@ class Session:
     def _image(self, picture: Picture, seed: int, spp: int, keep: bool) -> np.ndarray:
         picture.stop = (lambda: False) if keep else self.stop
         rays = self.pose, tuple(int(n) for n in self.sensor.film().crop_size())
-        versions = {light.number: light.version for light in self.lights}
-        image = picture.image(self.sensor, rays, versions, seed, spp, keep)
+        image = picture.image(self.sensor, rays, self._versions, seed, spp, keep)
         return image[..., -len(CHANNELS[self.shown]):] if self.shown else image
 
     def _place(self, size: tuple[int, int]) -> None:
         camera.place(self.sensor, self.parameters, self.pose, size)
+        versions = {light.number: light.version for light in self.lights}
+        if versions != self._versions:
+            self._versions = versions
+            self._reset()
         for light in self.lights:
             if light.moved and light.number in self._common:  # rebuilt once without it
                 self._common.remove(light.number)
@@ -192,5 +198,4 @@ class Session:
 
     def _reset(self) -> None:
         """Passes begin anew."""
-        self._passes, self._samples = 0, 0
-        self._sums: list[np.ndarray] | None = None
+        self._passes, self._samples, self._sums = 0, 0, []

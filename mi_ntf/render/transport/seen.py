@@ -1,5 +1,5 @@
-"""What camera rays meet in the fields, kept for renders in which lights alone differ: most of a preview's time goes into
-finding that."""
+"""What camera rays meet in the fields, kept for renders in which lights alone differ: finding it takes most of a
+preview's time."""
 
 from collections.abc import Callable
 from typing import Any
