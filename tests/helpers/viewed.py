@@ -5,6 +5,7 @@ SCENE = """<scene version="3.9.0">
     <integrator type="nrf">
         <string name="visibility" value="$visibility"/>
         <integer name="map_resolution" value="48"/>
+        <integer name="environment_lights" value="16"/>
         <boolean name="hide_emitters" value="true"/>
     </integrator>
     <sensor type="perspective">
