@@ -104,6 +104,8 @@ class Train:
     """Field file to keep; its transmittance networks alone are trained, anew."""
     tensorboard: Path | None = None
     """Folder for TensorBoard events: losses, validation, speed, preview pictures."""
+    view: bool = False
+    """Show the field in a browser while it learns; needs the extra `view`."""
     json: bool = False
     """Print the whole report as JSON in place of a summary."""
 
@@ -120,7 +122,7 @@ class Train:
                        augmentation=not self.no_augmentation, colour_loss=not self.no_colour_loss,
                        reading=reading, estimate=estimate, gains=not self.no_gains,
                        visibility_mlp=self.visibility_mlp, bounces=not self.no_bounces,
-                       fresnel=not self.no_fresnel)
+                       fresnel=not self.no_fresnel, view=self.view)
         if report:  # under torchrun, only the first process has one
             _report(report, self.json, _print_training)
 

@@ -15,7 +15,7 @@ def view(scene: Path, define: dict[str, str], size: int = 256, samples: int = 64
     number is out of range, and where rendering would.
     """
     if importlib.util.find_spec("viser") is None:
-        raise MiNtfError("mi-ntf view needs the package viser; run pip install 'mi-ntf[view]'")
+        raise MiNtfError("a view needs the package viser; run pip install 'mi-ntf[view]'")
     for name, value, most in (("size", size, 4096), ("samples", samples, 65536), ("port", port, 65535)):
         if not 1 <= value <= most:
             raise MiNtfError(f"--{name} is {value}, expected 1 to {most}")

@@ -8,6 +8,7 @@ import numpy as np
 import viser
 
 from mi_ntf.infer.visibility import names
+from mi_ntf.page_server import serve
 
 from . import environments
 from .camera import Pose, three
@@ -20,24 +21,14 @@ LIGHT, NOTHING = "light", "–"
 JPEG = 90
 
 
-class Server(viser.ViserServer):
-    """viser's server, which offers its users a public address by way of a company's machines: not here."""
-
-    def request_share_url(self, verbose: bool = True) -> None:
-        """None, whoever asks."""
-
-
 class Controls:
     """The page of `session` at `host`:`port`, or the next port that is free; ``url`` says where."""
 
     def __init__(self, session: Session, host: str = "127.0.0.1", port: int = 8080, samples: int = 64):
         self.session = session
-        self.server = Server(host=host, port=port, label=f"mi-ntf: {session.path.name}", verbose=False)
-        self.url = f"http://{host}:{self.server.get_port()}"
+        self.server, self.url = serve(f"mi-ntf: {session.path.name}", host, port)
         self.viewer = Viewer(session, self._show, self._tell, samples)
         self.gizmos: dict[int, Any] = {}
-        self.server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
-        self.server.gui.main_panel.dock_right()
         self._camera()
         self._picture_folder()
         for light in session.lights:

@@ -77,7 +77,7 @@ def test_a_light_is_dragged(page, served, tmp_path):
 
     pose, canvas = Session(path, {}, 32).pose, page.locator("canvas").first.bounding_box()
     light = np.array([0.9, 0.5, 1.8])
-    x, y = on_screen(canvas, pose, light + [0.4, 0, 0])
+    x, y = on_screen(canvas, pose, light + np.array([0.4, 0, 0]))
     page.mouse.move(x, y)
     time.sleep(0.3)
     page.mouse.down()
