@@ -109,6 +109,8 @@ class Train:
     """Field file to keep; its transmittance networks alone are trained, anew."""
     tensorboard: Path | None = None
     """Folder for TensorBoard events: losses, validation, speed, preview pictures."""
+    view: bool = False
+    """Show the field in a browser while it learns; needs the extra `view`."""
     json: bool = False
     """Print the whole report as JSON in place of a summary."""
 
@@ -125,7 +127,7 @@ class Train:
                        augmentation=not self.no_augmentation, colour_loss=not self.no_colour_loss,
                        reading=reading, estimate=estimate, gains=not self.no_gains,
                        visibility_mlp=self.visibility_mlp, bounces=not self.no_bounces,
-                       fresnel=not self.no_fresnel)
+                       fresnel=not self.no_fresnel, view=self.view)
         if report:  # under torchrun, only the first process has one
             _report(report, self.json, _print_training)
 
@@ -320,6 +322,32 @@ class Reproduce:
 
 
 @dataclass
+class View:
+    """Show a scene in a browser: orbit, drag lights, turn environments, compare methods, save what was changed."""
+
+    scene: Positional[Path]
+    """Scene with an nrf medium and integrator."""
+    define: Annotated[UseAppendAction[tuple[str, ...]], arg(aliases=("-D",), metavar="KEY=VALUE")] = field(
+        default_factory=tuple
+    )
+    """Value of $KEY in the scene."""
+    size: int = 256
+    """The picture has about SIZE² pixels."""
+    samples: int = 64
+    """Samples a pixel of a picture at rest."""
+    host: str = "127.0.0.1"
+    """Address to serve; 0.0.0.0: to everyone who reaches this machine."""
+    port: int = 8080
+    """Port to serve at; a later one if it is taken."""
+
+    def run(self) -> None:
+        parameters = _definitions(self.define)
+        from mi_ntf.view import view
+
+        view(self.scene, parameters, self.size, self.samples, self.host, self.port)
+
+
+@dataclass
 class Bake:
     """Write the transmittance maps of a scene's lights, one part of an EXR file each."""
 
@@ -471,6 +499,7 @@ Command = (
     | Annotated[Bench, subcommand("bench")]
     | Annotated[Tradeoff, subcommand("tradeoff")]
     | Annotated[Reproduce, subcommand("reproduce")]
+    | Annotated[View, subcommand("view")]
     | Annotated[Bake, subcommand("bake")]
     | Annotated[Export, subcommand("export")]
     | Annotated[Sequence_, subcommand("sequence")]

@@ -24,6 +24,7 @@ LLVM_MINIMUM = 17
 EXTRAS = {
     "train": ("torch", "tensorboard", "matplotlib", "PIL", "cv2"),
     "video": ("imageio_ffmpeg",),
+    "view": ("viser",),
     "eval": ("skimage", "flip_evaluator", "matplotlib", "PIL"),
     "mesh": ("skimage", "scipy", "trimesh"),
     "watch": ("tevclient",),

@@ -2,6 +2,7 @@
 
 import os
 import re
+from collections.abc import Callable
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -28,21 +29,23 @@ def swap(scene: Path, field: Path, out: Path) -> None:
     similarity = load_header(field).similarity
     if out.resolve() == scene.resolve():
         raise MiNtfError(f"{out} is the mesh scene itself; choose another name for the scene with the field")
-    root = _parse(scene)
+    root = parse(scene)
     defaults = {d.get("name", ""): d.get("value", "") for d in root.iter("default")}
-    _inline(root, scene, scene.parent, defaults)
+    inline(root, scene, scene.parent, defaults, lambda content: bool(_replaceable(content)) or
+           content.find("integrator") is not None)
     place = _remove_shapes(root, scene)
     root.insert(place, _bounding_sphere(similarity, os.path.relpath(field, out.parent)))
     _replace_integrator(root)
     _drop_unused(root, scene.parent, defaults)
-    _move_paths(root, scene.parent, out.parent, defaults)
+    move_paths(root, scene.parent, out.parent, defaults, root.find("shape/medium[@type='nrf']/string"))
     root.insert(0, ET.Comment(f" The meshes of {scene.name} as the field {field.name}; written by `mi-ntf swap`. "))
     ET.indent(root, "    ")
     files.make_folder(out.parent)
     files.write(out, ET.tostring(root, encoding="unicode") + "\n")
 
 
-def _parse(path: Path) -> ET.Element:
+def parse(path: Path) -> ET.Element:
+    """The <scene> of an XML file. Raises MiNtfError where there is none."""
     if not path.is_file():
         raise MiNtfError(f"scene {path} does not exist; give the XML file of a mesh scene")
     try:
@@ -59,7 +62,7 @@ def _resolve(include: ET.Element, source: Path, folder: Path, defaults: dict[str
 
     Mitsuba looks beside the including file first, then in the folder of the main scene.
     """
-    name = _substitute(include.get("filename", ""), defaults)
+    name = substitute(include.get("filename", ""), defaults)
     for base in (source.parent, folder):
         if (base / name).is_file():
             return base / name
@@ -67,20 +70,23 @@ def _resolve(include: ET.Element, source: Path, folder: Path, defaults: dict[str
     raise MiNtfError(f"{source}: included file {name!r} does not exist beside it{hint}")
 
 
-def _substitute(text: str, defaults: dict[str, str]) -> str:
+def substitute(text: str, defaults: dict[str, str]) -> str:
+    """`text` with the values of its $parameters."""
     return _PARAMETER.sub(lambda m: defaults.get(m[1], m[0]), text)
 
 
-def _inline(root: ET.Element, source: Path, folder: Path, defaults: dict[str, str]) -> None:
-    """Replace those includes of `root` that (themselves or deeper) hold shapes to swap or an integrator."""
+def inline(root: ET.Element, source: Path, folder: Path, defaults: dict[str, str],
+           wanted: Callable[[ET.Element], bool]) -> None:
+    """Replace those includes of `root`, the scene file `source`, whose content (or what it includes) is `wanted`, by
+    their content. `folder`: the main scene's; `defaults`: its $parameters, to which theirs are added."""
     for include in root.findall("include"):
         path = _resolve(include, source, folder, defaults)
-        content = _parse(path)
+        content = parse(path)
         for d in content.iter("default"):
             defaults.setdefault(d.get("name", ""), d.get("value", ""))
-        _inline(content, path, folder, defaults)
+        inline(content, path, folder, defaults, wanted)
         position = list(root).index(include)
-        if _replaceable(content) or content.find("integrator") is not None:
+        if wanted(content):
             root.remove(include)
             for offset, child in enumerate(content):
                 root.insert(position + offset, child)
@@ -146,7 +152,7 @@ def _replace_integrator(root: ET.Element) -> None:
 
 def _drop_unused(root: ET.Element, folder: Path, defaults: dict[str, str]) -> None:
     """Drop definitions that nothing refers to, until none is left. Includes may refer to them as well."""
-    included = [_parse(_resolve(i, folder / "scene.xml", folder, defaults)) for i in root.findall("include")]
+    included = [parse(_resolve(i, folder / "scene.xml", folder, defaults)) for i in root.findall("include")]
     while True:
         used = {r.get("id") for tree in (root, *included) for r in tree.iter("ref")}
         used |= {a.get("id") for a in root.iter("alias")}
@@ -157,19 +163,19 @@ def _drop_unused(root: ET.Element, folder: Path, defaults: dict[str, str]) -> No
             root.remove(element)
 
 
-def _move_paths(root: ET.Element, old: Path, new: Path, defaults: dict[str, str]) -> None:
-    """Make relative paths, written for the folder `old`, right for the folder `new`."""
+def move_paths(root: ET.Element, old: Path, new: Path, defaults: dict[str, str],
+               but: ET.Element | None = None) -> None:
+    """Make relative paths, written for the folder `old`, right for the folder `new`; that of the element `but` is."""
     if old.resolve() == new.resolve():
         _look_here_first(root)
         return
     nodes = [(e, "value") for e in root.iter("string") if e.get("name") == "filename"]
     nodes += [(e, "filename") for e in root.iter() if e.tag in ("include", "spectrum")]
     nodes += [(e, "value") for e in root.iter("path")]
-    field = root.find("shape/medium[@type='nrf']/string")
     for element, attribute in nodes:
         value = element.get(attribute, "")
         # What is not there is found by a <path>, which is moved itself.
-        if element is not field and not os.path.isabs(value) and (old / _substitute(value, defaults)).exists():
+        if element is not but and not os.path.isabs(value) and (old / substitute(value, defaults)).exists():
             element.set(attribute, Path(os.path.relpath(old / value, new)).as_posix())
     if root.find("include") is not None:
         # Mitsuba looks for the files that an include names in the main scene's folder, so that folder stays known.

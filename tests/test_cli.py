@@ -34,6 +34,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list:
     stand_in("mi_ntf.data.inspect", inspect=note(table), print_table=lambda values: print("table", values["psnr"]))
     stand_in("mi_ntf.train", train=note(table))
     stand_in("mi_ntf.swap", swap=note())
+    stand_in("mi_ntf.view", view=note())
     stand_in("mi_ntf.evaluate.compare", compare=note(table), print_table=lambda values: print("table", values["psnr"]))
     stand_in("mi_ntf.render.commands.explain", explain=note(table),
              print_table=lambda values: print("table", values["psnr"]))
@@ -63,7 +64,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list:
             (Path("data"), Path("f.safetensors")),
             {"preset": "fast", "minutes": 2.5, "steps": None, "seed": 0, "tensorboard": None, "field": None,
              "ntf": None, "augmentation": True, "colour_loss": True, "visibility_mlp": False,
-             "bounces": True, "fresnel": True, "gains": True, "estimate": False,
+             "bounces": True, "fresnel": True, "gains": True, "estimate": False, "view": False,
              "reading": {"size": None, "masks": None, "background": None, "flash_offset": None}},
         ),
         (
@@ -72,7 +73,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list:
             (Path("data"), Path("f")),
             {"preset": "fast", "minutes": None, "steps": 9, "seed": 0, "tensorboard": None, "field": Path("g"),
              "ntf": "ray", "augmentation": False, "colour_loss": False, "visibility_mlp": True,
-             "bounces": False, "fresnel": False, "gains": True, "estimate": False,
+             "bounces": False, "fresnel": False, "gains": True, "estimate": False, "view": False,
              "reading": {"size": None, "masks": None, "background": None, "flash_offset": None}},
         ),
         (
@@ -80,7 +81,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list:
             (Path("data"), Path("f")),
             {"preset": "fast", "minutes": None, "steps": None, "seed": 0, "tensorboard": None, "field": None,
              "ntf": None, "augmentation": True, "colour_loss": True, "visibility_mlp": False,
-             "bounces": True, "fresnel": True, "gains": False, "estimate": True,
+             "bounces": True, "fresnel": True, "gains": False, "estimate": True, "view": False,
              "reading": {"size": 768, "masks": None, "background": "black", "flash_offset": None}},
         ),
         (
@@ -88,8 +89,13 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list:
             (Path("data"), Path("f")),
             {"preset": "fast", "minutes": None, "steps": None, "seed": 0, "tensorboard": None, "field": None,
              "ntf": None, "augmentation": True, "colour_loss": True, "visibility_mlp": False,
-             "bounces": True, "fresnel": True, "gains": True, "estimate": False,
+             "bounces": True, "fresnel": True, "gains": True, "estimate": False, "view": False,
              "reading": {"size": None, "masks": Path("m"), "background": None, "flash_offset": (0.1, 0.2, -0.3)}},
+        ),
+        (
+            "view s.xml -D light=env -D spp=2 --size 128 --samples 8 --port 9000",
+            (Path("s.xml"), {"light": "env", "spp": "2"}, 128, 8, "127.0.0.1", 9000),
+            {},
         ),
         (
             "inspect data",

@@ -26,6 +26,7 @@ MAY_IMPORT = {
     "train": {"core", "data", "train"},
     "evaluate": {"core", "jobs", "infer", "render", "data", "evaluate", "sequence"},
     "sequence": {"core", "jobs", "infer", "render", "sequence"},
+    "view": {"core", "infer", "render", "evaluate", "view"},
 }
 """Which folders of the package a folder may import."""
 
@@ -42,6 +43,7 @@ FORBIDDEN = {
     "sequence": TORCH,
     # Metrics that live in PyTorch are offered where it is installed; the demo does without.
     "evaluate": set(),
+    "view": TORCH,
 }
 """Third parties that a folder must not import, not even inside a function."""
 

@@ -81,10 +81,15 @@ class Display:
 
 
 class Log:
-    """TensorBoard events in `folder`; nothing happens where it is None."""
+    """TensorBoard events in `folder`, none where it is None; `view`: pictures in a browser."""
 
-    def __init__(self, folder: Path | None):
-        self.folder = folder
+    def __init__(self, folder: Path | None, view: bool = False):
+        self.folder, self.live = folder, None
+        if view:
+            from .live import Live
+
+            self.live = Live()
+            note(f"Open {self.live.address} in a browser to watch the field.")
         self.writer: Any = None
         self.last = (time.monotonic(), 0, 0)
         if folder is not None:
@@ -113,6 +118,11 @@ class Log:
         for name, value in (values | rates).items():
             self.writer.add_scalar(name, value, step)
 
+    def look(self, step: int, psnr: float, picture: Callable[[], torch.Tensor]) -> None:
+        """Let those who watch see ``picture()``; `psnr`: of the last validation, dB."""
+        if self.live is not None:
+            self.live.show(step, psnr, picture)
+
     def validated(self, entry: dict, picture: Callable[[], torch.Tensor]) -> None:
         """Write the PSNR of `entry` and a picture (h, w, 3) of photograph, prediction and normals, side by side."""
         if self.writer is None:
@@ -125,6 +135,8 @@ class Log:
     def close(self) -> None:
         if self.writer is not None:
             self.writer.close()
+        if self.live is not None:
+            self.live.close()
 
 
 def note(text: str) -> None:

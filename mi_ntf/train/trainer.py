@@ -40,15 +40,16 @@ BETTER = 0.02
 
 def train(dataset: Path, out: Path, *, preset: str = "fast", minutes: float | None = None, steps: int | None = None,
           seed: int = 0, tensorboard: Path | None = None, field: Path | None = None, reading: dict | None = None,
-          estimate: bool = False, **variant) -> dict:
+          estimate: bool = False, view: bool = False, **variant) -> dict:
     """Train a field on the photographs in `dataset` and write it to `out`. Returns the report (JSON types).
 
     The run lasts `minutes` (10 unless told) or `steps`; runs given in steps are reproducible, bit for bit on one CPU.
     A checkpoint ``OUT.ckpt`` is written every minute, taken up by the same command, deleted at the end.
     Faults (see :class:`mi_ntf.train.monitor.Fault`) are rolled back, listed in the report, and end the run when they
-    keep coming. `tensorboard`: a folder for its events. `field`: a field file to keep as it is; its transmittance
-    networks alone are trained, anew. `reading`: options of :func:`mi_ntf.data.readers.load_dataset`. `estimate`: find
-    where the flash stands beside the lens. `variant`: ablations, see :func:`config.configured`.
+    keep coming. `tensorboard`: a folder for its events. `view`: show the field in a browser while it learns. `field`:
+    a field file to keep as it is; its transmittance networks alone are trained, anew. `reading`: options of
+    :func:`mi_ntf.data.readers.load_dataset`. `estimate`: find where the flash stands beside the lens. `variant`:
+    ablations, see :func:`config.configured`.
 
     Under ``torchrun --nproc-per-node=N -m mi_ntf train DATASET -o FIELD …`` (or any launcher that sets RANK,
     WORLD_SIZE, MASTER_ADDR and MASTER_PORT) N processes share the work of every step and average their gradients; see
@@ -71,7 +72,8 @@ def train(dataset: Path, out: Path, *, preset: str = "fast", minutes: float | No
         kind = _HierarchicalRun if isinstance(config, HierarchicalConfig) else _Run
         before = None if field is None else hashlib.sha256(Path(field).read_bytes()).hexdigest()
         run = kind(Path(dataset), Path(out), config, preset, minutes=None if steps is not None else float(limit),
-                   steps=steps, seed=seed, tensorboard=tensorboard, given=before, reading=reading, estimate=estimate)
+                   steps=steps, seed=seed, tensorboard=tensorboard, given=before, reading=reading, estimate=estimate,
+                   view=view)
         if field is not None and given is not None:
             run.take(field, *given)
         run.resume()
@@ -87,8 +89,8 @@ class _Loop(Recipe):
     OWN = ("history", "validated", "best", "kept", "faults", "trace")
 
     def __init__(self, dataset: Path, out: Path, config: TrainConfig | HierarchicalConfig, preset: str, *, minutes,
-                 steps, seed, tensorboard=None, given=None, reading=None, estimate=False):
-        self.log = Log(tensorboard if parallel.first() else None)
+                 steps, seed, tensorboard=None, given=None, reading=None, estimate=False, view=False):
+        self.log = Log(tensorboard if parallel.first() else None, view and parallel.first())
         # The stepper's, next in line.
         super().__init__(dataset, config, minutes, steps, seed, reading, estimate)  # type: ignore[call-arg]
         self.out, self.checkpoint = out, Path(f"{out}.ckpt")
@@ -161,6 +163,7 @@ class _Loop(Recipe):
         self.step += 1
         if self.step % 20 == 0:
             self.log_scalars()
+            self.log.look(self.step, self.last, self.picture)
         self.spent += time.monotonic() - start
         if self.minutes < math.inf:
             self.spent = parallel.agreed(self.spent)

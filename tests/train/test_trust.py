@@ -2,6 +2,7 @@
 
 import functools
 import sys
+import urllib.request
 
 import pytest
 
@@ -11,7 +12,7 @@ from train import two_spheres  # noqa: E402
 
 from mi_ntf.core import field_file  # noqa: E402
 from mi_ntf.core.errors import MiNtfError  # noqa: E402
-from mi_ntf.train import config, fast, monitor, recipe, train, trainer  # noqa: E402
+from mi_ntf.train import config, fast, live, monitor, recipe, train, trainer  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -158,6 +159,27 @@ def test_tensorboard_gets_scalars_and_previews(photographs, tmp_path, monkeypatc
     assert 1e2 < events.Scalars("speed/rays per second")[-1].value < 1e7
     picture = events.Images(events.Tags()["images"][0])[-1]
     assert (picture.width, picture.height) == (3 * 16, 16)
+
+
+def test_a_run_that_is_watched_shows_its_pictures_and_learns_the_same(photographs, tmp_path, monkeypatch):
+    viser = pytest.importorskip("viser", reason="pip install 'mi-ntf[view]'")
+    shown, pages = [], []
+    monkeypatch.setattr(viser.SceneApi, "set_background_image", lambda scene, image, **how: shown.append(image))
+
+    def show(self, step, psnr, picture):
+        self._next = 0.0  # a run of a second has no time for pictures
+        pages.append(urllib.request.urlopen(self.address).read())
+        real(self, step, psnr, picture)
+
+    real = live.Live.show
+    monkeypatch.setattr(live.Live, "show", show)
+    for name, view in (("watched", True), ("alone", False)):
+        train(photographs, tmp_path / name, steps=40, view=view)
+    assert len(shown) == 2 and all(b"<html" in page for page in pages)
+    photograph = shown[-1][:, :16]
+    assert shown[-1].shape[1] == 3 * 16 and photograph.max() > 50  # not the dark around it alone
+    fields = [field_file.load(tmp_path / name)[1] for name in ("watched", "alone")]
+    assert all((fields[0][key] == fields[1][key]).all() for key in fields[0])
 
 
 def test_no_tensorboard_is_a_clear_error(photographs, tmp_path, monkeypatch):

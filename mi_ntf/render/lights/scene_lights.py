@@ -44,19 +44,23 @@ class Lights:
                         emitter that is no finite set of lights; n: n samples a point of all emitters together
     environment_lights  most directional lights that stand for an environment
     dimmest             share of all light at the fields; the dimmest lights that have no more of it do not shine
+    only                numbers of the emitters that shine; None: all
 
     kinds    plugin name of each emitter
     sampled  emitters that are drawn at random
     discrete the others, each with its rows (:class:`Discrete`)
     rows     all of those in scene coordinates
+    background  whether one of them is an environment, which is seen behind all else
 
     Raises MiNtfError where an emitter has numbers that are none, or cannot be drawn.
     """
 
     def __init__(self, scene, media=(), light_samples: int = 0, environment_lights: int = 512,
-                 dimmest: float = 0.0):
+                 dimmest: float = 0.0, only: tuple[int, ...] | None = None):
         self._wrapped: list = []
-        emitters = [self._unwrap(e, scene, media) for e in scene.emitters()]
+        outer = [e for i, e in enumerate(scene.emitters()) if only is None or i in only]
+        emitters = [self._unwrap(e, scene, media) for e in outer]
+        self.background = scene.environment() is not None and any(e.is_environment() for e in outer)
         self.kinds = [kind(e) for e in emitters]
         self.light_samples = light_samples
         for e, k in zip(emitters, self.kinds, strict=True):
@@ -68,9 +72,9 @@ class Lights:
         every = light_rows.join([d.rows for d in self.discrete], dark)
         self._strength = every.strength([m.frame.origin for m in media])
         self.rows = every.part(self._bright(dimmest)) if dimmest else every
-        pairs = [(e, w) for e, w in zip(emitters, scene.emitters(), strict=True) if light_samples or not is_discrete(e)]
+        pairs = [(e, w) for e, w in zip(emitters, outer, strict=True) if light_samples or not is_discrete(e)]
         self.sampled = [e for e, _ in pairs if _shines(e)]
-        self._weights = [outer.sampling_weight() for e, outer in pairs if _shines(e)]
+        self._weights = [w.sampling_weight() for e, w in pairs if _shines(e)]
 
     def _bright(self, dimmest: float) -> np.ndarray:
         """Which of all rows remain."""

@@ -80,7 +80,7 @@ def describe(scene, settings: Settings, sensor, spp: int, media: list, light) ->
     return Effects(
         emitters=tuple(light.kinds),
         lit=lit,
-        background=scene.environment() is not None and not settings.hide_emitters and depth != 0,
+        background=light.background and not settings.hide_emitters and depth != 0,
         exhaustive=exhaustive,
         visibility=method,
         reason=reason,

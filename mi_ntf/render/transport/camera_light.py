@@ -9,23 +9,25 @@ import mitsuba as mi
 from ...infer import march, shade
 from ..lights import environment
 from .composition import Composition, Part
+from .seen import Seen
 from .shadow import Known
 from .walk import Paths, Walk
 
 
-def trace(composition: Composition, ray, quadrature, stream, sums=None):
+def trace(composition: Composition, ray, quadrature, stream, sums=None, seen: Seen | None = None):
     """``(radiance, opacity)`` of camera rays. `quadrature`: where their cells begin and samples lie in them
     (:meth:`mi_ntf.render.scene.camera.Camera.quadrature`). `sums`: where other outputs are gathered
-    (:class:`mi_ntf.render.transport.aovs.Sums`), None where nobody asks."""
-    return _CameraLight(composition, ray, quadrature, stream, sums).trace()
+    (:class:`mi_ntf.render.transport.aovs.Sums`), None where nobody asks. `seen`: what the same rays have met before, if
+    anyone keeps that."""
+    return _CameraLight(composition, ray, quadrature, stream, sums, seen or Seen(keep=False)).trace()
 
 
 class _CameraLight:
     """The light along rays: `hit`, the surfaces that they meet (None without surfaces); `total`, the sum so far, a
     float a ray for each channel."""
 
-    def __init__(self, composition: Composition, ray, quadrature, stream, sums):
-        self.scene, self.ray, self.stream, self.sums = composition, ray, stream, sums
+    def __init__(self, composition: Composition, ray, quadrature, stream, sums, seen: Seen):
+        self.scene, self.ray, self.stream, self.sums, self.seen = composition, ray, stream, sums, seen
         self.offset, self.depth = quadrature
         self.effects, self.first_run = composition.effects, not composition.run
         self.total = [dr.zeros(mi.Float, dr.width(ray.o)) for _ in range(3)]
@@ -65,7 +67,8 @@ class _CameraLight:
             self.total[:] = light
             return transmittance
         wanted = found.lit or bool(sums and sums.needs_points)
-        samples = march.camera_samples(strands, maxt, self.offset, self.depth, shade=wanted, view=found.collocated)
+        samples = self.seen.samples(wanted, found.collocated, lambda: march.camera_samples(
+            strands, maxt, self.offset, self.depth, shade=wanted, view=found.collocated))
         light = [dr.zeros(mi.Float, dr.width(samples.t)) for _ in range(3)]
         for i, part in enumerate(self.scene.in_view):
             self._field(i, part, samples, unit, light)
@@ -85,9 +88,7 @@ class _CameraLight:
             view = dr.gather(mi.Float, view, kept) if view is not None else None
         if not dr.width(index):
             return
-        x, along = samples.place(i, index, t)
-        points = shade.Points(x, tuple(-c for c in along), part.medium.reflectance(x))
-        points.evaluate()
+        points = self.seen.points(samples, i, lambda: self._points(i, part, samples, index, t))
         if self.sums:
             distance = (dr.gather(mi.Float, samples.bundle.base, index) + t) * unit
             self.sums.add_field(i, part, points, samples, kept, distance, self.scene.shadow(part, "mapped"))
@@ -96,6 +97,13 @@ class _CameraLight:
             for channel, value in zip(light, reflected, strict=True):
                 where = dr.arange(mi.UInt32, dr.width(t)) if kept is None else kept
                 dr.scatter_reduce(dr.ReduceOp.Add, channel, value * weight, where, mode=dr.ReduceMode.NoConflicts)
+
+    @staticmethod
+    def _points(i: int, part: Part, samples, index, t) -> shade.Points:
+        x, along = samples.place(i, index, t)
+        points = shade.Points(x, tuple(-c for c in along), part.medium.reflectance(x))
+        points.evaluate()
+        return points
 
     def _at_camera(self, strands):
         """The `reflect` of :func:`mi_ntf.infer.march.camera_light` for the fields in view."""

@@ -52,7 +52,7 @@ class Composition:
         self.scene, self.settings, self.sensor, self.patches = scene, settings, sensor, patches
         self.media = media = [m for number, m in enumerate(find_media(scene)) if number not in settings.without]
         self.lights = scene_lights.Lights(scene, media, settings.light_samples, settings.environment_lights,
-                                          settings.dimmest)
+                                          settings.dimmest, settings.only)
         self.effects = effects.describe(scene, settings, sensor, spp, media, self.lights)
         self._media = [m for m in media if m.field.grid.majorant > 0]
         self._seen = [m for m, visible in zip(media, self.effects.in_view, strict=True) if visible]

@@ -17,7 +17,11 @@ CHUNK = 1 << 18
 
 
 def render(integrator, scene, sensor, seed, spp: int, develop: bool):
-    """Camera rays → radiance and opacity → film. Without limits all samples are one pass."""
+    """Camera rays → radiance and opacity → film. Without limits all samples are one pass.
+
+    `integrator` is the plugin, or what has its attributes, and maybe ``seen``
+    (:class:`mi_ntf.render.transport.seen.Seen`) of an earlier render of the same rays, and ``chunk``, camera rays in
+    flight."""
     if dr.flag(dr.JitFlag.FreezingScope):
         raise MiNtfError(
             "nrf integrator: dr.freeze cannot record a render whose number of shading points is known only while it "
@@ -111,7 +115,8 @@ def _trace(integrator, composition, pixels: Reconstruction, picture, seed, count
     it was told to stop."""
     camera = pixels.camera
     alpha = mi.has_flag(camera.film.flags(), mi.FilmFlags.Alpha)
-    chunks = range(0, camera.count, max(1, CHUNK // camera.spp))
+    chunks = range(0, camera.count, max(1, getattr(integrator, "chunk", CHUNK) // camera.spp))
+    seen = getattr(integrator, "seen", None)
     for run, first in itertools.product(composition.own, chunks):
         if integrator.should_stop() or counted.overtime(integrator.timeout):
             _stop(pixels, run, first, len(composition.runs))
@@ -124,7 +129,8 @@ def _trace(integrator, composition, pixels: Reconstruction, picture, seed, count
         ray, weight, position = camera.rays(first, count, stream)
         sums = picture and picture.sums(dr.width(ray), run, composition.runs[run])
         with composition.lights.bare():
-            radiance, opacity = camera_light.trace(composition, ray, camera.quadrature(count), stream, sums)
+            radiance, opacity = camera_light.trace(composition, ray, camera.quadrature(count), stream, sums,
+                                                   seen and seen.chunk(first))
         # Opacity comes with the scene's first run, the filter's weights with the first that is rendered here.
         begins = run == composition.own[0]
         once = [*([None if run else opacity] if alpha else []), dr.ones(mi.Float, dr.width(ray)) if begins else None]

@@ -1,0 +1,40 @@
+"""A run that is watched in a browser: the trainer's own picture, as often as it costs next to nothing."""
+
+import time
+from collections.abc import Callable
+
+import torch
+
+SHARE = 0.05
+"""Of a run's time, what its pictures may take."""
+
+
+class Live:
+    """A page with the latest picture. `address`: where it is served."""
+
+    def __init__(self) -> None:
+        from ..page_server import serve
+
+        self._server, self.address = serve("mi-ntf train")
+        self._status = self._server.gui.add_markdown("The first picture comes with the first steps.")
+        self._next = 0.0
+
+    def show(self, step: int, psnr: float, picture: Callable[[], torch.Tensor]) -> None:
+        """Put up ``picture()`` (h, w, 3), sRGB, of `step`, if it is time for one; `psnr` of the last validation."""
+        start = time.monotonic()
+        if start < self._next:
+            return
+        image = (255 * picture()).round().to(torch.uint8).cpu().numpy()
+        height, width = image.shape[:2]
+        # The page stretches a background: room above and below keeps its shape.
+        framed = torch.zeros(max(height, round(width / 1.4)), width, 3, dtype=torch.uint8).numpy()
+        top = (framed.shape[0] - height) // 2
+        framed[top : top + height] = image
+        self._server.scene.set_background_image(framed, format="jpeg", jpeg_quality=90)
+        validation = "" if psnr != psnr else f", validation {psnr:.2f} dB"
+        self._status.content = f"Photograph, field, normals: step {step}{validation}"
+        now = time.monotonic()
+        self._next = now + (now - start) / SHARE
+
+    def close(self) -> None:
+        self._server.stop()

@@ -1,0 +1,48 @@
+"""Environment maps of a view: which there are, and one in place of another."""
+
+import tempfile
+from pathlib import Path
+
+import mitsuba as mi
+
+from mi_ntf import swap
+from mi_ntf.core.errors import MiNtfError
+
+from .save import save
+from .session import Session
+
+ENDINGS = (".exr", ".hdr")
+
+
+def beside(session: Session) -> list[Path]:
+    """Pictures that could be environments: those in the folders of the scene's files, of which results of renders are
+    not told apart."""
+    folders = {session.path.parent, *(p.parent for p in _files(session))}
+    found = sorted({p.resolve() for folder in folders for p in folder.iterdir() if p.suffix.lower() in ENDINGS})
+    own = [p.resolve() for p in _files(session)]
+    return [p for p in found if p in own] + [p for p in found if p not in own]
+
+
+def _files(session: Session) -> list[Path]:
+    """Those of the environments that are there now."""
+    root = swap.parse(session.path)
+    values = {d.get("name", ""): d.get("value", "") for d in root.iter("default")} | session.define
+    swap.inline(root, session.path, session.path.parent, values, lambda content: content.find("emitter") is not None)
+    names = [s.get("value", "") for e in root.findall("emitter") for s in e.findall("string[@name='filename']")]
+    places = [session.path.parent / swap.substitute(name, values) for name in names]
+    return [p for p in [session.environment, *places] if p is not None and p.is_file()]
+
+
+def swap_environment(session: Session, picture: Path) -> None:
+    """Let the file `picture` (latitude and longitude, EXR or HDR) be the scene's environment. Raises MiNtfError where
+    the scene has none, or the file is no picture."""
+    if not any(light.can_turn for light in session.lights):
+        raise MiNtfError('the scene has no environment map to swap; give it an <emitter type="envmap">')
+    try:
+        mi.Bitmap(str(picture))
+    except Exception as error:
+        raise MiNtfError(f"{picture} is no picture that Mitsuba reads ({error}); choose an EXR or HDR file") from None
+    with tempfile.TemporaryDirectory() as folder:
+        scene = Path(folder) / "scene.xml"
+        save(session, scene, picture)
+        session.reopen(scene, picture)

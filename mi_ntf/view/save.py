@@ -1,0 +1,141 @@
+"""The XML of a scene that was changed in a view."""
+
+import os
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import numpy as np
+
+from mi_ntf import swap
+from mi_ntf.core import files
+from mi_ntf.core.errors import MiNtfError
+
+from .lights import POWER, Light
+from .session import Session
+
+CHANGED = ("emitter", "sensor", "integrator")
+
+
+def save(session: Session, out: Path, environment: Path | None = None) -> None:
+    """Write `out`: the scene of `session` as it is now. What was not changed stays as it was written; includes that
+    hold a light, a sensor or an integrator are inlined, comments are lost, and the values of $names that the session
+    was opened with become their defaults. `environment`: picture file in place of the present one.
+
+    Raises MiNtfError if `out` is the scene itself, or a changed light is not an <emitter> of the scene's top level.
+    """
+    if out.resolve() == session.path.resolve():
+        raise MiNtfError(f"{out} is the scene that is being viewed; choose another name")
+    root = swap.parse(session.path)
+    values = {d.get("name", ""): d.get("value", "") for d in root.iter("default")} | session.define
+    swap.inline(root, session.path, session.path.parent, values,
+                lambda content: any(content.find(f".//{tag}") is not None for tag in CHANGED))
+    swap.move_paths(root, session.path.parent, out.parent, values)
+    _set_defaults(root, session.define)
+    for light in session.lights:
+        if light.version:
+            _write_light(_element(root, session, light, values), light)
+    environment = environment or session.environment
+    if environment:
+        for light in session.lights:
+            if light.can_turn:
+                place = os.path.relpath(environment, out.parent)
+                _replace(_element(root, session, light, values), ("filename", "bitmap"),
+                         ET.Element("string", name="filename", value=Path(place).as_posix()))
+    if session.pose != session.opened:
+        _write_pose(root, session)
+    for name in ("visibility", "max_depth"):
+        if getattr(session.settings, name) != getattr(session.before, name):
+            _write_setting(root, name, getattr(session.settings, name))
+    ET.indent(root, "    ")
+    files.make_folder(out.parent)
+    files.write(out, ET.tostring(root, encoding="unicode") + "\n")
+
+
+def _set_defaults(root: ET.Element, define: dict[str, str]) -> None:
+    for name, value in define.items():
+        found = [d for d in root.iter("default") if d.get("name") == name]
+        for default in found[1:]:
+            root.remove(default)
+        if found:
+            found[0].set("value", value)
+        else:
+            root.insert(0, ET.Element("default", name=name, value=value))
+
+
+def _element(root: ET.Element, session: Session, light: Light, values: dict[str, str]) -> ET.Element:
+    """The element of `light`: Mitsuba keeps the order of lights of a kind."""
+    found = [e for e in root.findall("emitter") if swap.substitute(e.get("type", ""), values) == light.kind]
+    same = [other for other in session.lights if other.kind == light.kind]
+    if len(found) != len(same):
+        raise MiNtfError(f"{session.path} has {len(found)} <emitter> of type {light.kind} at its top level, and the "
+                         f"scene {len(same)}; put them there to save what was changed")
+    return found[same.index(light)]
+
+
+def _write_light(element: ET.Element, light: Light) -> None:
+    if light.moved and light.kind == "point":
+        _replace(element, ("position", "to_world"), _vector("point", "position", light.position))
+    elif light.moved:
+        _replace(element, ("to_world", "direction"), _matrix(light.placement))
+    if light.degrees:
+        transform = element.find("transform[@name='to_world']")
+        if transform is None:
+            transform = ET.SubElement(element, "transform", name="to_world")
+        # The last step of a transform is done last.
+        x, y, z = (repr(float(c)) for c in light.up)
+        ET.SubElement(transform, "rotate", x=x, y=y, z=z, angle=repr(light.degrees))
+    if light.brightness != 1 and light.power is not None:
+        name = POWER[light.emitter.class_name()].removesuffix(".value")
+        if len(light.power) > 1:
+            _replace(element, (name,), ET.Element("rgb", name=name, value=", ".join(map(_text, light.power))))
+        else:
+            _replace(element, (name,), ET.Element("float", name=name, value=_text(light.power[0])))
+
+
+def _write_pose(root: ET.Element, session: Session) -> None:
+    """Origin, target and up of the first sensor; its angle stays."""
+    sensor = root.find("sensor")
+    if sensor is None:
+        raise MiNtfError(f"{session.path} has no <sensor> at its top level, so the camera cannot be saved")
+    pose, transform = session.pose, ET.Element("transform", name="to_world")
+    ET.SubElement(transform, "lookat", {
+        name: ", ".join(map(_text, value))
+        for name, value in (("origin", pose.origin), ("target", pose.target), ("up", pose.up))})
+    _replace(sensor, ("to_world",), transform)
+
+
+def _write_setting(root: ET.Element, name: str, value) -> None:
+    """A property of the integrator; where it is a $name, that name's default."""
+    integrator = root.find("integrator")
+    assert integrator is not None  # the scene was rendered by it
+    old = next((e for e in integrator if e.get("name") == name), None)
+    text = old.get("value", "") if old is not None else ""
+    default = next((d for d in root.iter("default") if text == f"${d.get('name')}"), None)
+    if default is not None:
+        default.set("value", str(value))
+    else:
+        _replace(integrator, (name,),
+                 ET.Element("string" if isinstance(value, str) else "integer", name=name, value=str(value)))
+
+
+def _replace(parent: ET.Element, names: tuple[str, ...], new: ET.Element) -> None:
+    """`new` in place of the children of these names."""
+    for child in [c for c in parent if c.get("name") in names]:
+        parent.remove(child)
+    parent.append(new)
+
+
+def _vector(tag: str, name: str, value: np.ndarray) -> ET.Element:
+    x, y, z = map(_text, value)
+    return ET.Element(tag, name=name, x=x, y=y, z=z)
+
+
+def _matrix(value: np.ndarray) -> ET.Element:
+    transform = ET.Element("transform", name="to_world")
+    ET.SubElement(transform, "matrix", value=" ".join(map(_text, value.ravel())))
+    return transform
+
+
+def _text(value: float) -> str:
+    """As many digits as float32 has."""
+    return f"{float(value):.9g}"

@@ -1,0 +1,117 @@
+"""What is saved is the scene that was seen."""
+
+import dataclasses
+from xml.etree import ElementTree as ET
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers.viewed import DIRECTIONAL, ENVIRONMENT, POINT, SECOND, SPOT
+
+from mi_ntf.core.errors import MiNtfError
+from mi_ntf.evaluate.metrics import relative_rmse
+from mi_ntf.view import environments
+from mi_ntf.view.save import save
+from mi_ntf.view.session import Session
+
+SAME = 1e-4
+"""Relative RMSE: the file has nine digits, of places that float32 rounds again."""
+
+
+def fresh(path, **define):
+    return np.array(mi.render(mi.load_file(str(path), **define), spp=1, seed=0))
+
+
+def change(view):
+    """Something of everything."""
+    point, second, spot, directional, sky = view.lights
+    point.move([-2.0, 3.5, 3.0])
+    second.dim(3)
+    spot.move([1.0, 4.0, 4.0])
+    spot.point([-0.5, -4.2, -3.7])
+    directional.point([1, -1, -1])
+    sky.turn(70)
+    sky.dim(0.5)
+    view.look(dataclasses.replace(view.pose, origin=(-2.0, 1.0, 5.0)))
+    view.choose(max_depth=3)
+
+
+def test_a_saved_scene_is_the_one_that_was_seen(scene, tmp_path):
+    """In another folder, from where field and sky are elsewhere."""
+    view = Session(scene(POINT, SECOND, SPOT, DIRECTIONAL, ENVIRONMENT), {"visibility": "raymarch"}, 32)
+    before = view.refine().image
+    change(view)
+    seen = view.refine().image
+    save(view, tmp_path / "new" / "saved.xml")
+    assert relative_rmse(before, seen) > 0.2
+    assert relative_rmse(fresh(tmp_path / "new" / "saved.xml"), seen) < SAME
+
+
+def test_only_what_was_changed_is_written_anew(scene, tmp_path):
+    view = Session(scene(POINT, SECOND), {}, 32)
+    view.lights[1].move([1.0, 2.0, 3.0])
+    save(view, view.path.with_name("saved.xml"))
+    old, new = (ET.parse(view.path.with_name(name)).getroot() for name in ("scene.xml", "saved.xml"))
+
+    def lines(root):
+        return [(e.tag, tuple(sorted(e.attrib.items()))) for e in root.iter()]
+
+    only_old, only_new = set(lines(old)) - set(lines(new)), set(lines(new)) - set(lines(old))
+    assert only_old == {("point", (("name", "position"), ("x", "-2.5"), ("y", "2"), ("z", "3")))}
+    assert only_new == {("point", (("name", "position"), ("x", "1"), ("y", "2"), ("z", "3"))),
+                        ("path", (("value", "."),))}
+
+
+def test_names_of_the_scene_keep_their_use(scene):
+    view = Session(scene(POINT), {"visibility": "raymarch"}, 32)
+    out = view.path.with_name("saved.xml")
+    save(view, out)
+    assert '<default name="visibility" value="raymarch" />' in out.read_text()
+    view.choose(visibility="none")
+    save(view, out)
+    assert '<default name="visibility" value="none" />' in out.read_text()
+    assert relative_rmse(fresh(out, visibility="raymarch"), fresh(view.path, visibility="raymarch")) == 0
+
+
+def test_lights_of_included_files_are_saved(scene):
+    path = scene('<default name="light" value="two"/><include filename="light_$light.xml"/>')
+    for name, light in (("one", POINT), ("two", SECOND)):
+        path.with_name(f"light_{name}.xml").write_text(f'<scene version="3.9.0">{light}</scene>')
+    view = Session(path, {"light": "one"}, 32)
+    view.lights[0].move([-2.0, 3.5, 3.0])
+    save(view, path.with_name("saved.xml"))
+    assert relative_rmse(fresh(path.with_name("saved.xml")), view.refine().image) < SAME
+
+
+def test_the_environment_is_swapped(scene):
+    """And keeps what was done before: a light elsewhere, the sky turned."""
+    view = Session(scene(POINT, ENVIRONMENT), {}, 32)
+    view.lights[0].move([-2.0, 3.5, 3.0])
+    view.lights[1].turn(40)
+    before = view.refine().image
+    other = next(p for p in environments.beside(view) if p.name == "other.exr")
+    environments.swap_environment(view, other)
+    seen = view.refine().image
+    view.lights[1].turn(60)
+    turned = view.refine().image
+    save(view, view.path.with_name("saved.xml"))
+    assert '"other.exr"' in view.path.with_name("saved.xml").read_text()
+    truth = fresh(view.path.with_name("saved.xml"))
+    assert relative_rmse(turned, truth) < SAME
+    assert min(relative_rmse(before, seen), relative_rmse(seen, turned)) > 0.01
+
+
+def test_the_first_choice_is_the_scenes_own_environment(scene):
+    view = Session(scene(ENVIRONMENT), {}, 32)
+    assert [p.name for p in environments.beside(view)] == ["sky.exr", "other.exr"]
+
+
+def test_mistakes_are_told(scene, tmp_path):
+    view = Session(scene(POINT), {}, 32)
+    with pytest.raises(MiNtfError, match="is the scene that is being viewed; choose another name"):
+        save(view, view.path)
+    with pytest.raises(MiNtfError, match="the scene has no environment map to swap"):
+        environments.swap_environment(view, tmp_path / "sky.exr")
+    view = Session(scene(ENVIRONMENT), {}, 32)
+    with pytest.raises(MiNtfError, match="is no picture that Mitsuba reads"):
+        environments.swap_environment(view, view.path)
