@@ -35,7 +35,7 @@ SCENE = """
 
 # Python reads a module of this name at its start, wherever it lies on the path.
 STAND_IN = """
-import sys, types
+import importlib.util, sys, types
 
 def register():
     import mitsuba as mi
@@ -65,7 +65,10 @@ def register():
     mi.register_integrator("nrf", kinds)
 
 keep = []
-sys.modules["mi_ntf.render"] = types.SimpleNamespace(register=register)
+stand_in = types.ModuleType("mi_ntf.render")
+stand_in.register = register
+stand_in.__path__ = [importlib.util.find_spec("mi_ntf").submodule_search_locations[0] + "/render"]  # its rooms are real
+sys.modules["mi_ntf.render"] = stand_in
 """
 
 

@@ -2,7 +2,9 @@
 
 import re
 import shutil
+import subprocess
 import sys
+import urllib.request
 from pathlib import Path
 
 import OpenEXR
@@ -60,6 +62,17 @@ def test_snippet(folder, language, code):
         check("python", "snippet.py", folder=folder)
 
 
+def opened(words, folder):
+    """A view of `words` is served, and ended."""
+    command = [sys.executable, "-m", "mi_ntf", *words[1:], "--size", "16", "--samples", "1", "--port", "8190"]
+    with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as program:
+        try:
+            address = next(m[1] for m in (re.match(r"Open (http:\S+) ", line) for line in program.stdout) if m)
+            assert b"<html" in urllib.request.urlopen(address).read()
+        finally:
+            program.terminate()
+
+
 def _marks(words) -> list:
     """How shipped fields were trained takes minutes here too, some trainings differ by their options alone, and prices
     are measured by other tests: `make hard-cases` runs those."""
@@ -74,6 +87,9 @@ def test_command(folder, words):
     """In their order: later ones use the files of earlier ones."""
     if words[0] == "make":  # they install, or run this suite
         assert re.search(rf"^{words[1]}:", (ROOT / "Makefile").read_text(), re.M)
+        return
+    if words[1] == "view":
+        opened(words, folder)
         return
     words = list(words)
     for option, value in SMALLER.items():
@@ -106,7 +122,7 @@ def test_command(folder, words):
 def test_every_command_is_shown():
     shown = {words[1] if words[0] == "mi-ntf" else words[0] for words in COMMANDS}
     assert shown == {"capture", "inspect", "train", "swap", "mitsuba", "info", "compare", "explain", "bake", "make",
-                     "tradeoff", "reproduce", "export", "render", "sequence"}
+                     "tradeoff", "reproduce", "export", "render", "sequence", "view"}
 
 
 def test_readme_is_short():

@@ -122,7 +122,7 @@ class Controls:
             return
         with gui.add_folder(name):
             if light.can_move:
-                place = gui.add_vector3("position", three(light.position), step=0.01)
+                place = gui.add_vector3("position", three(np.round(light.position, 6)), step=0.01)
                 self._link(place, f"light {name}", lambda v: self._typed(light, v), "light")
                 self.gizmos[light.number].place = place
             if light.can_turn:
@@ -154,7 +154,7 @@ class Controls:
             light.move(position)
             place = self.gizmos[light.number].place
             if place is not None:
-                place.value = three(position)
+                place.value = three(np.round(position, 6))
         if light.can_point:
             light.point(viser.transforms.SO3(wxyz).as_matrix()[:, 2])
 
@@ -203,7 +203,7 @@ class Controls:
         places = [light.position for light in self.session.lights if light.can_move]
         reach = max([float(np.linalg.norm(p - center)) for p in places], default=0.0)
         away = np.array(view.position, np.float64) - center
-        away *= 1.2 * reach / np.sin(min(float(view.fov), 2.0) / 2) / max(float(np.linalg.norm(away)), 1e-9)
+        away *= (0.5 * reach + reach / np.tan(min(float(view.fov), 2.0) / 2)) / max(float(np.linalg.norm(away)), 1e-9)
         view.position, view.look_at = tuple(center + away), tuple(center)
 
 
