@@ -224,7 +224,7 @@ def check_demo(folder: Path, ssim: float, rmse: float, to_march: float) -> None:
 
 
 COARSE = (('name="interior">', 'name="interior"><integer name="resolution" value="96"/>'),
-          ('<integrator type="nrf">', '<integrator type="nrf"><integer name="map_resolution" value="64"/>'))
+          ('<default name="map" value="192"/>', '<default name="map" value="64"/>'))
 """What makes the statue's scene quick to load: most of a render on few pixels is the field's grid and the maps."""
 
 
