@@ -3,6 +3,8 @@
 import importlib
 from types import ModuleType
 
+import numpy as np
+
 from ..core.errors import MiNtfError
 
 
@@ -18,3 +20,19 @@ def module(variant: str) -> ModuleType:
             "add `-m llvm_ad_rgb` to the command line"
         )
     return importlib.import_module(f"drjit.{backend}.ad")
+
+
+ALIGNMENT = 64
+"""Bytes that Dr.Jit's own arrays begin at a multiple of."""
+
+
+def floats(values: np.ndarray, dj: ModuleType):
+    """`values`, raveled, as a ``Float`` of the module `dj`. Dr.Jit takes NumPy's memory as it lies on a processor, and
+    kernels that fetch from it differ by whether it is aligned, which is chance: they were compiled again now and then,
+    for a light that moved."""
+    flat = np.asarray(values, np.float32).ravel()
+    raw = np.empty(flat.nbytes + ALIGNMENT, np.uint8)
+    first = -raw.ctypes.data % ALIGNMENT
+    aligned = raw[first : first + flat.nbytes].view(np.float32)
+    aligned[:] = flat
+    return dj.Float(aligned)

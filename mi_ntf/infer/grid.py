@@ -8,6 +8,7 @@ import numpy as np
 from ..core.architecture import LOG_FLOOR
 from ..core.ops import normalize
 from . import ops
+from .backend import floats
 from .network import MIN_DENSITY, NetworkField, cut_density
 
 CELLS = 64
@@ -51,7 +52,7 @@ class GridField:
         self.gloss = _highest_gloss(self, dense, coarse)
         self.majorant = float(np.exp(log_sigma.max())) if dense.any() else 0.0
         occupied = _occupied_cells(dense)
-        self.clearance = dj.Float(_chebyshev_distance(occupied).ravel())
+        self.clearance = floats(_chebyshev_distance(occupied), dj)
         self.hull = _support_points(dense)
         self.bounds = self.hull.min(0), self.hull.max(0)
 

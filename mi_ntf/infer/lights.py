@@ -6,6 +6,8 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from .backend import floats
+
 
 class LightTable:
     """Point and directional lights, one row each.
@@ -34,11 +36,10 @@ class LightTable:
         self._arguments = where, power, is_point, scale, dj, cones
         flag = self.is_point[:, None]
         rows = np.concatenate([self.where, flag, np.reshape(power, (-1, 3)), 0 * flag], axis=1)
-        self._rows = dj.Float(rows.astype(np.float32).ravel())
+        self._rows = floats(rows, dj)
         self._scale = dr.opaque(dj.Float, scale)
         self.moving = False  # whether a light's place carries gradients
-        columns = () if cones is None else np.array(np.transpose(cones), np.float32, order="C")
-        self._cones: list | None = [dj.Float(c) for c in columns] or None
+        self._cones: list | None = None if cones is None else [floats(c, dj) for c in np.transpose(cones)]
 
     def part(self, first: int, last: int) -> "LightTable":
         """The lights `first` … `last` − 1 as a table of their own."""

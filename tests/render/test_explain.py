@@ -11,6 +11,7 @@ from mi_ntf.core.errors import MiNtfError
 from mi_ntf.render import load_scene
 from mi_ntf.render.commands.explain import explain, print_table
 from mi_ntf.render.cost import measurement, model
+from mi_ntf.render.scene.media import find_media
 
 SCENE = Path(__file__).parents[2] / "scenes" / "statue" / "scene.xml"
 
@@ -157,7 +158,7 @@ def test_patches_are_counted_before_they_are_found():
     scene = load_scene(SCENE, {"light": "point", "res": "8", "spp": "1"})
     integrator = scene.integrator()
     mi.render(scene, integrator=integrator)
-    medium, patches = integrator.patches.media[0], integrator.patches.hits.shape[0]
+    medium, patches = find_media(scene)[0], integrator.patches.hits.shape[0]
     assert model.patches(medium.field.grid) == pytest.approx(patches, rel=0.2)
 
 

@@ -20,6 +20,7 @@ import numpy as np
 
 from ...core.ops import cross, dot
 from .. import octahedral
+from ..backend import floats
 from ..lights import LightTable
 
 ROW = 16
@@ -65,7 +66,7 @@ class LightRays:
         self.dj, self.m, self.count = dj, resolution, lights.count
         rows = frames(lights, hull, resolution)
         self.parallel, self.full = not (rows[:, 15] > 0).any(), bool((rows[:, 15] == SPHERE).any())
-        self._rows = dj.Float(rows.astype(np.float32).ravel())
+        self._rows = floats(rows, dj)
         self._texels = dr.opaque(dj.UInt32, resolution**2)
         self._area = dr.opaque(dj.Float, resolution**2 + 0.5)
 
