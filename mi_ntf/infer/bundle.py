@@ -132,7 +132,10 @@ class Bundle:
         count = len(self.strands)
 
         def look(begin, part):
-            return tuple(sigma for k in range(PARTS) for sigma in self.densities(begin + (k + 0.5) * part))
+            sigmas = [self.densities(begin + (k + 0.5) * part) for k in range(PARTS)]
+            totals = [sum(here[1:], here[0]) for here in sigmas]
+            means = [1 + b * b * (1 / 6) for b in bends(totals)]
+            return tuple(sigma * mean for here, mean in zip(sigmas, means, strict=True) for sigma in here)
 
         def nothing(begin, part):
             return tuple(type(begin)(0) for _ in range(PARTS * count))
@@ -200,10 +203,13 @@ class Cell(NamedTuple):
         return sum(totals[1:], totals[0]) * self.part
 
     def place(self, depth):
-        """Where the optical depth from the cell's begin on is `depth`."""
-        t, passed = self.begin, 0
-        for sigma in self.totals:
-            t = t + dr.minimum(dr.maximum(depth - passed, 0) * dr.rcp(dr.maximum(sigma, 1e-6)), self.part)
+        """Where the optical depth from the cell's begin on is `depth`: densities linear across each part, with the
+        slope that its neighbours tell. Constant ones put points in front of where the light is lost, since skins get
+        denser inwards: `statue` shone 0.4 % too bright."""
+        t, passed, totals = self.begin, 0, self.totals
+        for sigma, bend in zip(totals, bends(totals), strict=True):
+            share = dr.clip((depth - passed) * dr.rcp(dr.maximum(sigma * self.part, 1e-6)), 0, 1)
+            t = t + self.part * share * (1 + bend * (1 - share))
             passed = passed + sigma * self.part
         return t
 
@@ -224,6 +230,15 @@ class Cell(NamedTuple):
             shares = [share + rate * s for share, s in zip(shares, sigmas, strict=True)]
             passed = after
         return shares
+
+
+def bends(totals: list) -> list:
+    """Of densities in the middle of parts of equal length: half of each part's slope over its density, −1 to 1, by the
+    parts beside it. Skins are exponentials, σ ∝ e^(2bu) over a part's share u, whose mean is about 1 + b²/6 times what
+    is in the middle, and which are steeper than a part is long."""
+    logs, last = [dr.log(dr.maximum(sigma, 1e-6)) for sigma in totals], len(totals) - 1
+    pairs = ((max(k - 1, 0), min(k + 1, last)) for k in range(last + 1))
+    return [dr.clip((logs[above] - logs[below]) * (0.5 / (above - below)), -1, 1) for below, above in pairs]
 
 
 def onward(skip, step, parts=1):

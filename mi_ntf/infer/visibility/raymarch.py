@@ -10,11 +10,14 @@ from .method import Method, Options, queries
 MAX_OPTICAL_DEPTH = 12.0
 """Light rays end here, and count as blocked: a lamp that shines through at τ = 6e-6 would light what is outside an
 opaque lantern, if it is strong enough."""
+NODE = 0.48
+"""Where in a step its density is asked, from the shading point on. Skins thin out towards the light, and of exponentials
+of rate λ in steps of s the mean lies at s/2 − λs²/24: the middle saw 0.4 % too much light, this 0.03 % too little."""
 
 
 class RayMarch:
     """`steps`: see :func:`optical_depth`. They begin at the shading point, which lies at a random depth of its camera
-    ray's cell: that is the jitter. Steps of a quarter change an image by 0.3 % at most."""
+    ray's cell: that is the jitter. Steps of a sixth change an image by 0.15 % (relative RMSE; statue, globe, skull)."""
 
     def __init__(self, density, grid, steps):
         self.density, self.grid, self.steps = density, grid, steps
@@ -27,13 +30,13 @@ class RayMarch:
 
 def default_steps(step: float, gradients: bool = False) -> tuple[float, float, float]:
     """(shortest, longest, growth) from the camera march's cell length: finer beside the point, which lies in the skin
-    that makes the depth, a fifth of the distance further off, and never longer than 1/80, less than half an occupancy
-    cell: more would jump over thin parts. Below 2/384, all shrink with `step`: the march converges.
+    that makes the depth, three tenths of the distance further off, and never longer than 1/64, half an occupancy cell:
+    more would jump over thin parts. Below 2/384, all shrink with `step`: the march converges.
 
     `gradients`: for derivatives, which see the slopes of a skin: 28 % off with steps of 1/64, 2 % with 1/512.
     """
-    longest = 1 / 512 if gradients else max(step, min(3 * step, 1 / 80))
-    return 0.25 * step, longest, min(0.2, 38.4 * step)
+    longest = 1 / 512 if gradients else max(step, min(3 * step, 1 / 64))
+    return 0.35 * step, longest, min(0.3, 57.6 * step)
 
 
 def optical_depth(density, grid, x, d, length, steps, active):
@@ -59,7 +62,7 @@ def optical_depth(density, grid, x, d, length, steps, active):
         p = tuple(mi + t * di for mi, di in zip(m, along, strict=True))
         skip = clear_distance(grid, p, inverse)
         empty = skip > 0
-        at = t + 0.5 * step
+        at = t + NODE * step
         q = tuple(mi + at * di for mi, di in zip(m, along, strict=True))
         if attached:
             q = tuple(dr.replace_grad(a, xi + (at - here) * di) for a, xi, di in zip(q, x, d, strict=True))
