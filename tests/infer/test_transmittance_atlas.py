@@ -11,6 +11,7 @@ from helpers import fields, hard_cases
 
 from mi_ntf.core import field_file
 from mi_ntf.infer import octahedral
+from mi_ntf.infer import octahedral
 from mi_ntf.infer.lights import LightTable
 from mi_ntf.infer.visibility import outside, raymarch, transmittance_atlas
 from mi_ntf.infer.visibility.method import Options
@@ -95,6 +96,22 @@ def test_bounded_and_made_of_the_same_bits_each_time(statue):
     assert first.min() >= 0 and first.max() <= 1
     told = 4 * transmittance_atlas.numbers(captured()[0], None, Options(2 / 384))
     assert atlas.maps.texels.nbytes == told <= 64 << 20
+
+
+def test_directions_are_drawn_from_the_stream_without_bias(statue, monkeypatch):
+    """One ray, 2¹⁶ seeds: the mean cell is the ray's own place among cells, whose neighbours lie one apart."""
+    _, atlas = statue
+    count = 1 << 16
+    monkeypatch.setattr(atlas, "stream", dr.arange(mi.UInt32, count) * 977)
+    for x, d in zip(0.8 * unit(12, 18).T, unit(12, 19).T, strict=True):
+        ray = [tuple(mi.Float(float(c)) for c in v) for v in (x, d)]
+        u = transmittance_atlas._uniforms(mi, atlas.stream, *ray)
+        place = [float(f[0]) for f in octahedral.place(ray[1], mi.Float(transmittance_atlas.SIDE))]
+        for f, drawn in ((place[0], u[0]), (place[1], u[1]), (0.3, u[2]), (0.7, u[3])):
+            mean = np.floor(f + np.array(drawn, np.float64)).mean()
+            share = f - np.floor(f)
+            assert abs(mean - f) < 4.5 * np.sqrt(share * (1 - share) / count) + 2.0**-16  # 48 z-tests; bits of a number
+        assert abs(np.corrcoef(np.array(u, np.float64)) - np.eye(4)).max() < 4.5 / np.sqrt(count)
 
 
 def test_points_outside_see_the_object(statue):

@@ -33,7 +33,8 @@ class Method:
     """
     name         what users type
     summary      what it does, a sentence
-    build        ``(medium, table, options, dj, keep)`` → an object with ``tau``, in the medium's field coordinates.
+    build        ``(medium, table, options, dj, keep)`` → an object with ``tau``, in the medium's field coordinates, and
+                 with ``stream``, an opaque seed that the renderer sets, where lookups draw numbers.
                  `table`: the :class:`mi_ntf.infer.lights.LightTable` that what is held per light is made for, and whose
                  moving lights are followed more finely; None: the others. ``keep(width, step, make)`` → ``make()``, or
                  ``make(values)`` where what it would make, `width` float32 numbers for each of the squared

@@ -39,6 +39,8 @@ BEGIN = 0.08
 twice."""
 REACH = 0.06
 """Where the sum ends, and the map of smoke begins."""
+DARK = 3e-4
+"""Where the map lets no more through than this, nobody looks how much of that the sum close to x would take."""
 NEAREST_PIVOT = 0.16
 OUTSIDE = 0.98
 """Squared distance from the origin where points lie in no skin: maps are read from the sphere on."""
@@ -52,12 +54,14 @@ SMOKE_STEP = 1 / 32
 class TransmittanceAtlas:
     """`density`: σ at a point; `maps`: the :class:`TransmittanceMap` of the directions, read from the distance `begin`
     on; `march`: a :class:`mi_ntf.infer.visibility.raymarch.RayMarch` for what lies inside the sphere, which any drawn
-    light may; `options`: of the maps."""
+    light may; `options`: of the maps. `stream`: a seed of the sampler, for the numbers that lookups draw: opaque, or each
+    would be compiled."""
 
     def __init__(self, density, maps: TransmittanceMap, begin: float, march, options: Options, dj: ModuleType):
         self.density, self.maps, self.march, self.options, self.dj = density, maps, march, options, dj
         self._begin = dr.opaque(dj.Float, begin)
         self._side = dr.opaque(dj.Float, maps.count**0.5)
+        self.stream = dr.opaque(dj.UInt32, 0)
 
     def tau(self, x, wi, distance, index, active):
         """The product of both parts; marched where the light lies inside the sphere."""
@@ -74,18 +78,22 @@ class TransmittanceAtlas:
 
     def _look_up(self, x, wi, here, active):
         outside = dr.squared_norm(self.dj.Array3f(*x)) > OUTSIDE
+        far = self._far(x, wi, here, outside, active)
 
-        def near(x, wi):
+        def near(far, x, wi):
             depth = 0
             for t, w in zip(PLACES, WEIGHTS, strict=True):
                 depth += w * self.density(tuple(a + t * b for a, b in zip(x, wi, strict=True)))
-            return dr.exp(-depth)
+            return far * dr.exp(-depth)
 
-        close = dr.if_stmt((tuple(x), tuple(wi)), active & ~outside, near, lambda x, wi: self.dj.Float(1), label="near")
-        return close * self._far(x, wi, here, outside, active)
+        def dark(far, x, wi):
+            return far
+
+        wanted = active & ~outside & (far > DARK)
+        return dr.if_stmt((far, tuple(x), tuple(wi)), wanted, near, dark, label="near")
 
     def _far(self, x, wi, here, outside, active):
-        u = _uniforms(self.dj, x, wi)
+        u = _uniforms(self.dj, self.stream, x, wi)
         k, d = self._direction(wi, u[:2])
         pivot = dr.select(outside, dr.maximum(-here, 0), dr.maximum(-0.5 * here, NEAREST_PIVOT))
         back = dr.select(outside, pivot, pivot - self._begin)
@@ -99,9 +107,9 @@ class TransmittanceAtlas:
         return self.dj.UInt32(iv * self._side + iu), octahedral.direction(iu, iv, self._side)
 
 
-def _uniforms(dj, x, wi) -> list:
-    """Four numbers in [0, 1) of the bits of a ray: the same ray, the same numbers."""
-    state = dj.UInt32(0)
+def _uniforms(dj, stream, x, wi) -> list:
+    """Four numbers in [0, 1) of the seed `stream` and the bits of a ray: the same of both, the same numbers."""
+    state = dj.UInt32(stream)
     for c, factor in zip((*x, *wi), (0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D, 0x27D4EB2F, 0x165667B1, 0xD3A2646D),
                          strict=True):
         word: Any = dr.reinterpret_array(dj.UInt32, c)

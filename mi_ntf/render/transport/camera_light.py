@@ -19,6 +19,7 @@ def trace(composition: Composition, ray, quadrature, stream, sums=None, seen: Se
     (:meth:`mi_ntf.render.scene.camera.Camera.quadrature`). `sums`: where other outputs are gathered
     (:class:`mi_ntf.render.transport.aovs.Sums`), None where nobody asks. `seen`: what the same rays have met before, if
     anyone keeps that."""
+    composition.draw_from(stream)
     return _CameraLight(composition, ray, quadrature, stream, sums, seen or Seen(keep=False)).trace()
 
 

@@ -129,6 +129,14 @@ class Composition:
             return Part(medium, whole, table, mapped, mapped)
         return Part(medium, whole, table, mapped, building.build(drawn, medium, table, options))
 
+    def draw_from(self, stream) -> None:
+        """Methods whose lookups draw numbers take them from `stream`, an opaque seed: one for each seed of the user's
+        and chunk of pixels."""
+        for part in self.parts:
+            for method in (part.mapped, part.drawn):
+                if hasattr(method, "stream"):
+                    method.stream = stream
+
     def transmittance(self, p, d, distance, active):
         """What the fields let through from scene point `p` along `d`, as far as `distance`."""
         tau = mi.Float(1)
