@@ -19,11 +19,14 @@ def variant():
 def test_weights_are_shares_of_the_picture(rng):
     """A box that is a hundredth of it has a hundredth of the weight, whatever the places outside."""
     box = np.array([0.3, 0.4]), np.array([0.4, 0.5])
-    places, weights = probing._places(rng, 4000, [box])
+    places, weights = probing._places(rng, 1000, [box], 1 / 256)
     inside = ((places >= box[0][:, None]) & (places <= box[1][:, None])).all(0)
     assert weights[inside].sum() == pytest.approx(0.01, rel=1e-9) and inside.sum() > probing.WITHIN
-    assert weights.sum() == pytest.approx(1, abs=2e-3)  # 4000 places find the hundredth within so much
+    assert weights.sum() == pytest.approx(1, abs=2e-3)  # 1000 groups find the hundredth within so much
     assert ((places >= 0) & (places < 1)).all()
+    beside = places.reshape(2, -1, probing.GROUP)
+    steps = np.diff(beside[0], axis=1)
+    assert np.isclose(steps, 1 / 256).mean() > 0.99 and (np.ptp(beside[1], axis=1) == 0).all()
 
 
 @pytest.mark.parametrize(("name", "expected"), [("box", 1), ("gaussian", np.pi)])

@@ -21,6 +21,8 @@ from .probing import SAMPLES, Look, Probes, probed
 
 TRIAL = 0.5
 """Seconds that a trial takes: what saves less is not tried."""
+IN_VAIN = 0.5
+"""Of what is built for a trial, what is lost: as if half of the trials failed."""
 SHARED = 0.5
 """Of `max_error`, what fewer lights may err before a method is looked for: of squares a quarter."""
 SAVING = 0.1
@@ -120,10 +122,13 @@ class Chooser:
         return look.built / self.settings.frames + look.each * self._spp
 
     def _pays(self, saved: float, settings: Settings | None = None) -> bool:
-        """Whether so many seconds less a picture are worth a trial, and `settings` the maps that are made anew for
-        them."""
-        anew = self.estimate.built(settings) if settings and not REGISTRY[settings.visibility].per_field else 0.0
-        return saved * self.settings.frames >= TRIAL + anew
+        """Whether so many seconds less a picture are worth a trial of `settings`: maps are made anew for it; what is
+        built for a field serves the pictures as well, or was in vain."""
+        built = 0.0
+        if settings:
+            of_field = REGISTRY[settings.visibility].per_field
+            built = self.estimate.built(settings) * (IN_VAIN * self.settings.frames if of_field else 1.0)
+        return saved * self.settings.frames >= TRIAL + built
 
     def _by_error(self) -> Choice:
         named = self.settings.visibility != "auto"
@@ -151,7 +156,7 @@ class Chooser:
         full, settings = march.seconds, marched.composition.settings
         for seconds, candidate in sorted(((self.estimate.seconds(s), s) for s in self._candidates(settings)),
                                          key=lambda pair: pair[0]):
-            if not self._pays(full - seconds):
+            if not self._pays(full - seconds, candidate):
                 self._tried(candidate, seconds, why="saves less than a trial takes")
                 continue
             look = self._looked(candidate)
