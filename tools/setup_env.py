@@ -44,6 +44,8 @@ def main(extras: list[str]) -> None:
         return
 
     system_packages()
+    if "dev" in wanted:
+        browser()
     if not PYTHON.exists():
         say(f"making {VENV}")
         run(sys.executable, "-m", "venv", str(VENV))
@@ -115,6 +117,17 @@ def system_packages() -> None:
         f"missing: {' '.join(missing)} (names of Debian)",
         f"install them with the package manager of this system (LLVM {LLVM_MINIMUM} or newer)",
     )
+
+
+def browser() -> None:
+    """Install the browser that a test looks at the viewer with, where that can be done; without it the test is skipped."""
+    names = ("chromium", "chromium-browser", "google-chrome")
+    if any(map(shutil.which, names)) or not shutil.which("apt-get") or os.geteuid() != 0:
+        return
+    say("installing chromium")
+    environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
+    for command in (["update", "-qq"], ["install", "-y", "-qq", "--no-install-recommends", "chromium"]):
+        subprocess.run(["apt-get", *command], check=False, env=environment)
 
 
 def in_archive(package: str) -> bool:

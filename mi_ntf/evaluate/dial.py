@@ -3,6 +3,7 @@
     python -m mi_ntf.evaluate.dial error  [--scenes statue globe …] [--lights point sky …] [--size 128] [--spp 4]
     python -m mi_ntf.evaluate.dial noise  …
     python -m mi_ntf.evaluate.dial time   …
+    python -m mi_ntf.evaluate.dial effects …
     python -m mi_ntf.evaluate.dial stock  …
 
 ``error``  `max_error` 2 % with ``auto`` beside every fixed choice: methods, and of environments the number of lights.
@@ -11,6 +12,8 @@
 ``noise``  `noise_threshold` beside the noise of the picture against one of `TRUTH` samples a pixel.
 ``time``   `time_budget` beside the seconds that it took, and the error, noise included, beside that of the best fixed
            method in the same time.
+``effects``  `max_error` 2 % of pictures with light of up to `DEPTH` edges: the error of all that was left out, and the
+           seconds beside those of the same method without anything left out.
 ``stock``  the first of 1, 4, 16, … samples a pixel with 2 % of relative RMSE, kernels compiled and maps made anew,
            beside stock ``volpath`` of single scattering, whose seconds are reckoned from its noise: it falls by 1/√N.
 
@@ -39,7 +42,7 @@ LIGHTS = ("point", "directional", "env", "sky", "area")
 LIMIT, FRAMES = 0.02, (1, 20)
 THRESHOLDS = (0.1, 0.03, 0.01)
 BUDGETS = (5.0, 20.0)
-TRUTH, STOCK, MORE = 512, 8, 7
+TRUTH, STOCK, MORE, DEPTH = 512, 8, 7, 6
 FIXED: list[dict[str, Any]] = [
     {"visibility": "raymarch"}, {"visibility": "transmittance_atlas"}, {"visibility": "neural_transmittance"},
     {"visibility": "transmittance_map"},
@@ -185,6 +188,18 @@ def time_case(name: str, light: str, size: int, spp: int) -> list[dict[str, Any]
     return rows
 
 
+def effects_case(name: str, light: str, size: int, spp: int) -> list[dict[str, Any]]:
+    """One row."""
+    loaded = scene(name, light, size, spp)
+    truth, march, _ = frames(loaded, {"visibility": "raymarch", "max_depth": DEPTH})
+    images, seconds, nrf = frames(loaded, {"max_error": LIMIT, "max_depth": DEPTH})
+    _, whole, _ = frames(loaded, {"visibility": nrf.achieved["visibility"], "max_depth": DEPTH})
+    taken = [t["name"] for t in nrf.achieved["trials"] if t["taken"]]
+    return [{"scene": name, "light": light, "error": off(images, truth, light == "area"), "taken": taken,
+             "seconds": seconds[0], "whole_seconds": whole[0], "ratio": whole[0] / seconds[0],
+             "march_seconds": march[0]}]
+
+
 def stock_case(name: str, light: str, size: int, spp: int) -> list[dict[str, Any]]:
     """One row, for the fastest method; `spp` of it is not read."""
     loaded = scene(name, light, size, 1)
@@ -211,7 +226,8 @@ def stock_case(name: str, light: str, size: int, spp: int) -> list[dict[str, Any
              "ratio": reckoned / best[0]}]
 
 
-CASES = {"error": error_case, "noise": noise_case, "time": time_case, "stock": stock_case}
+CASES = {"error": error_case, "noise": noise_case, "time": time_case, "effects": effects_case,
+         "stock": stock_case}
 
 
 def main() -> None:
