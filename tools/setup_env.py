@@ -120,7 +120,7 @@ def system_packages() -> None:
 
 
 def browser() -> None:
-    """Install the browser that a test looks at the viewer with, where that can be done; without it the test is skipped."""
+    """Install the browser that a test looks at the viewer with, where that can be done; else the test is skipped."""
     names = ("chromium", "chromium-browser", "google-chrome")
     if any(map(shutil.which, names)) or not shutil.which("apt-get") or os.geteuid() != 0:
         return

@@ -11,7 +11,6 @@ from helpers import fields, hard_cases
 
 from mi_ntf.core import field_file
 from mi_ntf.infer import octahedral
-from mi_ntf.infer import octahedral
 from mi_ntf.infer.lights import LightTable
 from mi_ntf.infer.visibility import outside, raymarch, transmittance_atlas
 from mi_ntf.infer.visibility.method import Options

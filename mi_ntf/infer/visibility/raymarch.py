@@ -11,8 +11,9 @@ MAX_OPTICAL_DEPTH = 12.0
 """Light rays end here, and count as blocked: a lamp that shines through at τ = 6e-6 would light what is outside an
 opaque lantern, if it is strong enough."""
 NODE = 0.48
-"""Where in a step its density is asked, from the shading point on. Skins thin out towards the light, and of exponentials
-of rate λ in steps of s the mean lies at s/2 − λs²/24: the middle saw 0.4 % too much light, this 0.03 % too little."""
+"""Where in a step its density is asked, from the shading point on. Skins thin out towards the light, and the mean of an
+exponential of rate λ over a step s lies at s/2 − λs²/24: the middle saw 0.4 % too much light, this 0.03 % too
+little."""
 
 
 class RayMarch:

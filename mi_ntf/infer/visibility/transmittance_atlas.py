@@ -54,8 +54,8 @@ SMOKE_STEP = 1 / 32
 class TransmittanceAtlas:
     """`density`: σ at a point; `maps`: the :class:`TransmittanceMap` of the directions, read from the distance `begin`
     on; `march`: a :class:`mi_ntf.infer.visibility.raymarch.RayMarch` for what lies inside the sphere, which any drawn
-    light may; `options`: of the maps. `stream`: a seed of the sampler, for the numbers that lookups draw: opaque, or each
-    would be compiled."""
+    light may; `options`: of the maps. `stream`: a seed of the sampler, for the numbers that lookups draw, opaque, or
+    each would be compiled."""
 
     def __init__(self, density, maps: TransmittanceMap, begin: float, march, options: Options, dj: ModuleType):
         self.density, self.maps, self.march, self.options, self.dj = density, maps, march, options, dj

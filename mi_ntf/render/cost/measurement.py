@@ -15,8 +15,8 @@ they fetch reflectance, or are small."""
 
 
 UNIT = 16384
-"""Entries of a kernel that Dr.Jit gives to one thread of a processor at a time (drjit-core's DRJIT_POOL_BLOCK_SIZE): less
-work than that for each leaves some idle."""
+"""Entries of a kernel that Dr.Jit gives to one thread of a processor at a time (DRJIT_POOL_BLOCK_SIZE of drjit-core):
+less work than that for each leaves some idle."""
 BUILT = ("maps or volumes", "bounces")
 """Stages that do not grow with pixels and samples."""
 

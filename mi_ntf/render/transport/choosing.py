@@ -144,17 +144,22 @@ class Chooser:
             best = self._judged(look, truth, True, "named")
         else:
             march = Trial("raymarch", self._price(truth), 0.0, True), truth
-            # Fewer lights are fewer for every method; what they err leaves the method most of the error.
-            lit = march if self._whole else self._without(*march, truth, LIGHTS, SHARED * self.limits.error)
-            best, look = self._method(*lit, truth)
+            # Fewer lights are fewer for every method; what they err leaves the method most of the error. The march,
+            # which has none of its own, may do with still fewer.
+            lit = fewest = march
+            if not self._whole:
+                lit = self._without(*march, truth, LIGHTS, SHARED * self.limits.error)
+                fewest = self._without(*lit, truth, LIGHTS, self.limits.error)
+            best, look = self._method(lit[1].composition.settings, *fewest, truth)
         if not self._whole:
             best, look = self._without(best, look, truth, OMISSIONS, self.limits.error)
         return Choice(look.composition, self.trials, {"seconds": best.seconds, "error": best.error})
 
-    def _method(self, march: Trial, marched: Look, truth: Look) -> tuple[Trial, Look]:
-        """The cheapest that keeps to the error, in place of `march`, the cheapest of the march itself."""
+    def _method(self, lit: Settings, march: Trial, marched: Look, truth: Look) -> tuple[Trial, Look]:
+        """The cheapest that keeps to the error, with the lights of `lit`, in place of `march`, the cheapest of the
+        march itself."""
         full, settings = march.seconds, marched.composition.settings
-        for seconds, candidate in sorted(((self.estimate.seconds(s), s) for s in self._candidates(settings)),
+        for seconds, candidate in sorted(((self.estimate.seconds(s), s) for s in self._candidates(lit)),
                                          key=lambda pair: pair[0]):
             if not self._pays(full - seconds, candidate):
                 self._tried(candidate, seconds, why="saves less than a trial takes")
