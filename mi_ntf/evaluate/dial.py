@@ -42,7 +42,7 @@ LIGHTS = ("point", "directional", "env", "sky", "area")
 LIMIT, FRAMES = 0.02, (1, 20)
 THRESHOLDS = (0.1, 0.03, 0.01)
 BUDGETS = (5.0, 20.0)
-TRUTH, STOCK, MORE, DEPTH = 512, 8, 7, 6
+TRUTH, STOCK, MORE, DEPTH = 4096, 8, 7, 6
 FIXED: list[dict[str, Any]] = [
     {"visibility": "raymarch"}, {"visibility": "transmittance_atlas"}, {"visibility": "neural_transmittance"},
     {"visibility": "transmittance_map"},
