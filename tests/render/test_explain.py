@@ -193,6 +193,6 @@ def test_under_a_limit_the_trials_are_told(monkeypatch, capsys):
     trials = report["choice"]["trials"]
     taken = [trial for trial in trials if trial["taken"]]
     assert taken and report["effects"]["visibility"]["why"].endswith(taken[-1]["why"])
-    assert report["choice"]["predicted"] == {"seconds": trials[-1]["seconds"], "error": trials[-1]["error"]}
+    assert report["choice"]["predicted"] == {"seconds": taken[-1]["seconds"], "error": taken[-1]["error"]}
     print_table(report)
     assert "verdict" in capsys.readouterr().out
