@@ -23,6 +23,7 @@ def dataset(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_statue(dataset):
     """Cameras, light and normals agree: mirrored or turned views would lie below 20 dB and above 40°."""
     mi.set_variant(VARIANT)

@@ -169,6 +169,7 @@ def test_all_of_it_on_a_tiny_field(scene, trained, tmp_path, monkeypatch):
     assert again == ["reference/balls/point-001"]
 
 
+@pytest.mark.slow
 def test_several_workers_give_the_rows_of_one(scene, tmp_path, monkeypatch):
     mi.set_variant(VARIANT)
     monkeypatch.setattr(package, "QUICK", TINY)

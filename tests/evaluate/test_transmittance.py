@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import mitsuba as mi
+import pytest
 from helpers.variants import VARIANT
 
 import mi_ntf.render
@@ -11,6 +12,7 @@ from mi_ntf.evaluate import transmittance
 STATUE = Path(__file__).parents[2] / "scenes/statue/scene.xml"
 
 
+@pytest.mark.slow
 def test_study_of_the_statue():
     """Few pixels and lights: the learned transmittance is within 8 % of the march even so, and every map within 10."""
     mi.set_variant(VARIANT)

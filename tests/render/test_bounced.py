@@ -66,6 +66,7 @@ def test_a_convex_body_gets_nothing_and_pictures_have_no_more_noise(skin):
     np.testing.assert_allclose(all_, single, atol=1e-3 * single.max())
 
 
+@pytest.mark.slow
 def test_light_at_the_camera_takes_its_short_way(skin):
     """One walk for view and light; the same picture as with a light beside the camera."""
     flash = {"type": "point", "intensity": 40.0}
@@ -97,6 +98,7 @@ def test_what_radiosity_does_not_know_is_traced_or_refused(skin, tmp_path):
         np.testing.assert_array_equal(auto, paths)
 
 
+@pytest.mark.slow
 def test_few_drawn_lights_bounce_like_many(skin):
     """What patches get is drawn once for all samples of a pixel, so their number has to do."""
     places = [(3, 0, 0), (-3, 0, 0), (0, 3, 0), (0, -1.5, 0), (0, 0, 3), (0, 0, -3), (0, 0.8, 0), (0, 0, 1)]

@@ -54,7 +54,7 @@ METAL = {"type": "roughconductor", "alpha": 0.2}
     [
         ("point", DIFFUSE, False, 2),
         (None, METAL, True, 2),  # light that a BSDF-sampled ray meets behind a field arrives dimmed
-        ("directional", METAL, False, 4),
+        pytest.param("directional", METAL, False, 4, marks=pytest.mark.slow),
         pytest.param("env", METAL, False, 2, marks=pytest.mark.slow),
         pytest.param(None, DIFFUSE, True, -1, marks=pytest.mark.slow),
     ],

@@ -60,8 +60,8 @@ def test_volumes_hold_one_and_a_half_entries_a_sample():
 
 
 def test_steps_of_a_light_march():
-    """Steps of a quarter of 1/192, growing by a fifth of the distance, at last 1/80 long: counted for 384 samples."""
-    assert light_steps(384) == 93
+    """Steps of 0.35/192, growing by three tenths of the distance, at last 1/80 long: counted for 384 samples."""
+    assert light_steps(384) == 88
     assert light_steps(96) < light_steps(384) < light_steps(1536)
 
 

@@ -115,6 +115,7 @@ def test_table_names_every_effect_and_stage(capsys):
     assert all(name in text for name in report["seconds"])
 
 
+@pytest.mark.slow
 def test_measured_beside_predicted(tmp_path, capsys):
     """The kernels' seconds are those of the whole render, but for Python and the film. In a process of its own: Dr.Jit
     counts the memory of all that lives in one."""

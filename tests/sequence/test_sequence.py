@@ -179,7 +179,8 @@ LIGHTS = """<emitter type="point" id="lamp"><point name="position" x="3" y="3" z
 
 
 @pytest.mark.parametrize(("visibility", "depth", "surface"), [
-    ("raymarch", 3, True), ("transmittance_map", 2, True), ("transmittance_atlas", 3, False)])
+    ("raymarch", 3, True), ("transmittance_map", 2, True),
+    pytest.param("transmittance_atlas", 3, False, marks=pytest.mark.slow)])
 def test_parts_of_the_lights_add_up_to_the_frame(scene, tmp_path, visibility, depth, surface):
     """Background, surfaces, bounces and opacity are there once. Bounced light is marched in parts, whatever the method.
     """

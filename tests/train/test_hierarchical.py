@@ -187,6 +187,7 @@ def test_a_network_that_reads_baked_densities_is_refused(photographs, tmp_path):
         train(photographs, tmp_path / "f", preset="paper", ntf="mixture2", steps=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["fast", "paper"])
 def test_the_baselines_network_learns_beside_and_is_stored(photographs, tmp_path, monkeypatch, preset):
     """Its error falls in some steps."""

@@ -61,6 +61,7 @@ def test_a_run_killed_twice_ends_where_an_undisturbed_one_ends(photographs, undi
     assert {p.name for p in tmp_path.iterdir()} == {"f", "f.html", "f.npz", "f.json"}
 
 
+@pytest.mark.slow
 def test_two_processes_are_one(photographs, undisturbed, tmp_path):
     """torchrun with two processes: the losses of one process with the same seed.
 

@@ -33,6 +33,7 @@ def test_short_run_learns_the_spheres(photographs, tmp_path):
     assert {*tmp_path.iterdir()} == {out, out.with_suffix(".html")}, "checkpoint and temporary files are gone"
 
 
+@pytest.mark.slow
 def test_a_finished_field_learns_another_transmittance(photographs, tmp_path, monkeypatch):
     two_spheres.coarsen(monkeypatch)
     old, new = tmp_path / "old", tmp_path / "new"

@@ -115,6 +115,7 @@ def test_watch_finds_a_loss_that_runs_away_and_forgives_outliers():
         watch.check("ntf", float("inf"), 7)
 
 
+@pytest.mark.slow
 def test_the_best_field_is_the_one_that_is_written(photographs, tmp_path, monkeypatch):
     """The field is spoilt after step 30 of 40, all its matter thinned out; the one before is kept."""
     def spoil(run, loss):
@@ -161,6 +162,7 @@ def test_tensorboard_gets_scalars_and_previews(photographs, tmp_path, monkeypatc
     assert (picture.width, picture.height) == (3 * 16, 16)
 
 
+@pytest.mark.slow
 def test_a_run_that_is_watched_shows_its_pictures_and_learns_the_same(photographs, tmp_path, monkeypatch):
     viser = pytest.importorskip("viser", reason="pip install 'mi-ntf[view]'")
     shown, pages = [], []

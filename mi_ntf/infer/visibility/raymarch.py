@@ -31,12 +31,12 @@ class RayMarch:
 
 def default_steps(step: float, gradients: bool = False) -> tuple[float, float, float]:
     """(shortest, longest, growth) from the camera march's cell length: finer beside the point, which lies in the skin
-    that makes the depth, three tenths of the distance further off, and never longer than 1/64, half an occupancy cell:
-    more would jump over thin parts. Below 2/384, all shrink with `step`: the march converges.
+    that makes the depth, three tenths of the distance further off, and never longer than 1/80, less than half an
+    occupancy cell: more would jump over thin parts. Below 2/384, all shrink with `step`: the march converges.
 
     `gradients`: for derivatives, which see the slopes of a skin: 28 % off with steps of 1/64, 2 % with 1/512.
     """
-    longest = 1 / 512 if gradients else max(step, min(3 * step, 1 / 64))
+    longest = 1 / 512 if gradients else max(step, min(3 * step, 1 / 80))
     return 0.35 * step, longest, min(0.3, 57.6 * step)
 
 
