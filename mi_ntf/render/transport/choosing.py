@@ -31,6 +31,9 @@ SAVING = 0.1
 """Of the predicted time, what leaving something out must save at least."""
 FINER = {"map_resolution": 256, "map_components": 2}
 """Dials of a map for smaller errors."""
+PART, MANY = 0.005, 4
+"""Of the samples of all frames, what the probes may be, up to so many times those of one picture: fewer of them leave
+more room for chance, and good methods are then refused."""
 GLINTS = 4096
 """Pixels in which few lights are looked for glints: a lobe sees one light where it should see a patch of the sky, in a
 thousandth of the pixels, which had half of the squared error of `skull`."""
@@ -120,7 +123,9 @@ class Chooser:
 
     def _marched(self) -> Look:
         """The probes by the march, which also tell how far off the prices are."""
-        self.probes = Probes(self.sensor, self.estimate.media)
+        pixels = self._size[0] * self._size[1]
+        few, worth = probed(pixels) * pixels, PART * pixels * self._spp * self.settings.frames / SAMPLES
+        self.probes = Probes(self.sensor, self.estimate.media, round(min(max(few, worth), MANY * few)))
         march = self.settings.but(visibility="raymarch")
         truth = self._looked(march)
         self.estimate.dearer = self._price(truth) / max(self.estimate.seconds(march), 1e-9)
