@@ -179,7 +179,7 @@ class Bundle:
 
 
 class Cell(NamedTuple):
-    """A piece of a ray in PARTS parts, each of constant densities.
+    """A piece of a ray in PARTS parts, the mean densities of which are known.
 
     begin, part  where it begins; the length of a part
     sigmas       per part a list, the density of each field

@@ -81,10 +81,10 @@ def camera_samples(strands, maxt, offset, depth, shade=True, view=False) -> Samp
     shade     whether there is use for the samples; otherwise only `transmittance` is found
     view      whether `view` is wanted
 
-    Quadrature of method.md, section 1: α_j = 1 − e^(−σ_j Δ), w_j = T_j α_j, σ_j the mean of the densities in the
-    middle of cell j's PARTS, the sum over the fields. The sample lies where free flight through those parts would end,
+    Quadrature of method.md, section 1: α_j = 1 − e^(−σ_j Δ), w_j = T_j α_j, σ_j the mean density of cell j's PARTS,
+    each asked in its middle, the sum over the fields. The sample lies where free flight through those parts would end,
     so that quantities that vary within a cell, above all the light's own transmittance, are averaged with the right
-    weights: the expectation over `depth` is exact for densities constant in each part. Up to that point the cell lets
+    weights: the expectation over `depth` is right for densities linear across each part. Up to that point the cell lets
     1 − depth·α_j through.
 
     Samples that weigh at most MIN_WEIGHT_RATE times their cell's length in every field are left out.
@@ -212,7 +212,7 @@ def free_flight(strands, maxt, offset, depth, which):
 
     Arguments as :func:`camera_samples`; `which`, uniform in [0, 1), says whose matter it is where several overlap.
     Returns ``(hit, t, index, bundle)``: whether a ray ends before `maxt`, where (t of `bundle`), and the strand's
-    index. Linear depth within the parts of cells.
+    index. Densities linear across the parts of cells.
     """
     bundle = Bundle(strands, maxt, offset)
     floats, uint = type(bundle.base), dr.uint32_array_t(type(bundle.base))

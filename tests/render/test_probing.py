@@ -47,7 +47,7 @@ def looks(rng, probes, bias, noise, drawn):
 @pytest.fixture
 def probes():
     film = {**scenes.film(256), "rfilter": {"type": "box"}}
-    return probing.Probes(mi.load_dict({"type": "perspective", "fov": 30.0, "film": film}), [])
+    return probing.Probes(mi.load_dict({"type": "perspective", "fov": 30.0, "film": film}), [], probing.MOST)
 
 
 def test_noise_of_drawn_lights_is_no_error(rng, probes):

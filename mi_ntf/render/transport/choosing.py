@@ -22,7 +22,7 @@ from .probing import SAMPLES, Look, Probes, probed
 TRIAL = 0.5
 """Seconds that a trial takes: what saves less is not tried."""
 IN_VAIN = 0.5
-"""Of what is built for a trial, what is lost: as if half of the trials failed."""
+"""Of what is built for the trial of a method, what is lost: the pictures use it, as if half of the trials failed."""
 MARGIN = 0.9
 """Of `max_error`, what the probes may show: what is taken is what they happen to find good."""
 SHARED = 0.5
@@ -135,14 +135,9 @@ class Chooser:
         """Seconds of a picture, what is built shared among the frames."""
         return look.built / self.settings.frames + look.each * self._spp
 
-    def _pays(self, saved: float, settings: Settings | None = None) -> bool:
-        """Whether so many seconds less a picture are worth a trial of `settings`: maps are made anew for it; what is
-        built for a field serves the pictures as well, or was in vain."""
-        built = 0.0
-        if settings:
-            of_field = REGISTRY[settings.visibility].per_field
-            built = self.estimate.built(settings) * (IN_VAIN * self.settings.frames if of_field else 1.0)
-        return saved * self.settings.frames >= TRIAL + built
+    def _pays(self, saved: float, lost: float = 0.0) -> bool:
+        """Whether so many seconds less a picture are worth a trial, which loses `lost` seconds of building."""
+        return saved * self.settings.frames >= TRIAL + lost
 
     def _by_error(self) -> Choice:
         named = self.settings.visibility != "auto"
@@ -175,7 +170,8 @@ class Chooser:
         full, settings = march.seconds, marched.composition.settings
         for seconds, candidate in sorted(((self.estimate.seconds(s), s) for s in self._candidates(lit)),
                                          key=lambda pair: pair[0]):
-            if not self._pays(full - seconds, candidate):
+            of_all = self.settings.frames if REGISTRY[candidate.visibility].per_field else 1
+            if not self._pays(full - seconds, IN_VAIN * of_all * self.estimate.built(candidate)):
                 self._tried(candidate, seconds, why="saves less than a trial takes")
                 continue
             look = self._looked(candidate)
@@ -202,7 +198,8 @@ class Chooser:
         for name, of in omissions.items():
             while (settings := of(look.composition.settings, look.composition)) is not None:
                 share = self.estimate.seconds(settings) / self.estimate.seconds(look.composition.settings)
-                if (share > 1 - SAVING or not self._pays(best.seconds * (1 - share), settings)
+                anew = 0.0 if REGISTRY[settings.visibility].per_field else self.estimate.built(settings)
+                if (share > 1 - SAVING or not self._pays(best.seconds * (1 - share), anew)
                         or self._errors.get(settings, 0.0) > limit):
                     break
                 if name in LIGHTS and (error := self._glints(settings)) > limit:

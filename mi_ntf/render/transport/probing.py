@@ -45,15 +45,14 @@ class Probes:
     """Camera rays through pixels here and there; through those of fields that are small in the picture, all the more.
 
     weight  (probes,): share of the picture that each stands for
-    pixels  how many, where so many are there; 0: a share of the picture
+    pixels  how many, where so many are there
     """
 
-    def __init__(self, sensor, media: list, pixels: int = 0):
+    def __init__(self, sensor, media: list, pixels: int):
         width, height = (int(n) for n in sensor.film().crop_size())
         self._pixels = width * height
         rng = np.random.default_rng(0)
-        count = min(pixels, self._pixels) or probed(self._pixels) * self._pixels
-        groups = max(1, round(count / GROUP))
+        groups = max(1, round(min(pixels, self._pixels) / GROUP))
         places, self.weight = _places(rng, groups, _small(sensor, media), 1 / width)
         self.count = len(self.weight)
         self._sharpness = _pixels_of(sensor.film().rfilter())
