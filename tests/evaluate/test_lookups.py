@@ -18,6 +18,7 @@ def small(monkeypatch):
     monkeypatch.setenv("MI_NTF_MAP_CACHE", "memory")
 
 
+@pytest.mark.slow  # its scene is read at full size
 def test_directions_of_their_own_and_shared_ones(monkeypatch):
     monkeypatch.setattr(lookups, "LIGHTS", 2)
     monkeypatch.setattr(lookups.calibration, "WIDTH", 1 << 10)
