@@ -111,7 +111,6 @@ def outline(text: str) -> Outline:
     return found
 
 
-@pytest.mark.slow
 def test_the_command_from_end_to_end(folder, done, capsys):
     assert cli.main(["tradeoff", str(folder / "scene.xml"), "-o", str(done), "--budget", "3m"]) == 0
     printed = capsys.readouterr()
