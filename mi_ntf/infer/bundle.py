@@ -7,7 +7,7 @@ on one lattice per ray, so that skipping changes no value.
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import reduce
-from typing import Any, NamedTuple
+from typing import Any
 
 import drjit as dr
 
@@ -16,8 +16,9 @@ from . import ops
 from .grid import CELLS
 
 MIN_WEIGHT_RATE = 0.02
-"""Samples that weigh less than this times their cell's length are not shaded: matter that would add less than 2 % of a
-pixel per unit-sphere radius of depth. It is the tail of nearly spent rays, and the faint rim of a skin."""
+"""Cells that take less than this times their length are not shaded where lights shine from the camera: matter that
+would add less than 2 % of a pixel per unit-sphere radius of depth, the tail of nearly spent rays and the faint rim of a
+skin."""
 PARTS = 4
 """Densities in a cell, of which one point at most is shaded. A single one in the middle of cells as long as a skin is
 thick put light and shading too deep: relit objects were 2 % too bright, at 1/384 of the diameter."""
@@ -141,7 +142,7 @@ class Bundle:
             return tuple(type(begin)(0) for _ in range(PARTS * count))
 
         sigmas = dr.if_stmt((begin, part), active & (skip <= (PARTS - 1) * part), look, nothing, label="cell")
-        return Cell(begin, part, tuple(sigmas[k : k + count] for k in range(0, PARTS * count, count)), skip)
+        return Cell(begin, part, tuple(tuple(sigmas[k : k + count]) for k in range(0, PARTS * count, count)), skip)
 
     def point(self, i: int, t):
         """The point at `t` in the coordinates of field `i`."""
@@ -171,14 +172,15 @@ class Bundle:
         ]
 
     def counts(self, shares, step):
-        """Whether a sample of these weights is worth shading: that of some field, in its own unit."""
+        """Whether a cell of these weights is worth shading: that of some field, in its own unit."""
         hit = False
         for s, share in zip(self.strands, shares, strict=True):
             hit = (share > MIN_WEIGHT_RATE * step * (1 if s.rate is None else s.rate)) | hit
         return hit
 
 
-class Cell(NamedTuple):
+@dataclass
+class Cell:
     """A piece of a ray in PARTS parts, the mean densities of which are known.
 
     begin, part  where it begins; the length of a part

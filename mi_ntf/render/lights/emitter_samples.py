@@ -25,6 +25,7 @@ class EmitterSamples:
               it has no extent
     least     at least so many, of all emitters together or of each with an extent
     resampled candidates of each light that is resampled
+    gradients whether emitters or points are attached: what is kept of the candidates is then drawn once more
 
     A light is the one that resampling keeps of a few draws, with chances in proportion to the light that each
     would scatter to the viewer, were nothing in the way (Talbot et al. 2005): of the many that could, the few worth a
@@ -32,9 +33,10 @@ class EmitterSamples:
     """
 
     def __init__(self, emitters: list, weights: list[float], frame: Frame, points, seed, count: int = 0,
-                 least: int = 0, *, resampled: int):
-        self.frame, self.points = frame, points
-        self._emitters = mi.EmitterPtr(emitters)
+                 least: int = 0, *, resampled: int, gradients: bool = False):
+        self.frame, self.points, self._gradients = frame, points, gradients
+        # A single one is asked as itself, without a call through a table.
+        self._emitters = mi.EmitterPtr(emitters) if len(emitters) > 1 else emitters[0]
         self._choice = mi.DiscreteDistribution(weights) if count and len(emitters) > 1 else None
         rows = [(0, resampled)] * (count and max(count, least)) or [
             (i, 1) if mi.has_flag(e.flags(), mi.EmitterFlags.DeltaPosition) else (i, resampled)
@@ -59,13 +61,16 @@ class EmitterSamples:
         it = dr.zeros(mi.Interaction3f, dr.width(x[0]))
         it.p = self.frame.point_to_world(x)
         with dr.suspend_grad():
-            kept, weight = self._resample(index, it, active)
-        ds, irradiance = self._draw(index, kept, it, active)
-        irradiance *= weight
-        return self.frame.direction_to_field(ds.d), tuple(irradiance), ds.dist / self.frame.length
+            kept, d, irradiance, distance, weight = self._resample(index, it, active)
+        if self._gradients:
+            ds, irradiance = self._draw(index, kept, it, active)
+            d, distance = ds.d, ds.dist
+        irradiance = irradiance * weight
+        return self.frame.direction_to_field(d), tuple(irradiance), distance / self.frame.length
 
     def _resample(self, index, it, active):
-        """The candidate kept for light `index`, and the weight of its irradiance in the estimate."""
+        """The candidate kept for light `index`: its number, direction, irradiance over its density and distance; and
+        the weight of its irradiance in the estimate."""
         candidates = dr.gather(mi.UInt32, self._candidates, index, active)
         share = dr.gather(mi.Float, self._share, index, active)
         p, fraction = self.points, dr.rcp(3 * mi.Float(candidates))
@@ -78,27 +83,33 @@ class EmitterSamples:
             total = total + target
             u = mi.sample_tea_float32(self._lane ^ self._seed, index * self._most + k)
             keep = u * total < target
-            return k + 1, dr.select(keep, k, kept), dr.select(keep, target, of_kept), total
+            this = k, mi.Vector3f(ds.d), mi.Color3f(irradiance), mi.Float(ds.dist)
+            kept = tuple(dr.select(keep, new, old) for new, old in zip(this, kept, strict=True))
+            return k + 1, kept, dr.select(keep, target, of_kept), total
 
-        zero = dr.zeros(mi.UInt32, dr.width(it.p))
+        n = dr.width(it.p)
+        zero: Any = dr.zeros(mi.UInt32, n)
+        none = mi.UInt32(zero), dr.zeros(mi.Vector3f, n), dr.zeros(mi.Color3f, n), dr.ones(mi.Float, n)
         _, kept, of_kept, total = dr.while_loop(
-            state=(zero, zero, dr.zeros(mi.Float, dr.width(it.p)), dr.zeros(mi.Float, dr.width(it.p))),
+            state=(zero, none, dr.zeros(mi.Float, n), dr.zeros(mi.Float, n)),
             cond=lambda k, kept, of_kept, total: active & (k < candidates),
             body=body,
             label="light candidates",
         )
-        return kept, dr.select(of_kept > 0, share * total / (of_kept * candidates), 0)
+        return *kept, dr.select(of_kept > 0, share * total / (of_kept * candidates), 0)
 
     def _draw(self, index, k, it, active):
         """Candidate `k` of light `index`: Mitsuba's sample, and its irradiance over its density."""
         n = index * self._most + k
         # Evenly spread over a point's candidates, each uniform by itself: 24 bits of a float's mantissa.
         u = [mi.Float((shift + n * stride) >> 8) * 2**-24 for shift, stride in zip(self._shift, STRIDE, strict=True)]
-        emitter, weight = dr.gather(mi.UInt32, self._emitter, index, active), 1
-        if self._choice is not None:
-            emitter, u[0], pmf = self._choice.sample_reuse_pmf(u[0], active)
-            weight = dr.rcp(pmf)
-        chosen = dr.gather(mi.EmitterPtr, self._emitters, emitter, active)
-        ds, irradiance = chosen.sample_direction(it, mi.Point2f(*u), active)
+        emitter, weight = self._emitters, 1
+        if isinstance(emitter, mi.EmitterPtr):
+            chosen = dr.gather(mi.UInt32, self._emitter, index, active)
+            if self._choice is not None:
+                chosen, u[0], pmf = self._choice.sample_reuse_pmf(u[0], active)
+                weight = dr.rcp(pmf)
+            emitter = dr.gather(mi.EmitterPtr, emitter, chosen, active)
+        ds, irradiance = emitter.sample_direction(it, mi.Point2f(*u), active)
         ds.d = dr.normalize(ds.d)  # an environment's has the length of its to_world
         return ds, dr.select(ds.pdf > 0, irradiance * weight, 0)

@@ -117,14 +117,15 @@ class Lights:
         light_gradients.attach(table, self.rows, self.discrete, frame)
         return table
 
-    def sources(self, table: LightTable, frame: Frame, points, seed, draws: int, resampled: int) -> list:
+    def sources(self, table: LightTable, frame: Frame, points, seed, draws: int, resampled: int,
+                gradients: bool = False) -> list:
         """What to sum over at `points` (in the coordinates of `frame`): pairs of a source, which has ``count`` and
         ``sample``, and whether its index is a row of `table`, which is what maps are made for. `draws`: least number
-        of lights drawn; `resampled`: candidates of each (:class:`EmitterSamples`)."""
+        of lights drawn; `resampled`: candidates of each; `gradients`: lights are attached (:class:`EmitterSamples`)."""
         result: list[tuple[Any, bool]] = [(table, True)] if table.count else []
         if self.sampled:
             drawn = EmitterSamples(self.sampled, self._weights, frame, points, seed, self.light_samples, draws,
-                                   resampled=resampled)
+                                   resampled=resampled, gradients=gradients)
             result.append((drawn, False))
         return result
 

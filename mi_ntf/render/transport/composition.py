@@ -185,7 +185,8 @@ class Composition:
         `surface`: whether they are diffuse points of a surface above the skin; `draws`: least number of those drawn."""
         total = [dr.zeros(mi.Float, dr.width(points.x[0])) for _ in range(3)]
         candidates = REGISTRY[REGISTRY[self.effects.visibility].for_drawn].candidates
-        for source, mapped in self.lights.sources(part.table, part.frame, points, stream, draws, candidates):
+        for source, mapped in self.lights.sources(part.table, part.frame, points, stream, draws, candidates,
+                                                  self.effects.gradients):
             if self.run and not mapped:
                 continue
             # Maps and volumes stay where the lights were.
