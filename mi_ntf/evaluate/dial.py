@@ -41,7 +41,7 @@ NAMES = ("statue", "globe", "knot", "cloud", "skull")
 LIGHTS = ("point", "directional", "env", "sky", "area")
 LIMIT, FRAMES = 0.02, (1, 20)
 THRESHOLDS = (0.1, 0.03, 0.01)
-BUDGETS = (5.0, 20.0)
+BUDGETS, WARM = (5.0, 20.0), 2.0
 TRUTH, STOCK, MORE, DEPTH = 4096, 8, 7, 6
 FIXED: list[dict[str, Any]] = [
     {"visibility": "raymarch"}, {"visibility": "transmittance_atlas"}, {"visibility": "neural_transmittance"},
@@ -177,7 +177,7 @@ def time_case(name: str, light: str, size: int, spp: int) -> list[dict[str, Any]
         found = []
         for options in ({}, *({"visibility": v} for v in ("raymarch", "transmittance_atlas", "transmittance_map"))):
             with maps_in_memory():
-                picture(loaded, integrator(time_budget=budget, **options), 9)
+                picture(loaded, integrator(time_budget=WARM, **options), 9)
                 map_cache.forget()
                 nrf = integrator(time_budget=budget, **options)
                 image, seconds = picture(loaded, nrf, 1)

@@ -18,6 +18,7 @@ class LightTable:
     scale     scene units per field unit, since irradiance falls with the distance in the scene
     cones     (n, 5) or None where no light has one: unit axis away from a spot light; the angles from it, radians, at
               which its light begins to fall, linearly, and at which it ends. Wider than π: no cone
+    far       whether all lie outside of the unit sphere and stay there
     """
 
     def __init__(
@@ -39,6 +40,8 @@ class LightTable:
         self._rows = floats(rows, dj)
         self._scale = dr.opaque(dj.Float, scale)
         self.moving = False  # whether a light's place carries gradients
+        self._parallel = not self.is_point.any()
+        self.far = bool((np.linalg.norm(self.where[self.is_point], axis=1) > 1).all())
         self._cones: list | None = None if cones is None else [floats(c, dj) for c in np.transpose(cones)]
 
     def part(self, first: int, last: int) -> "LightTable":
@@ -56,6 +59,8 @@ class LightTable:
         """Let gradients flow to `where`, `power` and, if there are cones, their `axes`: 3-tuples of arrays of a number
         a light. Their values stay."""
         self.moving = dr.grad_enabled(where) or dr.grad_enabled(axes)
+        self._parallel = self._parallel and not self.moving
+        self.far = self.far and not self.moving
         # Dr.Jit's stub has replace_grad return nothing.
         replaced: Any = dr.replace_grad
         if axes is not None and self._cones is not None:
@@ -69,13 +74,16 @@ class LightTable:
     def sample(self, index, x, active):
         """Light `index` seen from `x`: ``(wi, irradiance, distance)``.
 
-        `wi`: unit 3-tuple towards the light; `irradiance`: 3-tuple on a surface that faces it; `distance`: field units.
+        `wi`: unit 3-tuple towards the light; `irradiance`: 3-tuple on a surface that faces it; `distance`: field units,
+        literally infinite where all lights are directional.
         """
         # Two fetches of four numbers: several times faster than seven of one.
         first = 2 * self.dj.UInt32(index)
         where = dr.gather(self.dj.Array4f, self._rows, first, active)
         power = dr.gather(self.dj.Array4f, self._rows, first + 1, active)
         flag, power = where[3], self.dj.Array3f(power[0], power[1], power[2])
+        if self._parallel:
+            return (where[0], where[1], where[2]), tuple(power), self.dj.Float(dr.inf)
         d = self.dj.Array3f(where[0], where[1], where[2]) - flag * self.dj.Array3f(*x)
         r2 = dr.maximum(dr.dot(d, d), 1e-8)
         inverse = dr.rsqrt(r2)

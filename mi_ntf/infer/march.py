@@ -193,7 +193,7 @@ def camera_light(strands, maxt, offset, depth, reflect):
 
 @dataclass
 class _Here:
-    """A cell on a walk: its lattice's `t`, and how many cells it is from the beginning (`number`), the view's
+    """A cell on a walk: its lattice's `t`, and how many of its length it is from the beginning (`number`), the view's
     `transmittance` to it, the share `alpha` of it that the cell takes, its `weight`, and that of each field
     (`shares`)."""
 
@@ -235,7 +235,7 @@ def _walk(bundle, emit, state):
         alpha = _absorbed(cell.depth)
         w = transmittance * alpha
         shares = (w,) if bundle.single else tuple(transmittance * share for share in cell.shares())
-        number = uint((t - bundle.begin) * dr.rcp(bundle.cells[0]) + 0.5)
+        number = uint((t - bundle.begin) * dr.rcp(step) + 0.5)
         here = _Here(t, number, transmittance, alpha, w, shares, cell)
         transmittance = dr.select(active, transmittance - w, transmittance)
         t = t + onward(cell.skip, step, PARTS)

@@ -4,6 +4,7 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ...infer import scatter
 from ..scene.frame import Frame
@@ -27,6 +28,8 @@ class EmitterSamples:
     resampled candidates of each light that is resampled
     gradients whether emitters or points are attached: what is kept of the candidates is then drawn once more
 
+    far       whether all emitters lie outside of the field's sphere
+
     A light is the one that resampling keeps of a few draws, with chances in proportion to the light that each
     would scatter to the viewer, were nothing in the way (Talbot et al. 2005): of the many that could, the few worth a
     visibility. It is weighted so that the mean over all draws is the sum over all emitters.
@@ -43,7 +46,7 @@ class EmitterSamples:
             for i, e in enumerate(emitters)
             for _ in range(1 if mi.has_flag(e.flags(), mi.EmitterFlags.DeltaPosition) else max(SAMPLES, least))
         ]
-        self.count = len(rows)
+        self.count, self.far = len(rows), all(_outside(e, frame) for e in emitters)
         of_emitter = [sum(row[0] == i for row in rows) for i in range(len(emitters))]
         self._emitter, self._candidates, self._share = (
             mi.UInt32([i for i, _ in rows]),
@@ -113,3 +116,15 @@ class EmitterSamples:
         ds, irradiance = emitter.sample_direction(it, mi.Point2f(*u), active)
         ds.d = dr.normalize(ds.d)  # an environment's has the length of its to_world
         return ds, dr.select(ds.pdf > 0, irradiance * weight, 0)
+
+
+def _outside(emitter, frame: Frame) -> bool:
+    """Whether an emitter is known to lie outside of the unit sphere of `frame`."""
+    if emitter.is_environment():
+        return True
+    shape = emitter.get_shape()
+    if shape is None:
+        return False
+    box = shape.bbox()
+    nearest = np.clip(frame.origin, np.array(box.min), np.array(box.max))
+    return bool(np.linalg.norm(nearest - frame.origin) > frame.length)

@@ -191,14 +191,17 @@ class Composition:
                 continue
             # Maps and volumes stay where the lights were.
             kind = "mapped" if mapped and not part.table.moving else "drawn"
-            shadow = Known(view) if view is not None else self.shadow(part, kind)
+            shadow = Known(view) if view is not None else self.shadow(part, kind, source.far)
             light = shade.reflect(points, source, shadow, self.effects.specular and not surface,
                                   self.effects.gradients, not surface)  # fmt: skip
             total = [a + b for a, b in zip(total, light, strict=True)]
         return total
 
-    def shadow(self, part: Part, kind: str):
-        """What dims the light of kind `kind`, ``mapped`` or ``drawn``, at points of `part`: every field and surface."""
+    def shadow(self, part: Part, kind: str, far: bool = False):
+        """What dims the light of kind `kind`, ``mapped`` or ``drawn``, at points of `part`: every field and surface;
+        `far`: the lights lie outside of the part's sphere."""
         own = getattr(part, kind)
+        far = far and (kind == "drawn" or REGISTRY[self.effects.visibility].per_field)  # a light's map needs its place
         others = [(p.frame, getattr(p, kind)) for p in self.parts if p is not part]
-        return Shadow(part.frame, own, others, self.surfaces) if own and (others or self.surfaces) else own
+        whole = others or self.surfaces or far
+        return Shadow(part.frame, own, others, self.surfaces, far) if own and whole else own

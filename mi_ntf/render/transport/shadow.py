@@ -7,14 +7,15 @@ from ...infer.visibility import outside
 
 class Shadow:
     """All that dims a light on its way to points of one field: that field (`own`, a visibility method in the
-    coordinates of `frame`), the others (pairs of frame and method) and `surfaces`. A visibility method itself."""
+    coordinates of `frame`), the others (pairs of frame and method) and `surfaces`; `far`: the light lies outside of
+    that field's sphere, which might as well be infinitely far away for it. A visibility method itself."""
 
-    def __init__(self, frame, own, others: list, surfaces):
-        self.frame, self.own, self.others, self.surfaces = frame, own, others, surfaces
+    def __init__(self, frame, own, others: list, surfaces, far: bool = False):
+        self.frame, self.own, self.others, self.surfaces, self.far = frame, own, others, surfaces, far
 
     def tau(self, x, wi, distance, index, active):
         """The product of their transmittances, in [0, 1]."""
-        tau = self.own.tau(x, wi, distance, index, active)
+        tau = self.own.tau(x, wi, type(distance)(dr.inf) if self.far else distance, index, active)
         p, d = self.frame.point_to_world(x), self.frame.direction_to_world(wi)
         length = distance * self.frame.length
         for frame, other in self.others:
