@@ -12,7 +12,7 @@ from .backend import floats
 class LightTable:
     """Point and directional lights, one row each.
 
-    where     (n, 3): position of a point light; unit vector towards a directional light
+    where     (n, 3): position of a point light; direction towards a directional one, of any length
     power     (n, 3): radiant intensity of a point light (W/sr), irradiance of a directional light (W/m²), linear RGB
     is_point  (n,) bool
     scale     scene units per field unit, since irradiance falls with the distance in the scene
@@ -36,6 +36,8 @@ class LightTable:
         self.dj = dj
         self._arguments = where, power, is_point, scale, dj, cones
         flag = self.is_point[:, None]
+        length = np.linalg.norm(self.where, axis=1, keepdims=True)
+        self.where = np.where(flag, self.where, self.where / np.maximum(length, 1e-300))
         rows = np.concatenate([self.where, flag, np.reshape(power, (-1, 3)), 0 * flag], axis=1)
         self._rows = floats(rows, dj)
         self._scale = dr.opaque(dj.Float, scale)
@@ -90,6 +92,8 @@ class LightTable:
         point = flag > 0
         irradiance = power * dr.select(point, dr.rcp(r2 * self._scale * self._scale), 1)
         wi = d * inverse
+        if not self.moving:  # the very numbers that tables without point lights have
+            wi = dr.select(point, wi, d)
         if self._cones is not None:
             irradiance *= self._falloff(index, wi, active)
         return tuple(wi), tuple(irradiance), dr.select(point, r2 * inverse, dr.inf)
