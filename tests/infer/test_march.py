@@ -127,8 +127,7 @@ def test_optical_depth_of_a_uniform_sphere(slab):
 
 
 def test_skipping_changes_nothing(grid, rng):
-    """The same rays with an occupancy that never lets a march skip: equal weights and places, sample by sample. Which
-    of its cells a sample lies in may turn on the last bit of a weight, for one in a hundred."""
+    """The same rays with an occupancy that never lets a march skip: equal weights, sample by sample."""
 
     class Everywhere:
         clearance = dr.zeros(mi.Float, len(grid.clearance))
@@ -142,11 +141,8 @@ def test_skipping_changes_nothing(grid, rng):
     strands = [[Strand(grid.density, g, arrays(o), arrays(d), mi.Float(2 / 300))] for g in (grid, Everywhere)]
     fast, slow = ((s.ray, s.t, *s.weights) for s in (march.camera_samples(k, *arguments) for k in strands))
     order = [np.lexsort((np.array(r[1]), np.array(r[0]))) for r in (fast, slow)]
-    (ray, t, *weights), (ray_too, t_too, *weights_too) = (
-        [np.array(a)[o] for a in arrays_] for arrays_, o in zip((fast, slow), order, strict=True))
-    for a, b in zip((ray, *weights), (ray_too, *weights_too), strict=True):
-        np.testing.assert_allclose(a, b, atol=2e-5)
-    assert np.mean(np.abs(t - t_too) > 2e-5) < 0.01
+    for a, b in zip(fast, slow, strict=True):
+        np.testing.assert_allclose(np.array(a)[order[0]], np.array(b)[order[1]], atol=2e-5)
 
 
 def test_shared_samples_are_fair(grid, rng, monkeypatch):

@@ -9,6 +9,7 @@ from helpers import emitters, scenes, ztest
 
 from mi_ntf.core.architecture import Similarity
 from mi_ntf.infer import shade
+from mi_ntf.infer.lights import LightTable
 from mi_ntf.render.lights import emitter_samples, scene_lights
 from mi_ntf.render.scene.frame import Frame
 
@@ -112,6 +113,31 @@ def test_resampled_lights_are_unbiased_and_quieter(kinds, rng):
         spread[candidates] = np.sqrt((deviation**2).mean() / (truth**2).mean())
     print(kinds, "noise of 2 lights, resampled and plain:", spread[8], spread[1])
     assert spread[8] < 0.6 * spread[1] and spread[8] < spread[2] < spread[1]
+
+
+@pytest.mark.parametrize(("where", "far"), [((0, 0, 1.5), True), ((0, 0, 1.2), False), ((0, 0, 0.5), False)])
+def test_lamps_outside_of_a_field_are_known(where, far, rng):
+    """A ball of radius 0.3 outside of the unit sphere, across it and inside: alone and beside an environment."""
+    lamp = mi.load_dict({"type": "sphere", "center": where, "radius": 0.3, "light": {"type": "area"}})
+    lamps, at = [lamp.emitter()], points(1, 1, rng)
+    assert drawn(lamps, at, 1).far is far
+    assert drawn([*lamps, mi.load_dict(emitter("constant"))], at, 1).far is far
+    assert not drawn([mi.load_dict(emitter("spot"))], at, 1).far  # places of others are not known
+
+
+def test_directions_of_any_length_are_unit_vectors():
+    """Alone and beside a point light, to the bit."""
+    where = np.array([[0.6, 0.64, 0.48], [0, 0, 4]])
+    x = tuple(mi.Float([0.1, 0.2]) for _ in range(3))
+
+    def toward(scale, rows):
+        table = LightTable(np.array([[scale], [1.0]])[:rows] * where[:rows], np.ones((rows, 3)),
+                           np.array([False, True])[:rows], 1.0, mi)
+        assert table.far
+        return np.array(table.sample(dr.zeros(mi.UInt32, 2), x, True)[0])
+
+    np.testing.assert_allclose(toward(3.0, 1), np.tile(where[0][:, None], 2), rtol=1e-6)
+    np.testing.assert_array_equal(toward(3.0, 1), toward(3.0, 2))
 
 
 def towards(emitter, p: np.ndarray, u=(0.5, 0.5)):

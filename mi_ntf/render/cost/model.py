@@ -28,9 +28,9 @@ FACING = 0.5
 """Share of (point, light) pairs whose light falls on the front, the others ask for no visibility."""
 COVERAGE = 0.35
 """Share of the camera rays that hit the object."""
-POINTS_A_HIT = 8.5
-"""Shading points of a camera ray that hits, at 384 samples across the diameter; they grow with the root of those (7 to
-10 on four objects; 5 to 7 at 192, 10 to 14 at 768)."""
+POINTS_A_HIT = 9.0
+"""Shading points of a camera ray that hits, at 384 samples across the diameter (7 to 11 on four objects); they grow
+with about the root of those."""
 NOT_SKIPPED = 0.05
 """Share of the samples across the diameter at which a camera ray's march asks the field."""
 

@@ -11,6 +11,9 @@ from ..scene.frame import Frame
 
 SAMPLES = 2
 """Resampled lights a point for each emitter with an extent, where all discrete lights are summed."""
+LEAST = 0.01
+"""Of its irradiance that a candidate which is lit counts for at least: what is kept stands for what is not, and of one
+that hardly shows so many times its light would be no number."""
 STRIDE = 3242174889, 2447445414
 """Powers of the inverse plastic number, times 2³²: the additive sequence R2 that fills a square most evenly."""
 
@@ -82,7 +85,9 @@ class EmitterSamples:
             ds, irradiance = self._draw(index, k, it, active)
             value, _ = scatter.evaluate(self.frame.direction_to_field(ds.d), p.wo, p.reflectance)
             # Light may be negative. Scaled, so that the sum of the brightest that floats hold is still one.
-            target = dr.abs(sum(fraction * e * v for e, v in zip(irradiance, value, strict=True)))
+            shows = dr.abs(sum(fraction * e * v for e, v in zip(irradiance, value, strict=True)))
+            least = LEAST * dr.abs(sum(fraction * e for e in irradiance))
+            target = dr.select(shows > 0, dr.maximum(shows, least), 0)
             total = total + target
             u = mi.sample_tea_float32(self._lane ^ self._seed, index * self._most + k)
             keep = u * total < target
