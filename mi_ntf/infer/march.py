@@ -10,8 +10,8 @@ from .bundle import PARTS, Bundle, Cell, onward
 SHARE = 0.04
 """Of its ray that a sample stands for at least. Cells that take less, two thirds of all that hold matter, share one: to
 equal noise a picture takes 0.57 to 0.64 of the time that it takes with shares of 0.002 (environment, atlas; four opaque
-objects), with 2 % more noise at most. Smoke has 2.5 times as much, in a sixth of the time. Shares of 0.05 are faster still,
-but a picture then changes by 0.22 % where float32 places lie 7e-4 radii apart."""
+objects), with 2 % more noise at most. Smoke has 2.5 times as much, in a sixth of the time. Shares of 0.05 are faster
+still, but a picture then changes by 0.22 % where float32 places lie 7e-4 radii apart."""
 MIN_SHARE = 1e-4
 """Rays that lose less light have no sample, nor have ends of rays that do."""
 MIN_TRANSMITTANCE = 1e-3
