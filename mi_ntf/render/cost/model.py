@@ -18,6 +18,7 @@ import numpy as np
 from ... import __version__
 from ...core import radiosity
 from ...infer.grid import CELLS
+from ...infer.march import SHARE
 from ...infer.visibility import REGISTRY
 from .. import user_cache
 
@@ -178,8 +179,9 @@ def memory(work: Work, chunk: int) -> dict[str, int]:
     camera, between = min(chunk, work.rays), work.patches * radiosity.SIDE**2
     return {
         "field grid": 4 * work.voxels**3 + 32 * min(work.voxels, 128) ** 3,
-        # Some 24 floats a shading point, 12 a ray between patches, in arrays that Dr.Jit rounds up to powers of two.
-        "rays in flight": round(max(camera * max(share, 1) * 128, between * 72)),
+        # Some 24 floats a shading point, 12 a ray between patches, in arrays that Dr.Jit rounds up to powers of two;
+        # and two for each point that a camera ray may have.
+        "rays in flight": round(max(camera * (max(share, 1) * 128 + 8 / SHARE), between * 72)),
     }
 
 
