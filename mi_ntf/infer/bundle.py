@@ -4,6 +4,7 @@ They skip empty space by the grid's clearance: inside the empty cube around a ce
 on one lattice per ray, so that skipping changes no value.
 """
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import reduce
@@ -14,14 +15,22 @@ import drjit as dr
 from ..core import spheres
 from . import ops
 from .grid import CELLS
+from .network import NOTHING, density_of
 
 MIN_WEIGHT_RATE = 0.02
 """Cells that take less than this times their length are not shaded where lights shine from the camera: matter that
 would add less than 2 % of a pixel per unit-sphere radius of depth, the tail of nearly spent rays and the faint rim of a
 skin."""
-PARTS = 4
-"""Densities in a cell, of which one point at most is shaded. A single one in the middle of cells as long as a skin is
-thick put light and shading too deep: relit objects were 2 % too bright, at 1/384 of the diameter."""
+PIECES = 3
+"""Of a cell, at whose ends densities are asked; neighbours share an end. To pictures of 16 pieces, brightness and RMS
+differ by 0.05 and 0.2 % at most, those of 2 pieces by 0.14 and 0.7 % (`statue`, `globe`, `knot`, `skull`, point light).
+A single density in the middle of cells as long as a skin is thick put light and shading too deep: relit objects were
+2 % too bright."""
+STEEP = 1.594
+"""Of the logarithms of the densities at a piece's ends, the difference that is taken for an exponential. Where they
+differ by more, its mean is half of the higher one: that is right on average where density sets in at once."""
+INSET = 0.001
+"""Of a piece: densities are asked so far before its end, within the sphere where a ray leaves it."""
 
 
 def clear_distance(grid, p, inverse_d):
@@ -60,6 +69,7 @@ class Strand:
     o, d     origin and unit direction, 3-tuples, field coordinates
     step     length of the march's cells, field units
     rate     field units per unit of the ray's parameter t; None: t is in these field units (a ray of one strand)
+    logs     callable, ln σ at a point, NOTHING where there is none and wherever `grid` is clear; None: by `density`
     """
 
     density: Callable
@@ -68,6 +78,7 @@ class Strand:
     d: tuple
     step: object
     rate: object = None
+    logs: Callable | None = None
 
 
 class Bundle:
@@ -125,24 +136,32 @@ class Bundle:
             length = dr.minimum(length, dr.select(t < end, dr.select(t < begin, ahead, cell), dr.inf))
         return dr.select(length < dr.inf, length, self.cells[0])
 
-    def cell(self, t, step, active) -> "Cell":
-        """The cell at `t`, cut off where the ray begins and ends (a surface may be there)."""
+    def first(self) -> tuple:
+        """What :meth:`cell` asks for where the rays begin."""
+        return tuple(self.logs(INSET / PIECES * self.step(dr.zeros(type(self.base), dr.width(self.base)))))
+
+    def cell(self, t, step, active, before: tuple) -> "Cell":
+        """The cell at `t`, cut off where the ray begins and ends (a surface may be there). `before`: ln σ of each field
+        there, which the last cell knows."""
         begin = dr.maximum(t, 0)
-        part = (dr.minimum(t + step, self.end) - begin) * (1 / PARTS)
-        skip = reduce(dr.minimum, self.clear(begin + 0.5 * part)[0])
+        part = (dr.minimum(t + step, self.end) - begin) * (1 / PIECES)
+        skip = reduce(dr.minimum, self.clear(begin)[0])
         count = len(self.strands)
 
-        def look(begin, part):
-            sigmas = [self.densities(begin + (k + 0.5) * part) for k in range(PARTS)]
-            totals = [sum(here[1:], here[0]) for here in sigmas]
-            means = [1 + b * b * (1 / 6) for b in bends(totals)]
-            return tuple(sigma * mean for here, mean in zip(sigmas, means, strict=True) for sigma in here)
+        def look(begin, part, *before):
+            knots = [before, *(self.logs(begin + (k + 1 - INSET) * part) for k in range(PIECES))]
+            fields = [_pieces(logs) for logs in zip(*knots, strict=True)]
+            sigmas = [sigmas[k] for k in range(PIECES) for sigmas, _ in fields]
+            return *sigmas, *(fields[0] if self.single else _pieces([_of_all(knot) for knot in knots]))[1], *knots[-1]
 
-        def nothing(begin, part):
-            return tuple(type(begin)(0) for _ in range(PARTS * count))
+        def nothing(begin, part, *before):
+            zero = type(begin)(0)
+            return (*(zero,) * (PIECES * count + PIECES), *(type(begin)(NOTHING),) * count)
 
-        sigmas = dr.if_stmt((begin, part), active & (skip <= (PARTS - 1) * part), look, nothing, label="cell")
-        return Cell(begin, part, tuple(tuple(sigmas[k : k + count]) for k in range(0, PARTS * count, count)), skip)
+        matter = (skip <= PIECES * part) | (reduce(dr.maximum, before) > NOTHING)
+        values = dr.if_stmt((begin, part, *before), active & matter, look, nothing, label="cell")
+        sigmas = tuple(tuple(values[k : k + count]) for k in range(0, PIECES * count, count))
+        return Cell(begin, part, sigmas, tuple(values[PIECES * count : -count]), skip, tuple(values[-count:]))
 
     def point(self, i: int, t):
         """The point at `t` in the coordinates of field `i`."""
@@ -164,12 +183,18 @@ class Bundle:
             places.append(p)
         return skips, places
 
-    def densities(self, t) -> list:
-        """The density of each field at `t`, per unit of t."""
-        return [
-            dr.select(skip <= 0, s.density(p), 0) * (1 if s.rate is None else s.rate)
-            for s, skip, p in zip(self.strands, *self.clear(t), strict=True)
-        ]
+    def logs(self, t) -> list:
+        """ln σ of each field at `t`, per unit of t."""
+        found = []
+        for i, s in enumerate(self.strands):
+            if s.logs is not None:
+                value = s.logs(self.point(i, t))
+            else:
+                p = self.point(i, t)
+                sigma = dr.select(clear_distance(s.grid, p, self.inverse[i]) <= 0, s.density(p), 0)
+                value = dr.select(sigma > 0, dr.log(sigma), NOTHING)
+            found.append(value if s.rate is None else dr.select(value > NOTHING, value + dr.log(s.rate), NOTHING))
+        return found
 
     def counts(self, shares, step):
         """Whether a cell of these weights is worth shading: that of some field, in its own unit."""
@@ -181,21 +206,25 @@ class Bundle:
 
 @dataclass
 class Cell:
-    """A piece of a ray in PARTS parts, the mean densities of which are known.
+    """A piece of a ray in PIECES of equal length, with densities that are exponentials across each.
 
-    begin, part  where it begins; the length of a part
-    sigmas       per part a list, the density of each field
-    skip         how far the ray is clear of all matter from the middle of the first part on
+    begin, part  where it begins; the length of a piece
+    sigmas       per piece a list, the mean density of each field
+    bends        per piece, the logarithm of the density of all at its end over that at its begin
+    skip         how far the ray is clear of all matter from the begin on
+    after        the density of each field at its end
     """
 
     begin: Any
     part: Any
     sigmas: tuple
+    bends: tuple
     skip: Any
+    after: tuple
 
     @property
     def totals(self) -> list:
-        """Per part the density of all fields."""
+        """Per piece the density of all fields."""
         return [sum(sigmas[1:], sigmas[0]) for sigmas in self.sigmas]
 
     @property
@@ -205,13 +234,12 @@ class Cell:
         return sum(totals[1:], totals[0]) * self.part
 
     def place(self, depth):
-        """Where the optical depth from the cell's begin on is `depth`: densities linear across each part, with the
-        slope that its neighbours tell. Constant ones put points in front of where the light is lost, since skins get
-        denser inwards: `statue` shone 0.4 % too bright."""
-        t, passed, totals = self.begin, 0, self.totals
-        for sigma, bend in zip(totals, bends(totals), strict=True):
+        """Where the optical depth from the cell's begin on is `depth`."""
+        t, passed = self.begin, 0
+        for sigma, bend in zip(self.totals, self.bends, strict=True):
             share = dr.clip((depth - passed) * dr.rcp(dr.maximum(sigma * self.part, 1e-6)), 0, 1)
-            t = t + self.part * share * (1 + bend * (1 - share))
+            flat = share * (1 + 0.5 * bend * (1 - share))
+            t = t + self.part * dr.select(dr.abs(bend) < 0.02, flat, dr.log(1 + share * (dr.exp(bend) - 1)) / bend)
             passed = passed + sigma * self.part
         return t
 
@@ -234,16 +262,28 @@ class Cell:
         return shares
 
 
-def bends(totals: list) -> list:
-    """Of densities in the middle of parts of equal length: half of each part's slope over its density, −1 to 1, by the
-    parts beside it. Skins are exponentials, σ ∝ e^(2bu) over a part's share u, whose mean is about 1 + b²/6 times what
-    is in the middle, and which are steeper than a part is long."""
-    logs, last = [dr.log(dr.maximum(sigma, 1e-6)) for sigma in totals], len(totals) - 1
-    pairs = ((max(k - 1, 0), min(k + 1, last)) for k in range(last + 1))
-    return [dr.clip((logs[above] - logs[below]) * (0.5 / (above - below)), -1, 1) for below, above in pairs]
+def _pieces(logs) -> tuple[list, list]:
+    """``(means, bends)`` of σ in the pieces between places with these ln σ, which is a parabola's: the mean of the
+    exponential through both ends, √(σ₀ σ₁) sinh(x)/x with x half of its bend, less a twelfth for the parabola's arch.
+    """
+    bends = [dr.clip(b - a, -STEEP, STEEP) for a, b in itertools.pairwise(logs)]
+    means = []
+    for k, (bend, (a, b)) in enumerate(zip(bends, itertools.pairwise(logs), strict=True)):
+        middle = min(max(k, 1), PIECES - 1)
+        arch = dr.clip(bends[middle] - bends[middle - 1], -1, 1) * (1 / 12)
+        top, square = dr.maximum(a, b), bend * bend
+        mean = dr.exp(top - 0.5 * dr.abs(bend) - arch) * (1 + square * (1 / 24 + square * (1 / 1920)))
+        means.append(dr.select(top > NOTHING, mean, 0))
+    return means, bends
 
 
-def onward(skip, step, parts=1):
-    """From one cell to the next, or beyond all whose `parts` have middles that are as `skip`, from the middle of the
-    first part on, says clear: whole cells, so that skipping changes no other cell."""
-    return dr.select(skip > 0, step * dr.maximum(dr.floor(skip / step + 1 / parts), 1), step)
+def _of_all(logs):
+    """ln Σ σ."""
+    total = sum(density_of(a) for a in logs)
+    return dr.select(total > 0, dr.log(total), NOTHING)
+
+
+def onward(skip, step, whole=1):
+    """From one cell to the next, or beyond all that are clear: whole cells, so that skipping changes no other cell.
+    `skip`: how far the ray is clear, from the middle of the cell on; from its begin on with `whole` 0."""
+    return dr.select(skip > 0, step * dr.maximum(dr.floor(skip / step + whole), 1), step)

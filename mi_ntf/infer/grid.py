@@ -9,7 +9,7 @@ from ..core.architecture import LOG_FLOOR
 from ..core.ops import normalize
 from . import ops
 from .backend import floats
-from .network import MIN_DENSITY, NetworkField, cut_density
+from .network import MIN_DENSITY, NetworkField, cut_log_density, density_of
 
 CELLS = 64
 """Resolution of the occupancy grid that marches skip by."""
@@ -58,7 +58,11 @@ class GridField:
 
     def density(self, p):
         """σ at `p`, 1/(unit-sphere radius)."""
-        return cut_density(dr.exp(self._log_sigma.eval(self._uvw(p))[0]), p)
+        return density_of(self.cut_log_density(p))
+
+    def cut_log_density(self, p):
+        """ln σ at `p`, ``NOTHING`` where there is none: wherever `clearance` says so, among others."""
+        return cut_log_density(self._log_sigma.eval(self._uvw(p))[0], p)
 
     def reflectance(self, p):
         """As :meth:`NetworkField.reflectance`."""

@@ -5,7 +5,7 @@ from typing import Any
 
 import drjit as dr
 
-from .bundle import PARTS, Bundle, Cell, onward
+from .bundle import PIECES, Bundle, Cell, onward
 
 SHARE = 0.04
 """Of its ray that a sample stands for at least. Cells that take less, two thirds of all that hold matter, share one: to
@@ -88,12 +88,12 @@ def camera_samples(strands, maxt, offset, depth, shade=True, view=False) -> Samp
     shade     whether there is use for the samples; otherwise only `transmittance` is found
     view      whether `view` is wanted
 
-    Quadrature of method.md, section 1: α_j = 1 − e^(−σ_j Δ), w_j = T_j α_j, σ_j the mean density of cell j's PARTS,
-    each asked in its middle, the sum over the fields. Cells follow each other into one sample until their weights come
+    Quadrature of method.md, section 1: α_j = 1 − e^(−σ_j Δ), w_j = T_j α_j, σ_j the mean density of cell j, the sum
+    over the fields, asked at the ends of its pieces. Cells follow each other into one sample until their weights come
     to SHARE, or the ray ends: it has the weight of all, and lies in one of them, with chances by weight. There it lies
-    where free flight through the cell's parts would end, so that quantities that vary within a cell, above all the
+    where free flight through the cell's pieces would end, so that quantities that vary within a cell, above all the
     light's own transmittance, are averaged with the right weights: the expectation over `depth` is right for densities
-    linear across each part. Up to that point the cell lets 1 − depth·α_j through.
+    exponential across each piece. Up to that point the cell lets 1 − depth·α_j through.
     """
     bundle = Bundle(strands, maxt, offset)
     uint = dr.uint32_array_t(type(bundle.base))
@@ -221,7 +221,7 @@ class _Here:
 def _nothing(bundle, n: int) -> _Here:
     """A cell of no weight on each of `n` rays."""
     zero, count = dr.zeros(type(bundle.base), n), len(bundle.strands)
-    cell = Cell(zero, zero, tuple((zero,) * count for _ in range(PARTS)), zero)
+    cell = Cell(zero, zero, ((zero,) * count,) * PIECES, (zero,) * PIECES, zero, (zero,) * count)
     return _Here(zero, dr.zeros(dr.uint32_array_t(type(bundle.base)), n), zero, zero, zero, (zero,) * count, cell)
 
 
@@ -230,22 +230,22 @@ def _walk(bundle, emit, state):
     called for each cell, a :class:`_Here`; `last`: it is the ray's last one. Returns ``(transmittance, state)``."""
     floats, uint = type(bundle.base), dr.uint32_array_t(type(bundle.base))
 
-    def body(t, transmittance, state, active):
+    def body(t, transmittance, before, state, active):
         step = bundle.step(t)
-        cell = bundle.cell(t, step, active)
+        cell = bundle.cell(t, step, active, before)
         alpha = _absorbed(cell.depth)
         w = transmittance * alpha
         shares = (w,) if bundle.single else tuple(transmittance * share for share in cell.shares())
         number = uint((t - bundle.begin) * dr.rcp(step) + 0.5)
         here = _Here(t, number, transmittance, alpha, w, shares, cell)
         transmittance = dr.select(active, transmittance - w, transmittance)
-        t = t + onward(cell.skip, step, PARTS)
+        t = t + onward(cell.skip, step, 0)
         onwards = active & (t < bundle.end) & (transmittance > MIN_TRANSMITTANCE)
-        return t, transmittance, emit(active, active & ~onwards, here, state), onwards
+        return t, transmittance, cell.after, emit(active, active & ~onwards, here, state), onwards
 
-    _, transmittance, state, _ = dr.while_loop(
-        state=(floats(bundle.begin), dr.ones(floats, dr.width(bundle.base)), state, bundle.active),
-        cond=lambda t, transmittance, state, active: active,
+    _, transmittance, _, state, _ = dr.while_loop(
+        state=(floats(bundle.begin), dr.ones(floats, dr.width(bundle.base)), bundle.first(), state, bundle.active),
+        cond=lambda t, transmittance, before, state, active: active,
         body=body,
         label="camera march",
     )
@@ -262,14 +262,14 @@ def free_flight(strands, maxt, offset, depth, which):
 
     Arguments as :func:`camera_samples`; `which`, uniform in [0, 1), says whose matter it is where several overlap.
     Returns ``(hit, t, index, bundle)``: whether a ray ends before `maxt`, where (t of `bundle`), and the strand's
-    index. Densities linear across the parts of cells.
+    index. Densities exponential across the pieces of cells.
     """
     bundle = Bundle(strands, maxt, offset)
     floats, uint = type(bundle.base), dr.uint32_array_t(type(bundle.base))
 
-    def body(t, passed, end, index, active):
+    def body(t, passed, end, index, before, active):
         step = bundle.step(t)
-        cell = bundle.cell(t, step, active)
+        cell = bundle.cell(t, step, active, before)
         after = passed + cell.depth
         hit = active & (after >= depth) & (after > passed)
         end = dr.select(hit, cell.place(depth - passed), end)
@@ -279,14 +279,14 @@ def free_flight(strands, maxt, offset, depth, which):
             for sigma in sigmas[:-1]:
                 rest = rest - sigma
                 index = dr.select(hit & (rest >= 0), index + 1, index)
-        t = t + onward(cell.skip, step, PARTS)
+        t = t + onward(cell.skip, step, 0)
         active = active & ~hit & (t < bundle.end)
-        return t, after, end, index, active
+        return t, after, end, index, cell.after, active
 
     n = dr.width(bundle.base)
     begin = floats(bundle.begin)
-    state = (begin, dr.zeros(floats, n), dr.full(floats, dr.inf, n), dr.zeros(uint, n), bundle.active)
-    _, _, t, index, _ = dr.while_loop(
-        state=state, cond=lambda t, passed, end, index, active: active, body=body, label="free flight"
+    state = (begin, dr.zeros(floats, n), dr.full(floats, dr.inf, n), dr.zeros(uint, n), bundle.first(), bundle.active)
+    _, _, t, index, *_ = dr.while_loop(
+        state=state, cond=lambda t, passed, end, index, before, active: active, body=body, label="free flight"
     )
     return dr.isfinite(t), t, index, bundle

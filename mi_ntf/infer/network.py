@@ -1,5 +1,6 @@
 """The field as its networks, in Dr.Jit: the twin of :mod:`mi_ntf.core.reference` (conventions there)."""
 
+import math
 from types import ModuleType
 from typing import Any
 
@@ -19,14 +20,24 @@ MIN_DENSITY = 0.1
 """σ below this counts as empty, 1/(unit-sphere radius): an optical depth of 0.2 at most across the whole sphere.
 Training drives empty space below it; every renderer of the field (also stock `volpath`) sees the same zero."""
 
+LOG_MIN_DENSITY = math.log(MIN_DENSITY)
 CLEAR_DEPTH = 1e-3
 """Rays with less optical depth than this count as clear: τ = 1."""
 
 
-def cut_density(sigma, p):
-    """`sigma`, but 0 outside the unit sphere and below ``MIN_DENSITY``."""
+NOTHING = -60.0
+"""ln σ where there is no matter."""
+
+
+def cut_log_density(log_sigma, p):
+    """`log_sigma`, but ``NOTHING`` outside the unit sphere and below ``MIN_DENSITY``."""
     inside = p[0] * p[0] + p[1] * p[1] + p[2] * p[2] < 1
-    return dr.select(inside & (sigma > MIN_DENSITY), sigma, 0)
+    return dr.select(inside & (log_sigma > LOG_MIN_DENSITY), log_sigma, NOTHING)
+
+
+def density_of(log_sigma):
+    """σ of what :func:`cut_log_density` returns."""
+    return dr.select(log_sigma > NOTHING, dr.exp(log_sigma), 0)
 
 
 class NetworkField:
@@ -56,7 +67,7 @@ class NetworkField:
 
     def density(self, p):
         """σ at `p`, 1/(unit-sphere radius)."""
-        return cut_density(dr.exp(self.log_density(p)), p)
+        return density_of(cut_log_density(self.log_density(p), p))
 
     def reflectance(self, p):
         """``(normal, albedo, roughness, specular)``: two 3-tuples and two scalars, ranges as in core.reference."""

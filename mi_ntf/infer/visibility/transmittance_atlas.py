@@ -18,6 +18,7 @@ import drjit as dr
 import numpy as np
 
 from ...core import spheres
+from ...core.ops import dot
 from .. import octahedral, ops, profile
 from ..lights import LightTable
 from . import map_source, raymarch
@@ -100,8 +101,8 @@ class TransmittanceAtlas:
         k, d = self._direction(wi, u[:2])
         pivot = dr.select(outside, dr.maximum(-here, 0), dr.maximum(-0.5 * here, NEAREST_PIVOT))
         back = dr.select(outside, pivot, pivot - self._begin)
-        y = tuple(a + pivot * b - back * c for a, b, c in zip(x, wi, d, strict=True))
-        return self.maps.tau_of_one(k, y, d, u[2:], active)
+        y = tuple(a + pivot * b for a, b in zip(x, wi, strict=True))
+        return self.maps.tau_of_one(k, y, dot(y, d) - back, u[2:], active)
 
     def _direction(self, wi, u):
         """``(index, direction)`` of one of the four nearest."""

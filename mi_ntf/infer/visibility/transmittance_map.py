@@ -13,7 +13,6 @@ from types import ModuleType
 import drjit as dr
 import numpy as np
 
-from ...core.ops import dot
 from .. import profile
 from ..lights import LightTable
 from ..texels import Texels, blank
@@ -76,12 +75,11 @@ class TransmittanceMap:
             root += weight * _root(t + shift, parts)
         return dr.select(inside, dr.minimum(root * root, 1), 1)
 
-    def tau_of_one(self, index, x, d, u, active):
-        """τ at `x` of one of the four rays of the directional light `index`, towards `d`, drawn by the uniform numbers
-        `u` (2); 1 where light meets nothing."""
+    def tau_of_one(self, index, x, t, u, active):
+        """τ of one of the four rays of the directional light `index` nearest to `x`, drawn by the uniform numbers `u`
+        (2), read at its place `t`; 1 where light meets nothing."""
         inside, texel = self.rays.one(index, x, u, active)
-        root = _root(dot(x, d), self._fetch(texel, inside))
-        return dr.select(inside, dr.minimum(root * root, 1), 1)
+        return dr.select(inside, dr.minimum(_tau(t, self._fetch(texel, inside)), 1), 1)
 
     def _fetch(self, texel, active):
         row = self.texels.row(texel, active)
@@ -90,12 +88,17 @@ class TransmittanceMap:
         return tuple((row[k], row[k + 1], row[k + 2]) for k in range(0, self.width, 4))
 
 
+def _tau(t, mixture):
+    """τ(t). Clipped as :func:`mi_ntf.core.logistic.sigmoid` is: what a weight was divided by, it is multiplied by."""
+    return sum(w * dr.rcp(1 + dr.exp(dr.clip(a * (b - t), -20, 80))) for w, a, b in mixture)
+
+
 def _root(t, mixture):
-    """√τ(t). Clipped as :func:`mi_ntf.core.logistic.sigmoid` is: what a weight was divided by, it is multiplied by."""
-    terms = [(w, 1 + dr.exp(dr.clip(a * (b - t), -20, 80))) for w, a, b in mixture]
-    if len(terms) == 1:
-        return dr.sqrt(terms[0][0]) * dr.rsqrt(terms[0][1])
-    return dr.sqrt(sum(w / below for w, below in terms))
+    """√τ(t)."""
+    if len(mixture) > 1:
+        return dr.sqrt(_tau(t, mixture))
+    w, a, b = mixture[0]
+    return dr.sqrt(w) * dr.rsqrt(1 + dr.exp(dr.clip(a * (b - t), -20, 80)))
 
 
 def _shifts(mixtures, weights, size):

@@ -158,6 +158,7 @@ class Composition:
                 p.frame.direction_to_field(ray.d),
                 dr.opaque(mi.Float, 2 / (steps or self.settings.samples)),
                 dr.opaque(mi.Float, unit / p.frame.length) if several else None,
+                p.source.cut_log_density if p.source is p.medium.field.grid else None,
             )
             for p in parts
         ]
