@@ -73,9 +73,9 @@ LEVELS = (1e-3, math.log(4 / 3), math.log(2), math.log(4))
 """Optical depths where matter begins and where τ is 3/4, 1/2 and 1/4."""
 
 
-def field_source(field, profile, components: int = 1) -> Source:
+def field_source(field, profile, components: int = 1, effort=two_logistics.FINE) -> Source:
     """`map_source=field`: march the field once per ray, from the light inwards. One logistic follows in closed form
-    from τ's quartiles and the slant of the skin there, two by least squares on twelve levels of τ."""
+    from τ's quartiles and the slant of the skin there, two by least squares on levels of τ, with `effort`."""
 
     def one(o, d, end):
         hit, m, h = spheres.chord(ops, o, d)
@@ -90,8 +90,8 @@ def field_source(field, profile, components: int = 1) -> Source:
 
     def two(o, d, end):
         hit, _m, _h = spheres.chord(ops, o, d)
-        places, depth, last = profile.with_end(o, d, two_logistics.DEPTHS, end)
-        return two_logistics.fit(places, depth, last, hit & (depth > two_logistics.DEPTHS[0]))
+        places, depth, last = profile.with_end(o, d, effort.depths, end)
+        return two_logistics.fit(places, depth, last, hit & (depth > effort.depths[0]), effort)
 
     return Source(one if components == 1 else two, components, components > 1)
 

@@ -21,7 +21,7 @@ from ...core import spheres
 from ...core.ops import dot
 from .. import octahedral, ops, profile
 from ..lights import LightTable
-from . import map_source, raymarch
+from . import map_source, raymarch, two_logistics
 from .method import FILLED, Method, Options, queries
 from .transmittance_map import TransmittanceMap, channels
 
@@ -140,7 +140,7 @@ def build(medium, lights, options: Options, dj, keep) -> TransmittanceAtlas:
         step = max(step, SMOKE_STEP)
     reader = profile.of(medium, step, dj)
     source = (map_source.network_source(medium.field.network, reader, False) if network
-              else map_source.field_source(medium.source, reader, LOGISTICS))
+              else map_source.field_source(medium.source, reader, LOGISTICS, two_logistics.ROUGH))
     directions = table(dj)
     own = replace(options, map_resolution=RESOLUTION, map_components=LOGISTICS)
 
