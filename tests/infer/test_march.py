@@ -8,10 +8,10 @@ from helpers import fields
 from helpers.jit import arrays
 from helpers.variants import VARIANT
 
-from mi_ntf.infer import march
+from mi_ntf.infer import bundle, march
 from mi_ntf.infer.bundle import Strand
 from mi_ntf.infer.grid import GridField
-from mi_ntf.infer.network import NetworkField
+from mi_ntf.infer.network import NOTHING, NetworkField
 from mi_ntf.infer.visibility import raymarch
 
 BLOBS = [(-0.3, 0.0, 0.0), (0.35, 0.2, 0.1), (0.0, -0.45, 0.3)], [0.35, 0.25, 0.2]
@@ -124,6 +124,36 @@ def test_optical_depth_of_a_uniform_sphere(slab):
     )
     # The sphere's surface cuts voxels of 1/128: half a voxel of σ 1.5 at each crossing.
     np.testing.assert_allclose(np.array(ours), [1.5, 0.75, 0.375, 3.0, 0.0], atol=0.013)
+
+
+def means(log_density) -> np.ndarray:
+    """Mean σ of the pieces of a cell from 0 to 1, of ln σ at their ends."""
+    logs = [mi.Float(log_density(k / bundle.PIECES)) for k in range(bundle.PIECES + 1)]
+    return np.array([np.array(m)[0] for m in bundle._pieces(logs)[0]])
+
+
+def test_means_of_pieces(slab):
+    """Exponentials, exactly; parabolas nearly; half of what sets in at once; nothing of nothing."""
+    u = (np.arange(6000) + 0.5) / 6000
+    for slope in (-4.0, -0.5, 0.0, 2.0, 4.0):
+        truth = np.exp(0.3 + slope * u).reshape(bundle.PIECES, -1).mean(1)
+        np.testing.assert_allclose(means(lambda t, slope=slope: 0.3 + slope * t), truth, rtol=1e-4)
+    for arch in (-2.0, 2.0):
+        truth = np.exp(1 + u + arch * u * (1 - u)).reshape(bundle.PIECES, -1).mean(1)
+        np.testing.assert_allclose(means(lambda t, arch=arch: 1 + t + arch * t * (1 - t)), truth, rtol=2e-3)
+    np.testing.assert_allclose(means(lambda t: 2.0 if t == 1 else NOTHING)[:-1], 0)
+    arch = 1 / 12  # of the parabola that a jump is taken for
+    np.testing.assert_allclose(means(lambda t: 2.0 if t == 1 else NOTHING)[-1], 0.5 * np.exp(2 - arch), rtol=1e-3)
+    assert (means(lambda t: NOTHING) == 0).all()
+
+
+def test_densities_by_their_logarithm(grid, rng):
+    """A strand that knows ln σ finds what one does that asks for σ."""
+    o, d = rays(rng, 200)
+    arguments = [mi.Float(np.full(200, 1e9)), *(mi.Float(rng.random(200)) for _ in range(2))]
+    found = [march.camera_samples([Strand(grid.density, grid, arrays(o), arrays(d), mi.Float(2 / 300), logs=logs)],
+                                  *arguments).transmittance for logs in (None, grid.cut_log_density)]  # fmt: skip
+    np.testing.assert_allclose(np.array(found[0]), np.array(found[1]), atol=2e-5)
 
 
 def test_skipping_changes_nothing(grid, rng):
