@@ -186,14 +186,18 @@ class Bundle:
     def logs(self, t) -> list:
         """ln σ of each field at `t`, per unit of t."""
         found = []
-        for i, s in enumerate(self.strands):
+        for i, (s, inverse, (begin, end)) in enumerate(zip(self.strands, self.inverse, self.intervals, strict=True)):
+            p = self.point(i, t)
             if s.logs is not None:
-                value = s.logs(self.point(i, t))
+                value = s.logs(p)
             else:
-                p = self.point(i, t)
-                sigma = dr.select(clear_distance(s.grid, p, self.inverse[i]) <= 0, s.density(p), 0)
+                sigma = dr.select(clear_distance(s.grid, p, inverse) <= 0, s.density(p), 0)
                 value = dr.select(sigma > 0, dr.log(sigma), NOTHING)
-            found.append(value if s.rate is None else dr.select(value > NOTHING, value + dr.log(s.rate), NOTHING))
+            if not self.single:  # a strand that misses its field's sphere has no place there
+                value = dr.select((t >= begin) & (t < end), value, NOTHING)
+            if s.rate is not None:
+                value = dr.select(value > NOTHING, value + dr.log(s.rate), NOTHING)
+            found.append(value)
         return found
 
     def counts(self, shares, step):
