@@ -137,7 +137,7 @@ class Bundle:
         return dr.select(length < dr.inf, length, self.cells[0])
 
     def first(self) -> tuple:
-        """What :meth:`cell` asks for where the rays begin."""
+        """ln σ of each field where the rays begin, for their first :meth:`cell`."""
         return tuple(self.logs(INSET / PIECES * self.step(dr.zeros(type(self.base), dr.width(self.base)))))
 
     def cell(self, t, step, active, before: tuple) -> "Cell":
@@ -145,7 +145,7 @@ class Bundle:
         there, which the last cell knows."""
         begin = dr.maximum(t, 0)
         part = (dr.minimum(t + step, self.end) - begin) * (1 / PIECES)
-        skip = reduce(dr.minimum, self.clear(begin)[0])
+        skip = reduce(dr.minimum, self.clear(begin))
         count = len(self.strands)
 
         def look(begin, part, *before):
@@ -169,19 +169,16 @@ class Bundle:
         along = t if s.rate is None else t * s.rate
         return tuple(a + along * b for a, b in zip(s.o, s.d, strict=True))
 
-    def clear(self, t):
-        """``(skips, places)`` of each field: how far the ray is clear of its matter from `t` on, 0 in an occupied cell;
-        the point at `t` in its coordinates."""
-        skips, places = [], []
+    def clear(self, t) -> list:
+        """How far the ray is clear of each field's matter from `t` on, 0 in an occupied cell."""
+        skips = []
         for i, (s, inverse, (begin, end)) in enumerate(zip(self.strands, self.inverse, self.intervals, strict=True)):
-            p = self.point(i, t)
-            skip = clear_distance(s.grid, p, inverse)
+            skip = clear_distance(s.grid, self.point(i, t), inverse)
             if not self.single:
                 inside, ahead = (t >= begin) & (t < end), dr.maximum(self.end - t, 1e-6)
                 skip = dr.select(inside, skip / s.rate, dr.select(t < begin, dr.minimum(begin - t, ahead), ahead))
             skips.append(skip)
-            places.append(p)
-        return skips, places
+        return skips
 
     def logs(self, t) -> list:
         """ln σ of each field at `t`, per unit of t."""
@@ -216,7 +213,7 @@ class Cell:
     sigmas       per piece a list, the mean density of each field
     bends        per piece, the logarithm of the density of all at its end over that at its begin
     skip         how far the ray is clear of all matter from the begin on
-    after        the density of each field at its end
+    after        ln σ of each field at its end
     """
 
     begin: Any

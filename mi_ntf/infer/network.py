@@ -19,8 +19,8 @@ from . import ops
 MIN_DENSITY = 0.1
 """σ below this counts as empty, 1/(unit-sphere radius): an optical depth of 0.2 at most across the whole sphere.
 Training drives empty space below it; every renderer of the field (also stock `volpath`) sees the same zero."""
-
 LOG_MIN_DENSITY = math.log(MIN_DENSITY)
+
 CLEAR_DEPTH = 1e-3
 """Rays with less optical depth than this count as clear: τ = 1."""
 

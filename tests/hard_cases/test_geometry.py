@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 from helpers import fields, pictures
 
-from mi_ntf.infer import march
-
 METHODS = ("raymarch", "transmittance_volume", "transmittance_map", "transmittance_map, 2 logistics",
            "ray_network", "visibility_mlp")  # fmt: skip
 
@@ -69,44 +67,23 @@ PLACEMENTS = {
 }
 
 
-def placements(name: str) -> list:
-    """``(matrix, size)``: of the field in its place, and moved."""
-    size, shift, angle, _ = PLACEMENTS[name]
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("name", [n if "1e5, t" in n else pytest.param(n, marks=pytest.mark.slow) for n in PLACEMENTS])
+def test_placement(folder, name, method, check):
+    """Means of blocks of 4² pixels against the field in its place, over the brightest; sun and lamp."""
+    size, shift, angle, bound = PLACEMENTS[name]
     matrix = np.array(turn(angle).matrix)
     matrix[:3, :3] *= size
     matrix[:3, 3] = shift
-    return [(np.eye(4), 1.0), (matrix, size)]
-
-
-def pair(folder, method: str, name: str, lamp: bool) -> list:
-    """Both pictures: means of blocks of 4² pixels, over the brightest of the first."""
-    images = [pictures.render(method, moved(folder, m, s, lamp)) for m, s in placements(name)]
-    neutral, image = (i.reshape(4, 4, 4, 4, 4).mean((1, 3)) for i in images)
-    return [i / neutral.max((0, 1)) for i in (neutral, image)]
-
-
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("name", [n if "1e5, t" in n else pytest.param(n, marks=pytest.mark.slow) for n in PLACEMENTS])
-def test_placement(folder, name, method, check, monkeypatch):
-    """Sun and lamp. Each cell has its own point: in which of its cells a shared one lies may turn on a last bit."""
-    monkeypatch.setattr(march, "SHARE", 1e-4)
-    bound = PLACEMENTS[name][3]
     for lamp in (False, True):
-        neutral, image = pair(folder, method, name, lamp)
-        check(name, method, f"picture under {'a lamp' if lamp else 'the sun'}", image - neutral, bound)
+        images = [pictures.render(method, moved(folder, m, s, lamp)) for m, s in ((np.eye(4), 1.0), (matrix, size))]
+        neutral, image = (i.reshape(4, 4, 4, 4, 4).mean((1, 3)) for i in images)
+        error = (image - neutral) / neutral.max((0, 1))
+        check(name, method, f"picture under {'a lamp' if lamp else 'the sun'}", error, bound)
     key = "light.intensity.value"
-    slopes = [pictures.slope(method, moved(folder, m, s, True), key) * s**2 for m, s in placements(name)]
+    slopes = [pictures.slope(method, moved(folder, m, s, True), key) * s**2
+              for m, s in ((np.eye(4), 1.0), (matrix, size))]  # fmt: skip
     check(name, method, "derivative by the lamp's intensity", slopes[1] / slopes[0] - 1, bound)
-
-
-@pytest.mark.parametrize("name", [n for n in PLACEMENTS if PLACEMENTS[n][3] == 2e-5])
-def test_placement_of_shared_points(folder, name, check):
-    """Few of them turn: nearly all blocks stay as they are, and none changes by more than two of its 4² · 16 camera
-    rays' shares do."""
-    neutral, image = pair(folder, "raymarch", name, False)
-    error = np.abs(image - neutral).max(-1)
-    check(name, "raymarch", "shared points: worst block", error, 2 * march.SHARE / (16 * 16))
-    check(name, "raymarch", "shared points: third worst block of sixteen", np.sort(error.ravel())[-3], 2e-5)
 
 
 def mesh_ball(folder, radius: float) -> dict:
