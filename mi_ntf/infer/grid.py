@@ -42,7 +42,7 @@ class GridField:
     def __init__(self, field: NetworkField, resolution: int, dj: ModuleType):
         self.dj, self.resolution, self._field = dj, resolution, field
         log_sigma = _coefficients(baked_log_density(field, resolution, dj), dj)
-        self._log_sigma = _texture(log_sigma[..., None], dj)
+        self._log_sigma, self._corners = _texture(log_sigma[..., None], dj), _Corners(resolution, dj)
         coarse = min(resolution, REFLECTANCE_RESOLUTION)
         self._reflectance = None
         if not field.quick:
@@ -63,6 +63,11 @@ class GridField:
     def cut_log_density(self, p):
         """ln σ at `p`, ``NOTHING`` where there is none: wherever `clearance` says so, among others."""
         return cut_log_density(self._log_sigma.eval(self._uvw(p))[0], p)
+
+    def rough_density(self, p):
+        """As :meth:`density`, but between four of the eight voxels around `p`, the corners of the tetrahedron that it
+        lies in (Kasson et al. 1995): half of the fetches. Off by 6 % (RMS) on `statue`, by 0.3 % on average."""
+        return density_of(cut_log_density(self._corners.mean(self._log_sigma.value(), p), p))
 
     def reflectance(self, p):
         """As :meth:`NetworkField.reflectance`."""
@@ -108,6 +113,31 @@ def _coefficients(log_sigma: np.ndarray, dj: ModuleType) -> np.ndarray:
                  for end, beside in ((0, here - step), (n - 1, here + step)))
         values = (14 * values - sum(sides)) / 12
     return dr.minimum(values, dr.opaque(dj.Float, float(log_sigma.max()))).numpy().reshape(log_sigma.shape)
+
+
+class _Corners:
+    """Of the voxels around points of n³ in [−1, 1]³, four whose tetrahedron holds the point: from the lowest corner of
+    their cube to its highest, along the largest share first."""
+
+    def __init__(self, n: int, dj: ModuleType):
+        self._dj, self._half, self._top = dj, dr.opaque(dj.Float, n / 2), dr.opaque(dj.Float, n - 1.001)
+        self._strides = [dr.opaque(dj.UInt32, n**k) for k in range(3)]
+
+    def mean(self, values, p):
+        """`values` of the voxels, x first, at `p`."""
+        place = [dr.clip(self._half * c + (self._half - 0.5), 0, self._top) for c in p]
+        corner = [self._dj.UInt32(f) for f in place]
+        x, y, z = (f - self._dj.Float(i) for f, i in zip(place, corner, strict=True))
+        low = sum(i * s for i, s in zip(corner, self._strides, strict=True))
+        most, least = dr.maximum(dr.maximum(x, y), z), dr.minimum(dr.minimum(x, y), z)
+        middle = x + y + z - most - least
+        xy, yz, zx = x >= y, y >= z, z >= x
+        across, up, deep = self._strides
+        first = dr.select(xy & ~zx, across, dr.select(yz & ~xy, up, deep))
+        last = dr.select(zx & ~xy, across, dr.select(xy & ~yz, up, deep))
+        high = low + (across + up + deep)
+        corners = (low, 1 - most), (low + first, most - middle), (high - last, middle - least), (high, least)
+        return sum(weight * dr.gather(self._dj.Float, values, i) for i, weight in corners)
 
 
 def _flat(reflectance) -> list:

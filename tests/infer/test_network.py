@@ -222,3 +222,20 @@ def test_empty_field():
     grid = GridField(NetworkField(*fields.empty(), mi), 32, mi)
     assert grid.majorant == 0 and (grid.hull == 0).all()
     assert (np.array(grid.clearance) > 0).all()
+
+
+def test_rough_density(grid, rng, monkeypatch):
+    """Between four voxels: what is linear exactly, also where shares are alike; what bends, nearly."""
+    near = rng.uniform(-0.5, 0.5, (20_000, 3))
+    sides = [np.stack([a, b, c], 1) for a, b, c in ((near[:, 0],) * 3, near[:, [0, 0, 1]].T, near[:, [0, 1, 0]].T,
+                                                   near[:, [1, 0, 0]].T)]
+    x = arrays(np.concatenate([near, *sides]))
+    exact, rough = (np.array(of(x), np.float64) for of in (grid.density, grid.rough_density))
+    assert abs(rough.mean() / exact.mean() - 1) < 0.01
+    assert np.sqrt(((rough - exact) ** 2).mean() / (exact**2).mean()) < 0.08
+    n = grid.resolution
+    z, y, of_x = ((np.mgrid[:n, :n, :n] + 0.5) * 2 / n - 1).astype(np.float32)
+    monkeypatch.setattr(grid, "_log_sigma", grid_module._texture((2 + of_x - 2 * y + 0.5 * z)[..., None], mi))
+    p = np.array(x, np.float64)
+    truth = np.exp(2 + p[0] - 2 * p[1] + 0.5 * p[2])
+    np.testing.assert_allclose(grid.rough_density(x), np.where((p**2).sum(0) < 1, truth, 0), rtol=1e-4)

@@ -1,8 +1,8 @@
 """``transmittance_atlas``: per field, transmittance maps of directions all around; any ray is read from one of them.
 
 A ray from x along ω is read in two parts. Close to x, where a map of another direction would see the wrong piece of the
-skin that x lies in, σ is summed at a few places. The rest is one texel of one map: on the line along its direction d_k
-that crosses the ray at the pivot x + c ω, from `BEGIN` on:
+skin that x lies in, σ is summed at a few places, one drawn in each stratum of √t. The rest is one texel of one map: on
+the line along its direction d_k that crosses the ray at the pivot x + c ω, from `BEGIN` on:
 
     τ(x, ω) ≈ exp(−Σ w_i σ(x + t_i ω)) · τ_k(x + c ω − (c − BEGIN) d_k)
 
@@ -31,14 +31,16 @@ RESOLUTION = 45
 """Texels along a map's side: 63 MiB of two logistics each. One through the layers of `globe` is 0.8 % too dark."""
 LOGISTICS = 2
 RAYS = SIDE**2 * RESOLUTION**2
-PLACES = (0.00157, 0.00982, 0.03502)
-WEIGHTS = (0.00418, 0.01392, 0.03872)
-"""Of the sum close to x, field units: the three that are right within 3.2 % (RMS; 13 % at most) for exponentials and
-logistics whose width is anything from 0.0012 to 0.06, skins seen straight and at a slant."""
+STRATA = 4
+"""Places close to x: t = REACH v² with v = (i + u)/STRATA, all by the same u of a ray. Skins thin out away from x, and
+strata of √t see each of their parts; the depth is right on average. Off by 1 % of τ at most where fixed places were by
+2 to 4 % (RMS of the means; `statue`, `globe`, `knot`, `skull`), by three strata 2 %."""
+CLOSE = 2
+"""Of these, the first ones, whose densities are read between eight voxels; those further off between four."""
 BEGIN = 0.08
 """Where the map of an opaque thing is read from on: what lies between is neither's, or the skin of x would count
 twice."""
-REACH = 0.06
+REACH = 0.064
 """Where the sum ends, and the map of smoke begins."""
 DARK = 3e-4
 """Where the map lets no more through than this, nobody looks how much of that the sum close to x would take."""
@@ -53,13 +55,13 @@ SMOKE_STEP = 1 / 32
 
 
 class TransmittanceAtlas:
-    """`density`: σ at a point; `maps`: the :class:`TransmittanceMap` of the directions, read from the distance `begin`
-    on; `march`: a :class:`mi_ntf.infer.visibility.raymarch.RayMarch` for what lies inside the sphere, which any drawn
+    """`densities`: σ at a point, for each of `STRATA`; `maps`: the :class:`TransmittanceMap` of the directions, read
+    from the distance `begin` on; `march`: a :class:`mi_ntf.infer.visibility.raymarch.RayMarch` for what lies inside the sphere, which any drawn
     light may; `options`: of the maps. `stream`: a seed of the sampler, for the numbers that lookups draw, opaque, or
     each would be compiled."""
 
-    def __init__(self, density, maps: TransmittanceMap, begin: float, march, options: Options, dj: ModuleType):
-        self.density, self.maps, self.march, self.options, self.dj = density, maps, march, options, dj
+    def __init__(self, densities, maps: TransmittanceMap, begin: float, march, options: Options, dj: ModuleType):
+        self.densities, self.maps, self.march, self.options, self.dj = densities, maps, march, options, dj
         self._begin = dr.opaque(dj.Float, begin)
         self._side = dr.opaque(dj.Float, maps.count**0.5)
         self.stream = dr.opaque(dj.UInt32, 0)
@@ -82,22 +84,19 @@ class TransmittanceAtlas:
 
     def _look_up(self, x, wi, here, active):
         outside = dr.squared_norm(self.dj.Array3f(*x)) > OUTSIDE
-        far = self._far(x, wi, here, outside, active)
+        *u, v = _uniforms(self.dj, self.stream, x, wi)
+        far = self._far(x, wi, here, outside, active, u)
 
-        def near(far, x, wi):
-            depth = 0
-            for t, w in zip(PLACES, WEIGHTS, strict=True):
-                depth += w * self.density(tuple(a + t * b for a, b in zip(x, wi, strict=True)))
-            return far * dr.exp(-depth)
+        def near(far, x, wi, v):
+            return far * close_by(self.densities, x, wi, v)
 
-        def dark(far, x, wi):
+        def dark(far, x, wi, v):
             return far
 
         wanted = active & ~outside & (far > DARK)
-        return dr.if_stmt((far, tuple(x), tuple(wi)), wanted, near, dark, label="near")
+        return dr.if_stmt((far, tuple(x), tuple(wi), v), wanted, near, dark, label="near")
 
-    def _far(self, x, wi, here, outside, active):
-        u = _uniforms(self.dj, self.stream, x, wi)
+    def _far(self, x, wi, here, outside, active, u):
         k, d = self._direction(wi, u[:2])
         pivot = dr.select(outside, dr.maximum(-here, 0), dr.maximum(-0.5 * here, NEAREST_PIVOT))
         back = dr.select(outside, pivot, pivot - self._begin)
@@ -111,17 +110,30 @@ class TransmittanceAtlas:
         return self.dj.UInt32(iv * self._side + iu), octahedral.direction(iu, iv, self._side)
 
 
+def close_by(densities, x, wi, v):
+    """τ(x, ω) as far as `REACH`, drawn by the uniform number `v`: its optical depth is right on average."""
+    depth = 0
+    for i, density in enumerate(densities):
+        root = (v + i) * (1 / STRATA)
+        t = REACH * root * root
+        depth += root * density(tuple(a + t * b for a, b in zip(x, wi, strict=True)))
+    return dr.exp((-2 * REACH / STRATA) * depth)
+
+
 def _uniforms(dj, stream, x, wi) -> list:
-    """Four numbers in [0, 1) of the seed `stream` and the bits of a ray: the same of both, the same numbers."""
+    """Five numbers in [0, 1) of the seed `stream` and the bits of a ray: the same of both, the same numbers."""
     state = dj.UInt32(stream)
     for c, factor in zip((*x, *wi), (0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D, 0x27D4EB2F, 0x165667B1, 0xD3A2646D),
                          strict=True):
         word: Any = dr.reinterpret_array(dj.UInt32, c)
         state = (state ^ (word * factor)) * 0x2C1B3C6D
         state ^= state >> 15
-    other = (state ^ 0x5BD1E995) * 0x297A2D39
-    other ^= other >> 15
-    return [dj.Float(bits & 0xFFFF) * 2.0**-16 for word in (state, other) for bits in (word, word >> 16)]
+    words = [state]
+    for key, factor in ((0x5BD1E995, 0x297A2D39), (0x68E31DA4, 0xB5297A4D)):
+        word = (words[-1] ^ key) * factor
+        words.append(word ^ (word >> 15))
+    halves = [half for word in words for half in (word & 0xFFFF, word >> 16)]
+    return [dj.Float(half) * 2.0**-16 for half in halves[:5]]
 
 
 def table(dj: ModuleType) -> LightTable:
@@ -150,7 +162,9 @@ def build(medium, lights, options: Options, dj, keep) -> TransmittanceAtlas:
     maps = keep(channels(source.components, source.weights), step, make, directions, own)
     march = raymarch.build(medium, lights, options, dj, keep)
     begin = BEGIN if medium.field.softness.opaque else REACH
-    return TransmittanceAtlas(medium.source.density, maps, begin, march, own, dj)
+    # Voxels will do for what is further off, also of a field that is its networks.
+    densities = [medium.source.density] * CLOSE + [medium.field.grid.rough_density] * (STRATA - CLOSE)
+    return TransmittanceAtlas(densities, maps, begin, march, own, dj)
 
 
 def numbers(medium, lights, options: Options) -> int:
@@ -168,7 +182,7 @@ METHOD = Method(
     name="transmittance_atlas",
     summary="per field, maps of directions all around: one texel and a few densities per point and light",
     build=build,
-    pair=lambda work, prices: prices.atlas + len(PLACES) * queries(work, prices),
+    pair=lambda work, prices: prices.atlas + CLOSE * queries(work, prices),
     prices={"atlas": 25.0},
     making=making,
     numbers=numbers,
