@@ -151,7 +151,11 @@ def test_depth_close_by_is_right_on_average(variant):
 
             for depth in (0.2, 1.0, 3.0):
                 top = depth / np.trapezoid(shape(t), t)
-                sigma = [lambda p, top=top, shape=shape: top * shape(p[1] / 0.6, exp=dr.exp)] * transmittance_atlas.STRATA
+
+                def density(p, top=top, shape=shape):
+                    return top * shape(p[1] / 0.6, exp=dr.exp)
+
+                sigma = [density] * transmittance_atlas.STRATA
                 found = np.array(transmittance_atlas.close_by(sigma, x, wi, v), np.float64)
                 np.testing.assert_allclose(-np.log(found).mean(), depth, rtol=2e-3)
                 off.append(found.mean() - np.exp(-depth))

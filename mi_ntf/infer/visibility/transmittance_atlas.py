@@ -56,9 +56,9 @@ SMOKE_STEP = 1 / 32
 
 class TransmittanceAtlas:
     """`densities`: σ at a point, for each of `STRATA`; `maps`: the :class:`TransmittanceMap` of the directions, read
-    from the distance `begin` on; `march`: a :class:`mi_ntf.infer.visibility.raymarch.RayMarch` for what lies inside the sphere, which any drawn
-    light may; `options`: of the maps. `stream`: a seed of the sampler, for the numbers that lookups draw, opaque, or
-    each would be compiled."""
+    from the distance `begin` on; `march`: a :class:`mi_ntf.infer.visibility.raymarch.RayMarch` for what lies inside
+    the sphere, which any drawn light may; `options`: of the maps. `stream`: a seed of the sampler, for the numbers that
+    lookups draw, opaque, or each would be compiled."""
 
     def __init__(self, densities, maps: TransmittanceMap, begin: float, march, options: Options, dj: ModuleType):
         self.densities, self.maps, self.march, self.options, self.dj = densities, maps, march, options, dj
