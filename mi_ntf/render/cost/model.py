@@ -18,7 +18,7 @@ import numpy as np
 from ... import __version__
 from ...core import radiosity
 from ...infer.grid import CELLS
-from ...infer.march import SHARE
+from ...infer.march import SMOKE_SHARE
 from ...infer.visibility import REGISTRY
 from .. import user_cache
 
@@ -181,7 +181,7 @@ def memory(work: Work, chunk: int) -> dict[str, int]:
         "field grid": 4 * work.voxels**3 + 32 * min(work.voxels, 128) ** 3,
         # Some 24 floats a shading point, 12 a ray between patches, in arrays that Dr.Jit rounds up to powers of two;
         # and two for each point that a camera ray may have.
-        "rays in flight": round(max(camera * (max(share, 1) * 128 + 8 / SHARE), between * 72)),
+        "rays in flight": round(max(camera * (max(share, 1) * 128 + 8 / SMOKE_SHARE), between * 72)),
     }
 
 

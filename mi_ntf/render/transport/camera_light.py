@@ -68,8 +68,10 @@ class _CameraLight:
             self.total[:] = light
             return transmittance
         wanted = found.lit or bool(sums and sums.needs_points)
+        opaque = all(part.medium.field.softness.opaque for part in self.scene.in_view)
         samples = self.seen.samples(wanted, found.collocated, lambda: march.camera_samples(
-            strands, maxt, self.offset, self.depth, shade=wanted, view=found.collocated))
+            strands, maxt, self.offset, self.depth, shade=wanted, view=found.collocated,
+            share=march.SHARE if opaque else march.SMOKE_SHARE))
         light = [dr.zeros(mi.Float, dr.width(samples.t)) for _ in range(3)]
         for i, part in enumerate(self.scene.in_view):
             self._field(i, part, samples, unit, light)
