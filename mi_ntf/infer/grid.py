@@ -41,8 +41,8 @@ class GridField:
 
     def __init__(self, field: NetworkField, resolution: int, dj: ModuleType):
         self.dj, self.resolution, self._field = dj, resolution, field
-        log_sigma = _coefficients(baked_log_density(field, resolution, dj), dj)
-        self._log_sigma, self._corners = _texture(log_sigma[..., None], dj), _Corners(resolution, dj)
+        self._log_sigma = _Voxels(_coefficients(baked_log_density(field, resolution, dj), dj), dj)
+        log_sigma = self._log_sigma.values()
         coarse = min(resolution, REFLECTANCE_RESOLUTION)
         self._reflectance = None
         if not field.quick:
@@ -62,12 +62,7 @@ class GridField:
 
     def cut_log_density(self, p):
         """ln σ at `p`, ``NOTHING`` where there is none: wherever `clearance` says so, among others."""
-        return cut_log_density(self._log_sigma.eval(self._uvw(p))[0], p)
-
-    def rough_density(self, p):
-        """As :meth:`density`, but between four of the eight voxels around `p`, the corners of the tetrahedron that it
-        lies in (Kasson et al. 1995): half of the fetches. Off by 6 % (RMS) on `statue`, by 0.3 % on average."""
-        return density_of(cut_log_density(self._corners.mean(self._log_sigma.value(), p), p))
+        return cut_log_density(self._log_sigma(p), p)
 
     def reflectance(self, p):
         """As :meth:`NetworkField.reflectance`."""
@@ -115,29 +110,44 @@ def _coefficients(log_sigma: np.ndarray, dj: ModuleType) -> np.ndarray:
     return dr.minimum(values, dr.opaque(dj.Float, float(log_sigma.max()))).numpy().reshape(log_sigma.shape)
 
 
-class _Corners:
-    """Of the voxels around points of n³ in [−1, 1]³, four whose tetrahedron holds the point: from the lowest corner of
-    their cube to its highest, along the largest share first."""
+class _Voxels:
+    """Trilinear numbers of `values` (z, y, x) on [−1, 1]³, to 1/65535 of their range. A word holds a voxel and the next
+    one along x: four fetches a point in place of the eight of a Dr.Jit texture, which take 0.7 of the time."""
 
-    def __init__(self, n: int, dj: ModuleType):
-        self._dj, self._half, self._top = dj, dr.opaque(dj.Float, n / 2), dr.opaque(dj.Float, n - 1.001)
-        self._strides = [dr.opaque(dj.UInt32, n**k) for k in range(3)]
+    def __init__(self, values: np.ndarray, dj: ModuleType):
+        n, low = values.shape[0], float(values.min())
+        step = max(float(values.max()) - low, 1e-6) / 0xFFFF
+        levels = np.round((values - low) / step).astype(np.uint32)
+        levels[:, :, :-1] |= levels[:, :, 1:] << 16
+        levels[:, :, -1] |= levels[:, :, -1] << 16
+        self._dj, self._words = dj, dj.UInt32(levels.ravel())
+        self._half, self._last, self._low, self._step = (dr.opaque(dj.Float, v) for v in (n / 2, n - 1, low, step))
+        self._end, self._line, self._layer = (dr.opaque(dj.UInt32, v) for v in (n - 2, n, n * n))
 
-    def mean(self, values, p):
-        """`values` of the voxels, x first, at `p`."""
-        place = [dr.clip(self._half * c + (self._half - 0.5), 0, self._top) for c in p]
-        corner = [self._dj.UInt32(f) for f in place]
-        x, y, z = (f - self._dj.Float(i) for f, i in zip(place, corner, strict=True))
-        low = sum(i * s for i, s in zip(corner, self._strides, strict=True))
-        most, least = dr.maximum(dr.maximum(x, y), z), dr.minimum(dr.minimum(x, y), z)
-        middle = x + y + z - most - least
-        xy, yz, zx = x >= y, y >= z, z >= x
-        across, up, deep = self._strides
-        first = dr.select(xy & ~zx, across, dr.select(yz & ~xy, up, deep))
-        last = dr.select(zx & ~xy, across, dr.select(xy & ~yz, up, deep))
-        high = low + (across + up + deep)
-        corners = (low, 1 - most), (low + first, most - middle), (high - last, middle - least), (high, least)
-        return sum(weight * dr.gather(self._dj.Float, values, i) for i, weight in corners)
+    def values(self) -> np.ndarray:
+        """Those of the voxels, float32."""
+        n = int(self._end[0]) + 2
+        levels = (self._words.numpy() & 0xFFFF).reshape(n, n, n)
+        return (np.float32(self._low[0]) + np.float32(self._step[0]) * levels).astype(np.float32)
+
+    def __call__(self, p):
+        """At the field points `p`; those outside of the voxels' centres, as on the nearest ones."""
+        place = [dr.clip(self._half * c + (self._half - 0.5), 0, self._last) for c in p]
+        x, y, z = (dr.minimum(self._dj.UInt32(f), self._end) for f in place)
+        fx, fy, fz = (f - self._dj.Float(i) for f, i in zip(place, (x, y, z), strict=True))
+        first = z * self._layer + y * self._line + x
+
+        def along_x(index):
+            word = dr.gather(self._dj.UInt32, self._words, index)
+            low = self._dj.Float(word & 0xFFFF)
+            return low + fx * (self._dj.Float(word >> 16) - low)
+
+        def along_y(index):
+            low = along_x(index)
+            return low + fy * (along_x(index + self._line) - low)
+
+        low = along_y(first)
+        return self._low + self._step * (low + fz * (along_y(first + self._layer) - low))
 
 
 def _flat(reflectance) -> list:

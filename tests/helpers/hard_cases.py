@@ -86,7 +86,7 @@ def transmittance(method: str, medium, light, x: np.ndarray) -> np.ndarray:
 def marched(grid, x: np.ndarray, light: np.ndarray, step: float = 1 / 1024) -> np.ndarray:
     """τ (n,) from the points `x` towards the direction `light`, in float64: the voxels' ln σ, trilinear, every `step`
     to the end of the unit sphere."""
-    log_sigma = np.array(grid._log_sigma.tensor(), np.float64)[..., 0]
+    log_sigma = np.array(grid._log_sigma.values(), np.float64)
     n = len(log_sigma)
     along = x @ light
     length, depth = np.sqrt(np.maximum(along**2 - (x * x).sum(1) + 1, 0)) - along, np.zeros(len(x))

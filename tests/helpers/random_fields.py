@@ -135,8 +135,7 @@ class Exact:
     def medium(self):
         """As :meth:`Balls.medium`; its occupancy lets no march skip."""
         corners = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), -1).reshape(-1, 3)
-        grid = SimpleNamespace(clearance=dr.zeros(mi.Float, CELLS**3), hull=corners, density=self.density,
-                               rough_density=self.density)
+        grid = SimpleNamespace(clearance=dr.zeros(mi.Float, CELLS**3), hull=corners, density=self.density)
         network = Balls(0).medium().field.network
         field = SimpleNamespace(network=network, grid=grid, softness=SimpleNamespace(opaque=True))
         return SimpleNamespace(source=SimpleNamespace(density=self.density, reflectance=self.reflectance), field=field)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from helpers import fields
 from helpers.jit import arrays
+from scipy.ndimage import map_coordinates
 
 from mi_ntf.core import field_file, reference
 from mi_ntf.core.architecture import LOG_FLOOR, Architecture, Encoding, Header, Network
@@ -188,7 +189,7 @@ def test_fine_voxels_are_baked_near_matter_alone_and_hold_the_same(monkeypatch):
     some = GridField(network, 112, mi)
     assert looked[0] == (48, 48**3) and looked[1][0] == 112 and looked[1][1] < 112**3 / 2
     monkeypatch.setattr(grid_module, "SURVEY", 112)
-    assert (np.array(some._log_sigma.value()) == np.array(GridField(network, 112, mi)._log_sigma.value())).all()
+    assert (some._log_sigma.values() == GridField(network, 112, mi)._log_sigma.values()).all()
 
 
 def test_grid_knows_where_density_is(rng):
@@ -224,18 +225,15 @@ def test_empty_field():
     assert (np.array(grid.clearance) > 0).all()
 
 
-def test_rough_density(grid, rng, monkeypatch):
-    """Between four voxels: what is linear exactly, also where shares are alike; what bends, nearly."""
-    near = rng.uniform(-0.5, 0.5, (20_000, 3))
-    sides = [np.stack([a, b, c], 1) for a, b, c in ((near[:, 0],) * 3, near[:, [0, 0, 1]].T, near[:, [0, 1, 0]].T,
-                                                   near[:, [1, 0, 0]].T)]
-    x = arrays(np.concatenate([near, *sides]))
-    exact, rough = (np.array(of(x), np.float64) for of in (grid.density, grid.rough_density))
-    assert abs(rough.mean() / exact.mean() - 1) < 0.01
-    assert np.sqrt(((rough - exact) ** 2).mean() / (exact**2).mean()) < 0.08
-    n = grid.resolution
-    z, y, of_x = ((np.mgrid[:n, :n, :n] + 0.5) * 2 / n - 1).astype(np.float32)
-    monkeypatch.setattr(grid, "_log_sigma", grid_module._texture((2 + of_x - 2 * y + 0.5 * z)[..., None], mi))
-    p = np.array(x, np.float64)
-    truth = np.exp(2 + p[0] - 2 * p[1] + 0.5 * p[2])
-    np.testing.assert_allclose(grid.rough_density(x), np.where((p**2).sum(0) < 1, truth, 0), rtol=1e-4)
+def test_voxels(variant, rng):
+    """Trilinear between the values, beyond the outer centres as on them; values as they are to half a level."""
+    values = rng.uniform(-9, 7, (17, 17, 17)).astype(np.float32)
+    voxels, level = grid_module._Voxels(values, mi), np.ptp(values) / 0xFFFF
+    np.testing.assert_allclose(voxels.values(), values, atol=0.51 * level)
+    p = rng.uniform(-1.1, 1.1, (50_000, 3))
+    places = ((p[:, ::-1] + 1) * 17 / 2 - 0.5).T
+    truth = map_coordinates(values.astype(np.float64), places, order=1, mode="nearest")
+    np.testing.assert_allclose(np.array(voxels(arrays(p))), truth, atol=0.51 * level + 6e-5)
+    assert (grid_module._Voxels(np.full((16, 16, 16), 3, np.float32), mi).values() == 3).all()
+    unknown = np.array(voxels(arrays(np.array([[np.nan, 0, 0], [0, np.inf, 0], [0, 0, -np.inf]]))))
+    assert np.isfinite(unknown[1:]).all()

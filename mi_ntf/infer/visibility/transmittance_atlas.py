@@ -35,8 +35,6 @@ STRATA = 4
 """Places close to x: t = REACH v² with v = (i + u)/STRATA, all by the same u of a ray. Skins thin out away from x, and
 strata of √t see each of their parts; the depth is right on average. Off by 1 % of τ at most where fixed places were by
 2 to 4 % (RMS of the means; `statue`, `globe`, `knot`, `skull`), by three strata 2 %."""
-CLOSE = 2
-"""Of these, the first ones, whose densities are read between eight voxels; those further off between four."""
 BEGIN = 0.08
 """Where the map of an opaque thing is read from on: what lies between is neither's, or the skin of x would count
 twice."""
@@ -55,13 +53,13 @@ SMOKE_STEP = 1 / 32
 
 
 class TransmittanceAtlas:
-    """`densities`: σ at a point, for each of `STRATA`; `maps`: the :class:`TransmittanceMap` of the directions, read
+    """`density`: σ at a point; `maps`: the :class:`TransmittanceMap` of the directions, read
     from the distance `begin` on; `march`: a :class:`mi_ntf.infer.visibility.raymarch.RayMarch` for what lies inside
     the sphere, which any drawn light may; `options`: of the maps. `stream`: a seed of the sampler, for the numbers that
     lookups draw, opaque, or each would be compiled."""
 
-    def __init__(self, densities, maps: TransmittanceMap, begin: float, march, options: Options, dj: ModuleType):
-        self.densities, self.maps, self.march, self.options, self.dj = densities, maps, march, options, dj
+    def __init__(self, density, maps: TransmittanceMap, begin: float, march, options: Options, dj: ModuleType):
+        self.density, self.maps, self.march, self.options, self.dj = density, maps, march, options, dj
         self._begin = dr.opaque(dj.Float, begin)
         self._side = dr.opaque(dj.Float, maps.count**0.5)
         self.stream = dr.opaque(dj.UInt32, 0)
@@ -83,25 +81,35 @@ class TransmittanceAtlas:
         return dr.if_stmt((x, wi, distance), active & (here + distance < h), march, look_up, label="light inside")
 
     def _look_up(self, x, wi, here, active):
+        """0 where not `active`: often no light shines on any of the points that kernels look at together."""
+        if active is True:
+            return self._product(x, wi, here)
+
+        def dark(x, wi, here):
+            return type(here)(0)
+
+        return dr.if_stmt((tuple(x), tuple(wi), here), active, self._product, dark, label="lit")
+
+    def _product(self, x, wi, here):
         outside = dr.squared_norm(self.dj.Array3f(*x)) > OUTSIDE
         *u, v = _uniforms(self.dj, self.stream, x, wi)
-        far = self._far(x, wi, here, outside, active, u)
+        far = self._far(x, wi, here, outside, u)
 
         def near(far, x, wi, v):
-            return far * close_by(self.densities, x, wi, v)
+            return far * close_by(self.density, x, wi, v)
 
         def dark(far, x, wi, v):
             return far
 
-        wanted = active & ~outside & (far > DARK)
+        wanted = ~outside & (far > DARK)
         return dr.if_stmt((far, tuple(x), tuple(wi), v), wanted, near, dark, label="near")
 
-    def _far(self, x, wi, here, outside, active, u):
+    def _far(self, x, wi, here, outside, u):
         k, d = self._direction(wi, u[:2])
         pivot = dr.select(outside, dr.maximum(-here, 0), dr.maximum(-0.5 * here, NEAREST_PIVOT))
         back = dr.select(outside, pivot, pivot - self._begin)
         y = tuple(a + pivot * b for a, b in zip(x, wi, strict=True))
-        return self.maps.tau_of_one(k, y, dot(y, d) - back, u[2:], active)
+        return self.maps.tau_of_one(k, y, dot(y, d) - back, u[2:], True)
 
     def _direction(self, wi, u):
         """``(index, direction)`` of one of the four nearest."""
@@ -110,10 +118,10 @@ class TransmittanceAtlas:
         return self.dj.UInt32(iv * self._side + iu), octahedral.direction(iu, iv, self._side)
 
 
-def close_by(densities, x, wi, v):
+def close_by(density, x, wi, v):
     """τ(x, ω) as far as `REACH`, drawn by the uniform number `v`: its optical depth is right on average."""
     depth = 0
-    for i, density in enumerate(densities):
+    for i in range(STRATA):
         root = (v + i) * (1 / STRATA)
         t = REACH * root * root
         depth += root * density(tuple(a + t * b for a, b in zip(x, wi, strict=True)))
@@ -162,9 +170,8 @@ def build(medium, lights, options: Options, dj, keep) -> TransmittanceAtlas:
     maps = keep(channels(source.components, source.weights), step, make, directions, own)
     march = raymarch.build(medium, lights, options, dj, keep)
     begin = BEGIN if medium.field.softness.opaque else REACH
-    # Voxels will do for what is further off, also of a field that is its networks.
-    densities = [medium.source.density] * CLOSE + [medium.field.grid.rough_density] * (STRATA - CLOSE)
-    return TransmittanceAtlas(densities, maps, begin, march, own, dj)
+    # Voxels will do, also for a field that is its networks.
+    return TransmittanceAtlas(medium.field.grid.density, maps, begin, march, own, dj)
 
 
 def numbers(medium, lights, options: Options) -> int:
@@ -182,7 +189,7 @@ METHOD = Method(
     name="transmittance_atlas",
     summary="per field, maps of directions all around: one texel and a few densities per point and light",
     build=build,
-    pair=lambda work, prices: prices.atlas + CLOSE * queries(work, prices),
+    pair=lambda work, prices: prices.atlas,
     prices={"atlas": 25.0},
     making=making,
     numbers=numbers,
