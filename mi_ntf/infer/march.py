@@ -14,8 +14,6 @@ SHARE = 1 / 8
 lights that are summed, shares of 1/6 would take 0.75 of that; with lights drawn at each point they gain nothing."""
 SMOKE_SHARE = 1 / 16
 """The same of a field without opaque skins, whose rays are long to march: 0.7 of the time of shares of 1/8."""
-GOLDEN = 0.618034
-"""Its multiples fill [0, 1) most evenly."""
 MIN_SHARE = 1e-4
 """Rays that lose less light have no sample, nor have ends of rays that do."""
 MIN_TRANSMITTANCE = 1e-3
@@ -95,12 +93,12 @@ def camera_samples(strands, maxt, offset, depth, shade=True, view=False, share=N
 
     Quadrature of method.md, section 1: α_j = 1 − e^(−σ_j Δ), w_j = T_j α_j, σ_j the mean density of cell j, the sum
     over the fields, asked at the ends of its pieces. A sample stands for `share` of the light that the ray loses, the
-    last one for what remains, and lies where the ray has lost so much: at one place in each share, by `depth` and a
-    sequence that fills [0, 1) evenly, so that quantities that vary along the ray, above all the light's own
-    transmittance, are averaged with the right weights. In its cell it lies where free flight through the pieces would
-    end: the expectation over `depth` is right for densities exponential across each piece. Of the shares that lie in
-    one cell as a whole one sample stands for all. It follows the march continuously: rounding moves a sample by as
-    little as the light before it, and does not choose among cells, but in the last, unfinished share.
+    last one for what remains, and lies where the ray has lost so much: at one place in each share, drawn by `depth`, so
+    that quantities that vary along the ray, above all the light's own transmittance, are averaged with the right
+    weights. In its cell it lies where free flight through the pieces would end: the expectation over `depth` is right
+    for densities exponential across each piece. Of the shares that lie in one cell as a whole one sample stands for
+    all. It follows the march continuously: rounding moves a sample by as little as the light before it, and does not
+    choose among cells, but in the last, unfinished share.
     """
     bundle = Bundle(strands, maxt, offset)
     uint = dr.uint32_array_t(type(bundle.base))
@@ -140,7 +138,7 @@ def _gather(bundle, depth, channels: int, share: float):
     def look(count, ray, depth, here, last, *kept):
         before, after = 1 - here.transmittance, 1 - (here.transmittance - here.weight)
         first, now = shares.number(before), shares.number(after)
-        number = _uniform(depth, here)
+        number = _uniform(depth, here.number)
         # Of the shares that end here one may have its sample in an earlier cell.
         early = (shares.aim(depth, first) < before) & (now > first)
         count = dr.if_stmt((count, ray, kept, dr.select(early, shares.size, 0)), early, put, none, label="earlier")
@@ -187,15 +185,15 @@ class _Shares:
 
     def aim(self, depth, number):
         """The light that a ray has lost where the sample of its share `number` lies."""
-        place = depth + number * GOLDEN
-        return (number + place - dr.floor(place)) * self.size
+        uint = dr.uint32_array_t(type(depth))
+        return (number + _uniform(depth, uint(number) + 77)) * self.size  # 77: not the numbers of the first cells
 
 
-def _uniform(depth, here):
-    """A number in [0, 1) of a ray's `depth` and the number of its cell. One number for all of a ray's choices, used up
-    by and by, would make late ones turn on the rounding of early ones."""
+def _uniform(depth, number):
+    """A number in [0, 1) of a ray's `depth` and the whole `number` of a cell or share. One number for all of a ray's
+    choices, used up by and by, would make late ones turn on the rounding of early ones."""
     uint = dr.uint32_array_t(type(depth))
-    bits = (uint(depth * 2**24) * 0x9E3779B1) ^ (here.number * 0x85EBCA77)
+    bits = (uint(depth * 2**24) * 0x9E3779B1) ^ (number * 0x85EBCA77)
     for factor in (0x2C1B3C6D, 0x297A2D39):
         bits = (bits ^ (bits >> 15)) * factor
     return type(depth)((bits ^ (bits >> 15)) >> 8) * 2**-24

@@ -17,11 +17,11 @@ that hardly shows so many times its light would be no number."""
 STRIDE = 3242174889, 2447445414
 """Powers of the inverse plastic number, times 2³²: the additive sequence R2 that fills a square most evenly."""
 BLOCK = 64
-"""Points side by side, mostly of one pixel, that share one run of the sequence: the noise of `skull` under its
-environment falls by a fifth."""
+"""Points side by side, mostly of one pixel, that share one run of the sequence: under the demo's environment the
+variance of `skull` falls by a fifth, of `statue` by a tenth."""
 NARROW = 0.25
 """Emitters whose radius is less than this times their distance light a point from about one side: resampling gains
-nothing, and costs a sixth of the picture's time."""
+nothing (`statue`, `skull`: the variance of 1 to 6 candidates is the same to 0.5 %), and every candidate costs."""
 
 
 class EmitterSamples:
@@ -39,9 +39,9 @@ class EmitterSamples:
 
     far       whether all emitters lie outside of the field's sphere
 
-    A light is the one that resampling keeps of a few draws, with chances in proportion to the light that each
-    would scatter to the viewer, were nothing in the way (Talbot et al. 2005): of the many that could, the few worth a
-    visibility. It is weighted so that the mean over all draws is the sum over all emitters.
+    A light of a wide emitter is the one that resampling keeps of a few draws, with chances in proportion to the light
+    that each would scatter to the viewer, were nothing in the way (Talbot et al. 2005): of the many that could, the few
+    worth a visibility. It is weighted so that the mean over all draws is the sum over all emitters.
     """
 
     def __init__(self, emitters: list, weights: list[float], frame: Frame, points, seed, count: int = 0,
