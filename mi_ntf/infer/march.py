@@ -14,6 +14,8 @@ SHARE = 1 / 8
 lights that are summed, shares of 1/6 would take 0.75 of that; with lights drawn at each point they gain nothing."""
 SMOKE_SHARE = 1 / 16
 """The same of a field without opaque skins, whose rays are long to march: 0.7 of the time of shares of 1/8."""
+GOLDEN = 0.618034
+"""Its multiples fill [0, 1) most evenly."""
 MIN_SHARE = 1e-4
 """Rays that lose less light have no sample, nor have ends of rays that do."""
 MIN_TRANSMITTANCE = 1e-3
@@ -86,19 +88,19 @@ def camera_samples(strands, maxt, offset, depth, shade=True, view=False, share=N
     strands   of each ray, one for each field
     maxt      where each ray ends (a surface, or infinity)
     offset    per ray, uniform in [0, 1): where its lattice of cells begins
-    depth     per ray, uniform in [0, 1): where in its cells a sample lies, as a quantile of the light lost in them
+    depth     per ray, uniform in [0, 1): where in its shares of the light a sample lies
     shade     whether there is use for the samples; otherwise only `transmittance` is found
     view      whether `view` is wanted
     share     of its ray that a sample stands for; None: SHARE
 
     Quadrature of method.md, section 1: α_j = 1 − e^(−σ_j Δ), w_j = T_j α_j, σ_j the mean density of cell j, the sum
     over the fields, asked at the ends of its pieces. A sample stands for `share` of the light that the ray loses, the
-    last one for what remains, and lies where the ray has lost so much: at one place in each share, drawn by `depth`, so
-    that quantities that vary along the ray, above all the light's own transmittance, are averaged with the right
-    weights. In its cell it lies where free flight through the pieces would end: the expectation over `depth` is right
-    for densities exponential across each piece. Of the shares that lie in one cell as a whole one sample stands for
-    all. It follows the march continuously: rounding moves a sample by as little as the light before it, and does not
-    choose among cells, but in the last, unfinished share.
+    last one for what remains, and lies where the ray has lost so much: by `depth` in each share, so that quantities
+    that vary along the ray, above all the light's own transmittance, are averaged with the right weights. In its cell
+    it lies where free flight through the pieces would end: the expectation over `depth` is right for densities
+    exponential across each piece. Of the shares that end in one cell one sample stands for all that have none yet. It
+    follows the march continuously: rounding moves a sample by as little as the light before it, and does not choose
+    among cells, but in the last, unfinished share.
     """
     bundle = Bundle(strands, maxt, offset)
     uint = dr.uint32_array_t(type(bundle.base))
@@ -120,7 +122,7 @@ def _gather(bundle, depth, channels: int, share: float):
     first samples of all rays before the second ones, and so on."""
     floats, uint = type(bundle.base), dr.uint32_array_t(type(bundle.base))
     n = dr.width(bundle.base)
-    most, shares = math.ceil(1 / share) + 1, _Shares(depth, share)
+    most, size, per_light = math.ceil(1 / share), dr.opaque(floats, share), dr.opaque(floats, 1 / share)
     found = [dr.empty(floats, most * n) for _ in range(channels)]
     ray, rays = dr.arange(uint, n), dr.opaque(uint, n)
 
@@ -136,24 +138,20 @@ def _gather(bundle, depth, channels: int, share: float):
         return count
 
     def look(count, ray, depth, here, last, *kept):
-        before, after = 1 - here.transmittance, 1 - (here.transmittance - here.weight)
-        first, now = shares.number(before), shares.number(after)
-        number = _uniform(depth, here.number)
-        # Of the shares that end here one may have its sample in an earlier cell.
-        early = (shares.aim(depth, first) < before) & (now > first)
-        count = dr.if_stmt((count, ray, kept, dr.select(early, shares.size, 0)), early, put, none, label="earlier")
-        first = dr.select(early, first + 1, first)
-        aim = shares.aim(depth, first + dr.floor(number * (now - first)))
-        weight = (now - first) * shares.size
-        count = dr.if_stmt((count, ray, here, aim, weight), now > first, put_here, none, label="sample")
+        # In shares: the light that is lost before the cell and after it.
+        begin, end = ((1 - left) * per_light for left in (here.transmittance, here.transmittance - here.weight))
+        now = dr.floor(end)
+        early, others, place = _closing(depth, begin, now)
+        count = dr.if_stmt((count, ray, kept, dr.select(early, size, 0)), early, put, none, label="earlier sample")
+        count = dr.if_stmt((count, ray, here, place * size, others * size), others > 0, put_here, none, label="sample")
         # The share that is still open: until its own place is reached, one is chosen by weight.
-        aim, begin, rest = shares.aim(depth, now), dr.maximum(now * shares.size, before), after - now * shares.size
-        reached, chance = aim < after, number * rest
-        take = dr.select(reached, aim >= before, chance < after - begin)
-        at = here.sample(here.quantile(dr.select(reached, aim, begin + chance)))
+        aim, rest, low = now + _place(depth, now), end - now, dr.maximum(now, begin)
+        reached, chance = aim < end, _uniform(depth, here.number) * rest
+        take = dr.select(reached, aim >= begin, chance < end - low)
+        at = here.sample(here.quantile(dr.select(reached, aim, low + chance) * size))
         kept = tuple(dr.select(take, a, b) for a, b in zip(at, kept, strict=True))
-        ends = last & (rest > MIN_SHARE)
-        return dr.if_stmt((count, ray, kept, rest), ends, put, none, label="last sample"), *kept
+        weight, ends = rest * size, last & (rest * size > MIN_SHARE)
+        return dr.if_stmt((count, ray, kept, weight), ends, put, none, label="last sample"), *kept
 
     def gather(active, last, here, state):
         wanted = active & ((here.weight > 0) | last)
@@ -166,6 +164,27 @@ def _gather(bundle, depth, channels: int, share: float):
     return transmittance, count, found
 
 
+def _closing(depth, begin, now):
+    """Of the shares that end in a cell, which begins after `begin` shares and ends in share `now`: ``(early, others,
+    place)``, whether one of them has its sample in an earlier cell, how many others there are, and where in the cell
+    the one sample lies that stands for them: uniformly, spread over the samples of a pixel as evenly as `depth`, and
+    at the cell's beginning where `early` turns on the last bit."""
+    first = dr.floor(begin)
+    place, passed = _place(depth, first), begin - first
+    early = (now > first) & (place < passed)
+    others = now - first - dr.select(early, 1, 0)
+    # As it is known whether `place` is less than `passed`, it is uniform on one side.
+    away = dr.abs(place - passed) * dr.rcp(dr.maximum(dr.select(early, passed, 1 - passed), 1e-6))
+    return early, others, begin + dr.minimum(away, 1) * (now - begin)
+
+
+def _place(depth, number):
+    """Where in its share `number` a ray's sample lies, in [0, 1): evenly over a ray's shares, and over rays as `depth`
+    is."""
+    place = depth + number * GOLDEN
+    return place - dr.floor(place)
+
+
 def _weighted(sample, weight) -> tuple:
     """``(t, *weights, view)`` of a :meth:`_Here.sample` that stands for `weight`: in each field by its share."""
     t, *shares, view = sample
@@ -173,25 +192,8 @@ def _weighted(sample, weight) -> tuple:
     return t, *((weight,) if scale is None else (share * scale for share in shares)), view
 
 
-class _Shares:
-    """The light that rays lose, in shares of `size`."""
-
-    def __init__(self, depth, size: float):
-        self.size, self._count = (dr.opaque(type(depth), v) for v in (size, 1 / size))
-
-    def number(self, light):
-        """How many have been lost with so much `light`."""
-        return dr.floor(light * self._count)
-
-    def aim(self, depth, number):
-        """The light that a ray has lost where the sample of its share `number` lies."""
-        uint = dr.uint32_array_t(type(depth))
-        return (number + _uniform(depth, uint(number) + 77)) * self.size  # 77: not the numbers of the first cells
-
-
 def _uniform(depth, number):
-    """A number in [0, 1) of a ray's `depth` and the whole `number` of a cell or share. One number for all of a ray's
-    choices, used up by and by, would make late ones turn on the rounding of early ones."""
+    """A number in [0, 1) of a ray's `depth` and the `number` of a cell."""
     uint = dr.uint32_array_t(type(depth))
     bits = (uint(depth * 2**24) * 0x9E3779B1) ^ (number * 0x85EBCA77)
     for factor in (0x2C1B3C6D, 0x297A2D39):

@@ -265,3 +265,17 @@ def test_rays_from_afar(slab, distance):
     np.testing.assert_allclose(np.array(samples.bundle.base), distance - np.sqrt(1 - across**2), rtol=2e-7, atol=1e-6)
     place = np.array(samples.place(0, samples.ray, samples.t)[0]).T
     assert np.linalg.norm(place, axis=1).max() < 1 + 1e-5
+
+
+@pytest.mark.parametrize(("begin", "now"), [(0.0, 1), (0.3, 1), (0.3, 2), (2.0, 5), (2.9, 7), (0.4, 0)])
+def test_shares_that_end_in_a_cell_are_represented_evenly(variant, begin, now):
+    """Mean weight, place and its square over `depth`: of the light from `begin` to the last end of a share."""
+    depth = (dr.arange(mi.Float, 1 << 16) + 0.5) / (1 << 16)
+    early, others, place = (np.array(v, np.float64) for v in march._closing(depth, mi.Float(begin), mi.Float(now)))
+    length = max(now - begin, 0)
+    assert early.mean() == pytest.approx(begin % 1 if now > begin else 0, abs=1e-4)
+    assert others.mean() == pytest.approx(length, abs=1e-4)
+    for power in (1, 2) if length else ():
+        truth = (now ** (power + 1) - begin ** (power + 1)) / (power + 1)
+        assert (others * place**power).mean() == pytest.approx(truth, rel=1e-3)
+    assert (place[others > 0] >= begin - 1e-6).all() and (place[others > 0] <= now + 1e-6).all()

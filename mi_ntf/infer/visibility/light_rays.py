@@ -74,15 +74,15 @@ class LightRays:
         """Cells along a side of the directions of lights that look everywhere."""
         return dr.sqrt(dr.floor(self._area))
 
-    def one(self, index, x, u, active):
+    def one(self, index, x, u):
         """``(inside, texel)`` of one of the four rays of directional light `index` nearest to `x`, drawn by their
         bilinear weights with the uniform numbers `u` (2)."""
         first = self.dj.UInt32(index) * (ROW // 4)
-        axes = (dr.gather(self.dj.Array4f, self._rows, first + i, active) for i in range(2))
+        axes = (dr.gather(self.dj.Array4f, self._rows, first + i) for i in range(2))
         fu, fv = (dot((c[0], c[1], c[2]), x) + c[3] for c in axes)
-        columns = dr.gather(self.dj.Float, self._rows, first * 4 + 11, active)
+        columns = dr.gather(self.dj.Float, self._rows, first * 4 + 11)
         lines = dr.floor(self._area / columns)
-        inside = active & (fu > -0.5) & (fv > -0.5) & (fu < columns - 0.5) & (fv < lines - 0.5)
+        inside = (fu > -0.5) & (fv > -0.5) & (fu < columns - 0.5) & (fv < lines - 0.5)
         tu, tv = (dr.clip(dr.floor(f + r), 0, n - 1) for f, r, n in ((fu, u[0], columns), (fv, u[1], lines)))
         return inside, self.dj.UInt32(index) * self._texels + self.dj.UInt32(tv * columns + tu)
 

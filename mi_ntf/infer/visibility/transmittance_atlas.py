@@ -53,10 +53,10 @@ SMOKE_STEP = 1 / 32
 
 
 class TransmittanceAtlas:
-    """`density`: σ at a point; `maps`: the :class:`TransmittanceMap` of the directions, read
-    from the distance `begin` on; `march`: a :class:`mi_ntf.infer.visibility.raymarch.RayMarch` for what lies inside
-    the sphere, which any drawn light may; `options`: of the maps. `stream`: a seed of the sampler, for the numbers that
-    lookups draw, opaque, or each would be compiled."""
+    """`density`: σ at a point; `maps`: the :class:`TransmittanceMap` of the directions, read from the distance `begin`
+    on; `march`: a :class:`mi_ntf.infer.visibility.raymarch.RayMarch` for what lies inside the sphere, which any drawn
+    light may; `options`: of the maps. `stream`: a seed of the sampler, for the numbers that lookups draw, opaque, or
+    each would be compiled."""
 
     def __init__(self, density, maps: TransmittanceMap, begin: float, march, options: Options, dj: ModuleType):
         self.density, self.maps, self.march, self.options, self.dj = density, maps, march, options, dj
@@ -109,7 +109,7 @@ class TransmittanceAtlas:
         pivot = dr.select(outside, dr.maximum(-here, 0), dr.maximum(-0.5 * here, NEAREST_PIVOT))
         back = dr.select(outside, pivot, pivot - self._begin)
         y = tuple(a + pivot * b for a, b in zip(x, wi, strict=True))
-        return self.maps.tau_of_one(k, y, dot(y, d) - back, u[2:], True)
+        return self.maps.tau_of_one(k, y, dot(y, d) - back, u[2:])
 
     def _direction(self, wi, u):
         """``(index, direction)`` of one of the four nearest."""

@@ -75,10 +75,10 @@ class TransmittanceMap:
             root += weight * _root(t + shift, parts)
         return dr.select(inside, dr.minimum(root * root, 1), 1)
 
-    def tau_of_one(self, index, x, t, u, active):
+    def tau_of_one(self, index, x, t, u):
         """τ of one of the four rays of the directional light `index` nearest to `x`, drawn by the uniform numbers `u`
         (2), read at its place `t`; 1 where light meets nothing."""
-        inside, texel = self.rays.one(index, x, u, active)
+        inside, texel = self.rays.one(index, x, u)
         return dr.select(inside, dr.minimum(_tau(t, self._fetch(texel, inside)), 1), 1)
 
     def _fetch(self, texel, active):

@@ -150,7 +150,7 @@ def _outside(emitter, frame: Frame) -> bool:
 
 def _narrow(emitter, frame: Frame) -> bool:
     """Whether an emitter lights all points of the unit sphere of `frame` evenly, each from about one side."""
-    if mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaPosition):
+    if mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta):
         return True
     shape = emitter.get_shape()
     if shape is None or mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying):
