@@ -24,6 +24,8 @@ from ..backend import floats
 from ..lights import LightTable
 
 ROW = 16
+PART = 128
+"""Lights whose rectangles are sought at a time, so that what is needed for it stays in the processor's cache."""
 NEAREST_DEPTH = 0.2
 WIDEST = 2.0
 """tan 63°. Wider frusta waste their rays on the rim."""
@@ -220,15 +222,9 @@ def frames(lights: LightTable, hull: np.ndarray, resolution: int) -> np.ndarray:
     side = np.cross(axis, helper)
     side /= np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
     up = np.cross(axis, side)
-    best, area = np.zeros((lights.count, 10)), np.full(lights.count, np.inf)
-    for angle in np.arange(8) * np.pi / 16:
-        u = np.cos(angle) * side + np.sin(angle) * up
-        v = np.cos(angle) * up - np.sin(angle) * side
-        row = np.concatenate([u, v, *_window(u, v, hull, np.maximum(depth, NEAREST_DEPTH))], axis=1)
-        size = row[:, 7] * row[:, 9]
-        # By a clear margin: of rectangles alike, rounding would pick another one wherever the field stands.
-        smaller = size < (1 - 1e-6) * area
-        best, area = np.where(smaller[:, None], row, best), np.where(smaller, size, area)
+    scale = np.maximum(depth, NEAREST_DEPTH)
+    parts = (slice(i, i + PART) for i in range(0, max(lights.count, 1), PART))
+    best = np.concatenate([_rectangles(side[p], up[p], hull, scale[:, p]) for p in parts])
     u, v, (u_middle, u_half, v_middle, v_half) = best[:, :3], best[:, 3:6], best[:, 6:].T
     widest = k * np.maximum(np.abs(u_middle) + u_half, np.abs(v_middle) + v_half)
     sphere = (depth.min(0) < NEAREST_DEPTH) | (widest > WIDEST)
@@ -248,10 +244,22 @@ def _along(points, axes):
     return sum(points[:, i, None] * axes[None, :, i] for i in range(3))
 
 
-def _window(u, v, hull, depth):
-    """Middle and half width, along u and v, of what holds `hull` on the plane through the origin, as each light sees
-    it: two (n, 2)."""
-    for along in (u, v):
-        place = _along(hull, along) / depth
-        low, high = place.min(0), place.max(0)
-        yield np.stack([(low + high) / 2, np.maximum((high - low) / 2, 1e-3)], axis=1)
+def _rectangles(side, up, hull, scale) -> np.ndarray:
+    """û, v̂ of unit length and both :func:`_window` of the smallest of a few rectangles that hold the object as each
+    light sees it, (n, 10). `side`, `up`: (n, 3), axes across the light's; `scale`: depth of the `hull`, (points, n)."""
+    x, y = _along(hull, side) / scale, _along(hull, up) / scale
+    best, area = np.zeros((len(side), 10)), np.full(len(side), np.inf)
+    for angle in np.arange(8) * np.pi / 16:
+        c, s = np.cos(angle), np.sin(angle)
+        row = np.concatenate([c * side + s * up, c * up - s * side, _window(c * x + s * y), _window(c * y - s * x)], 1)
+        size = row[:, 7] * row[:, 9]
+        # By a clear margin: of rectangles alike, rounding would pick another one wherever the field stands.
+        smaller = size < (1 - 1e-6) * area
+        best, area = np.where(smaller[:, None], row, best), np.where(smaller, size, area)
+    return best
+
+
+def _window(places) -> np.ndarray:
+    """Middle and half width, (n, 2), of what holds all `places` (points, n)."""
+    low, high = places.min(0), places.max(0)
+    return np.stack([(low + high) / 2, np.maximum((high - low) / 2, 1e-3)], axis=1)

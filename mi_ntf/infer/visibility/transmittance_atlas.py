@@ -25,9 +25,9 @@ from . import map_source, raymarch, two_logistics
 from .method import FILLED, Method, Options, queries
 from .transmittance_map import TransmittanceMap, channels
 
-SIDE = 32
+SIDE = 28
 """Directions: as many squared, octahedral."""
-RESOLUTION = 45
+RESOLUTION = 51
 """Texels along a map's side: 63 MiB of two logistics each. One through the layers of `globe` is 0.8 % too dark."""
 LOGISTICS = 2
 RAYS = SIDE**2 * RESOLUTION**2
@@ -45,7 +45,7 @@ DARK = 3e-4
 NEAREST_PIVOT = 0.16
 OUTSIDE = 0.98
 """Squared distance from the origin where points lie in no skin: maps are read from the sphere on."""
-COARSE = 3.0
+COARSE = 4.0
 """Steps of the march that fills the maps of an opaque thing, in those of a transmittance map: what a texel blurs hides
 more (pictures of four objects err alike by 2 and 3)."""
 SMOKE_STEP = 1 / 32

@@ -54,7 +54,9 @@ class TransmittanceMap:
         chunk = max(1, (1 << 22) // self.rays.m**2)
         for first in range(0, self.count, chunk):
             texel, o, d, end = self.rays.all_rays(first, min(chunk, self.count - first))
-            for k, part in enumerate(source.fit(o, d, end)):
+            mixture = source.fit(o, d, end)
+            dr.eval(mixture)  # or each part's scatter would march anew
+            for k, part in enumerate(mixture):
                 row = self.dj.Array2f(*part[1:]) if self.width == 2 else self.dj.Array4f(*part, 0)
                 dr.scatter(numbers, row, texel * parts + k)
             dr.eval(numbers)

@@ -189,16 +189,16 @@ def power(texels, shape: tuple[int, int], cells: Cells):
 def _cut(light: np.ndarray, limit: int) -> list:
     """Bounds of at most `limit` cells of `light` (4, rows, columns): power and first moments of each block."""
     order = itertools.count()
-    waiting = [(0.0, next(order), (0, light.shape[1], 0, light.shape[2]))]
+    waiting = [(0.0, next(order), "", (0, light.shape[1], 0, light.shape[2]))]
     whole: list = []
     while waiting and len(waiting) + len(whole) < limit:
-        cell = heapq.heappop(waiting)[2]
+        _, _, path, cell = heapq.heappop(waiting)
         halves = _halves(light, cell)
         if not halves:
-            whole.append(cell)
-        for half, (power, *moment) in halves:
-            heapq.heappush(waiting, (np.linalg.norm(moment) - power, next(order), half))
-    return whole + [cell for _, _, cell in sorted(waiting)]
+            whole.append((path, cell))
+        for side, (half, (power, *moment)) in enumerate(halves):
+            heapq.heappush(waiting, (np.linalg.norm(moment) - power, next(order), f"{path}{side}", half))
+    return [cell for _, cell in sorted(whole + [(path, cell) for _, _, path, cell in waiting])]
 
 
 def _halves(light: np.ndarray, cell: tuple) -> list:
