@@ -223,8 +223,8 @@ def frames(lights: LightTable, hull: np.ndarray, resolution: int) -> np.ndarray:
     side /= np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
     up = np.cross(axis, side)
     scale = np.maximum(depth, NEAREST_DEPTH)
-    parts = (slice(i, i + PART) for i in range(0, max(lights.count, 1), PART))
-    best = np.concatenate([_rectangles(side[p], up[p], hull, scale[:, p]) for p in parts])
+    some = [slice(i, i + PART) for i in range(0, max(lights.count, 1), PART)]
+    best = np.concatenate([_rectangles(side[s], up[s], hull, scale[:, s]) for s in some])
     u, v, (u_middle, u_half, v_middle, v_half) = best[:, :3], best[:, 3:6], best[:, 6:].T
     widest = k * np.maximum(np.abs(u_middle) + u_half, np.abs(v_middle) + v_half)
     sphere = (depth.min(0) < NEAREST_DEPTH) | (widest > WIDEST)

@@ -187,7 +187,8 @@ def power(texels, shape: tuple[int, int], cells: Cells):
 
 
 def _cut(light: np.ndarray, limit: int) -> list:
-    """Bounds of at most `limit` cells of `light` (4, rows, columns): power and first moments of each block."""
+    """Bounds of at most `limit` cells of `light` (4, rows, columns): power and first moments of each block. Neighbours
+    follow each other, so that lookups find in the processor's cache what the light before needed."""
     order = itertools.count()
     waiting = [(0.0, next(order), "", (0, light.shape[1], 0, light.shape[2]))]
     whole: list = []
