@@ -120,7 +120,9 @@ class _Voxels:
         levels = np.round((values - low) / step).astype(np.uint32)
         levels[:, :, :-1] |= levels[:, :, 1:] << 16
         levels[:, :, -1] |= levels[:, :, -1] << 16
-        self._dj, self._words = dj, dj.UInt32(levels.ravel())
+        # Dr.Jit's own copy: NumPy's memory, aligned by chance, would compile kernels anew, and counts as nobody's.
+        self._dj, self._words = dj, dj.UInt32(levels.ravel()) | dr.opaque(dj.UInt32, 0)
+        dr.eval(self._words)
         self._half, self._last, self._low, self._step = (dr.opaque(dj.Float, v) for v in (n / 2, n - 1, low, step))
         self._end, self._line, self._layer = (dr.opaque(dj.UInt32, v) for v in (n - 2, n, n * n))
 
