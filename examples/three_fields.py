@@ -28,14 +28,14 @@ def field(name: str, to_world, scale: float = 1.0) -> dict:
     return {"type": "sphere", "to_world": ball, "bsdf": {"type": "null"}, "interior": medium}
 
 
-def main(out: Path = Path("out/three_fields.png"), size: int = 320, spp: int = 16, max_depth: int = 4) -> None:
-    """Render and save the picture."""
+def load(size: int, spp: int, max_depth: int, visibility: str = "raymarch") -> mi.Scene:
+    """The scene; three bounces by a `max_depth` of 4."""
     tiles = {"type": "checkerboard", "color0": 0.25, "color1": 0.6, "to_uv": PLACE().scale([8, 8, 1])}
     view = PLACE().look_at([-1.2, 1.9, 4.6], [0.1, 0.6, 0], [0, 1, 0])
     lamp = {"type": "area", "radiance": {"type": "rgb", "value": [18, 16, 13]}}
-    scene = mi.load_dict({
+    return mi.load_dict({
         "type": "scene",
-        "integrator": {"type": "nrf", "visibility": "raymarch", "light_samples": 4, "max_depth": max_depth},
+        "integrator": {"type": "nrf", "visibility": visibility, "light_samples": 4, "max_depth": max_depth},
         "sensor": {"type": "perspective", "fov": 36, "to_world": view,
                    "film": {"type": "hdrfilm", "width": size * 3 // 2, "height": size},
                    "sampler": {"type": "multijitter", "sample_count": spp}},
@@ -50,6 +50,11 @@ def main(out: Path = Path("out/three_fields.png"), size: int = 320, spp: int = 1
                  "emitter": lamp},
         "sky": {"type": "envmap", "filename": str(SCENES / "common" / "env.exr"), "scale": 0.5},
     })  # fmt: skip
+
+
+def main(out: Path = Path("out/three_fields.png"), size: int = 320, spp: int = 16, max_depth: int = 4) -> None:
+    """Render and save the picture."""
+    scene = load(size, spp, max_depth)
     out.parent.mkdir(parents=True, exist_ok=True)
     mi.util.write_bitmap(str(out), mi.render(scene)[..., :3], write_async=False)
 

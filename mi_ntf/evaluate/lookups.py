@@ -5,12 +5,14 @@ does not measure.
     python -m mi_ntf.evaluate.lookups whole  …
     python -m mi_ntf.evaluate.lookups drawn  …
     python -m mi_ntf.evaluate.lookups floor  …
+    python -m mi_ntf.evaluate.lookups bounces --size 160
 
 ``loop``   nanoseconds of τ at a seen point, towards a direction of its own or the same lights as its neighbours.
 ``whole``  a picture under the demo's environment, kernels compiled and atlases made anew; error to `raymarch`.
 ``drawn``  8 lights drawn for each point, of the environment and of an area light: time to equal noise.
 ``floor``  the field's shadow on a floor under an ``ntf`` around the environment, by stock ``path``: the median of three
            pictures of 256 samples; error of the mean of all, of the picture and relative to the shadow in it.
+``bounces``  three bounces of ``examples/three_fields.py``, atlases at hand: seconds and brightness.
 
 One line of JSON a scene. Medians; both sides alternate.
 """
@@ -18,6 +20,7 @@ One line of JSON a scene. Medians; both sides alternate.
 import argparse
 import json
 import os
+import runpy
 from typing import Any
 
 import drjit as dr
@@ -135,7 +138,21 @@ def _floor_scene(name: str, method: str, size: int):
         if method else sky})
 
 
-CASES = {"loop": loop, "whole": whole, "drawn": drawn, "floor": floor}
+def bounces(name: str, size: int, spp: int) -> dict[str, Any]:
+    """`name` is not read: all three fields stand in the picture."""
+    load = runpy.run_path(str(dial.SCENES.parent / "examples" / "three_fields.py"))["load"]
+    scenes, taken = {method: load(size, spp, 4, method) for method in METHODS[:2]}, {m: [] for m in METHODS[:2]}
+    with maps_in_memory():
+        for seed in range(ROUNDS + 1):
+            for method, loaded in scenes.items():
+                taken[method].append(dial.picture(loaded, loaded.integrator(), seed))
+    march, atlas = (float(np.median([t for _, t in some[1:]])) for some in taken.values())
+    lit, looked_up = (np.mean([image for image, _ in some]) for some in taken.values())
+    return {"size": size, "spp": spp, "seconds": {METHODS[0]: march, METHODS[1]: atlas}, "ratio": atlas / march,
+            "mean": looked_up / lit - 1}
+
+
+CASES = {"loop": loop, "whole": whole, "drawn": drawn, "floor": floor, "bounces": bounces}
 
 
 def main() -> None:
