@@ -141,7 +141,8 @@ def _floor_scene(name: str, method: str, size: int):
 def bounces(name: str, size: int, spp: int) -> dict[str, Any]:
     """`name` is not read: all three fields stand in the picture."""
     load = runpy.run_path(str(dial.SCENES.parent / "examples" / "three_fields.py"))["load"]
-    scenes, taken = {method: load(size, spp, 4, method) for method in METHODS[:2]}, {m: [] for m in METHODS[:2]}
+    scenes: dict[str, Any] = {method: load(size, spp, 4, method) for method in METHODS[:2]}
+    taken: dict[str, list] = {method: [] for method in scenes}
     with maps_in_memory():
         for seed in range(ROUNDS + 1):
             for method, loaded in scenes.items():

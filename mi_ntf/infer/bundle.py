@@ -174,9 +174,11 @@ class Bundle:
         skips = []
         for i, (s, inverse, (begin, end)) in enumerate(zip(self.strands, self.inverse, self.intervals, strict=True)):
             skip = clear_distance(s.grid, self.point(i, t), inverse)
+            if s.rate is not None:
+                skip = skip / s.rate
             if not self.single:
                 inside, ahead = (t >= begin) & (t < end), dr.maximum(self.end - t, 1e-6)
-                skip = dr.select(inside, skip / s.rate, dr.select(t < begin, dr.minimum(begin - t, ahead), ahead))
+                skip = dr.select(inside, skip, dr.select(t < begin, dr.minimum(begin - t, ahead), ahead))
             skips.append(skip)
         return skips
 
@@ -243,14 +245,6 @@ class Cell:
             t = t + self.part * dr.select(dr.abs(bend) < 0.02, flat, dr.log(1 + share * (dr.exp(bend) - 1)) / bend)
             passed = passed + sigma * self.part
         return t
-
-    def densities(self, depth) -> list:
-        """The density of each field where the optical depth from the cell's begin on is `depth`."""
-        passed, found = 0, list(self.sigmas[0])
-        for sigmas, sigma in zip(self.sigmas, self.totals, strict=True):
-            found = [dr.select(depth > passed, s, f) for s, f in zip(sigmas, found, strict=True)]
-            passed = passed + sigma * self.part
-        return found
 
     def shares(self) -> list:
         """Per field, what it takes of the light that enters the cell."""

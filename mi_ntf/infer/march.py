@@ -81,6 +81,31 @@ class Samples:
             max_iterations=-1 if gradients else None,  # a sum
         )[1]
 
+    def draw(self, u) -> tuple:
+        """``(t, strand, weight)``, per ray: of one of its samples, drawn by `u`, uniform in [0, 1), and their weights;
+        and the weight of all, 0 where there is none."""
+        uint, count, n = type(self.count), self.count, dr.width(self.count)
+        t, strand = dr.zeros(type(self.t), n), dr.zeros(uint, n)
+        if not dr.width(self.t):
+            return t, strand, dr.zeros(type(self.t), n)
+        weight: Any = sum(self.totals(list(self.weights)))
+
+        def more(k, rest, t, strand):
+            return (k < count) & (rest >= 0)
+
+        def body(k, rest, t, strand):
+            for i, share in enumerate(self.weights):
+                w = dr.gather(type(share), share, self.first + k, k < count)
+                here = (rest >= 0) & (w > 0)
+                t = dr.select(here, dr.gather(type(self.t), self.t, self.first + k, k < count), t)
+                strand = dr.select(here, i, strand)
+                rest = rest - w
+            return k + 1, rest, t, strand
+
+        state: Any = (dr.zeros(uint, n), u * weight, t, strand)
+        _, _, t, strand = dr.while_loop(state=state, cond=more, body=body, label="one sample of a ray")
+        return t, strand, weight
+
 
 def camera_samples(strands, maxt, offset, depth, shade=True, view=False, share=None) -> Samples:
     """Shading points of camera rays, compacted.
@@ -300,36 +325,36 @@ def _absorbed(depth):
     return dr.select(depth < 0.02, depth * (1 - depth * (0.5 - depth * (1 / 6))), 1 - dr.exp(-depth))
 
 
-def free_flight(strands, maxt, offset, depth, which):
-    """Where rays end in the fields if they pass the optical depth `depth` (for free flight −ln(1 − u)).
+def free_flight(strands, maxt, offset, depths):
+    """Where rays end in the fields, of which each stops them at an optical depth of its own (for free flight
+    −ln(1 − u), u of each field's own): the first of these ends is distributed as in the sum of all densities.
 
-    Arguments as :func:`camera_samples`; `which`, uniform in [0, 1), says whose matter it is where several overlap.
-    Returns ``(hit, t, index, bundle)``: whether a ray ends before `maxt`, where (t of `bundle`), and the strand's
-    index. Densities exponential across the pieces of cells.
+    Arguments as :func:`camera_samples`; `depths`: for each strand. Returns ``(hit, t, index)``: whether a ray ends
+    before `maxt`, where, from its origin, and the strand's index. Densities exponential across the pieces of cells.
     """
-    bundle = Bundle(strands, maxt, offset)
-    floats, uint = type(bundle.base), dr.uint32_array_t(type(bundle.base))
+    end, hit, index = maxt, False, 0
+    for i, (strand, depth) in enumerate(zip(strands, depths, strict=True)):
+        bundle = Bundle([strand], end, offset)
+        t = bundle.base + _flight(bundle, depth)
+        stopped = dr.isfinite(t)
+        end, hit, index = dr.select(stopped, t, end), stopped | hit, dr.select(stopped, i, index)
+    return hit, end, dr.uint32_array_t(type(end))(index)
 
-    def body(t, passed, end, index, before, active):
+
+def _flight(bundle, depth):
+    """t where the rays of one strand end; infinity where they do not."""
+    floats = type(bundle.base)
+
+    def body(t, passed, end, before, active):
         step = bundle.step(t)
         cell = bundle.cell(t, step, active, before)
         after = passed + cell.depth
         hit = active & (after >= depth) & (after > passed)
         end = dr.select(hit, cell.place(depth - passed), end)
-        if not bundle.single:
-            sigmas = cell.densities(depth - passed)
-            rest = which * sum(sigmas[1:], sigmas[0])
-            for sigma in sigmas[:-1]:
-                rest = rest - sigma
-                index = dr.select(hit & (rest >= 0), index + 1, index)
         t = t + onward(cell.skip, step, 0)
-        active = active & ~hit & (t < bundle.end)
-        return t, after, end, index, cell.after, active
+        return t, after, end, cell.after, active & ~hit & (t < bundle.end)
 
     n = dr.width(bundle.base)
-    begin = floats(bundle.begin)
-    state = (begin, dr.zeros(floats, n), dr.full(floats, dr.inf, n), dr.zeros(uint, n), bundle.first(), bundle.active)
-    _, _, t, index, *_ = dr.while_loop(
-        state=state, cond=lambda t, passed, end, index, before, active: active, body=body, label="free flight"
-    )
-    return dr.isfinite(t), t, index, bundle
+    state = (floats(bundle.begin), dr.zeros(floats, n), dr.full(floats, dr.inf, n), bundle.first(), bundle.active)
+    return dr.while_loop(
+        state=state, cond=lambda t, passed, end, before, active: active, body=body, label="free flight")[2]

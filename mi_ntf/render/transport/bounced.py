@@ -57,7 +57,7 @@ class Patches:
             return [nothing] * len(self.skins)
         steps = min(radiosity.STEPS, composition.settings.samples)
         hit, t, which = composition.fly(mi.Ray3f(mi.Point3f(o), d), dr.full(mi.Float, dr.inf, n),
-                                        mi.Float(rng.random(n)), mi.Float(radiosity.DEPTH), mi.Float(0.5), steps)
+                                        mi.Float(rng.random(n)), [mi.Float(radiosity.DEPTH)] * len(self.skins), steps)
         dr.eval(hit, t, which)
         hit, which = hit.numpy(), which.numpy()
         result = []
@@ -155,9 +155,9 @@ def meet(density, grid, o: np.ndarray, d: np.ndarray, rng) -> tuple[np.ndarray, 
     :class:`mi_ntf.infer.bundle.Strand`."""
     n, start, along = len(o), _vector(o), _vector(d)
     strand = Strand(density, grid, tuple(start), tuple(along), dr.opaque(mi.Float, 2 / radiosity.STEPS))
-    hit, t, _, bundle = march.free_flight([strand], dr.full(mi.Float, dr.inf, n), mi.Float(rng.random(n)),
-                                          mi.Float(radiosity.DEPTH), mi.Float(0.5))
-    x = start + (bundle.base + t) * along
+    hit, t, _ = march.free_flight([strand], dr.full(mi.Float, dr.inf, n), mi.Float(rng.random(n)),
+                                  [mi.Float(radiosity.DEPTH)])
+    x = start + dr.select(hit, t, 0) * along
     dr.eval(x, hit)
     return hit.numpy(), _rows(x)
 

@@ -25,7 +25,7 @@ def trace(composition: Composition, ray, quadrature, stream, sums=None, seen: Se
 
 class _CameraLight:
     """The light along rays: `hit`, the surfaces that they meet (None without surfaces); `total`, the sum so far, a
-    float a ray for each channel."""
+    float a ray for each channel; `met`, the samples of the fields and the scene length of their t's unit."""
 
     def __init__(self, composition: Composition, ray, quadrature, stream, sums, seen: Seen):
         self.scene, self.ray, self.stream, self.sums, self.seen = composition, ray, stream, sums, seen
@@ -33,6 +33,7 @@ class _CameraLight:
         self.effects, self.first_run = composition.effects, not composition.run
         self.total = [dr.zeros(mi.Float, dr.width(ray.o)) for _ in range(3)]
         self.hit: Any = None
+        self.met: Any = None
 
     def trace(self):
         surfaces, ray, found = self.scene.surfaces, self.ray, self.effects
@@ -63,7 +64,7 @@ class _CameraLight:
         found, sums, ray = self.effects, self.sums, self.ray
         strands, unit = self.scene.strands(ray, self.scene.in_view)
         maxt = (dr.minimum(ray.maxt, self.hit.t) if self.hit is not None else ray.maxt) / unit
-        if found.collocated and not sums:
+        if found.collocated and not sums and found.bounces != "paths":
             light, transmittance = march.camera_light(strands, maxt, self.offset, self.depth, self._at_camera(strands))
             self.total[:] = light
             return transmittance
@@ -72,6 +73,7 @@ class _CameraLight:
         samples = self.seen.samples(wanted, found.collocated, lambda: march.camera_samples(
             strands, maxt, self.offset, self.depth, shade=wanted, view=found.collocated,
             share=march.SHARE if opaque else march.SMOKE_SHARE))
+        self.met = samples, unit
         light = [dr.zeros(mi.Float, dr.width(samples.t)) for _ in range(3)]
         for i, part in enumerate(self.scene.in_view):
             self._field(i, part, samples, unit, light)
@@ -139,27 +141,27 @@ class _CameraLight:
             si = hit.compute_surface_interaction(mi.Ray3f(ray))
             if surfaces.shining:
                 walk.add(camera, si.emitter(self.scene.scene).eval(si, hit.is_valid()))
-            if self.effects.lit:
-                self._surface_paths(walk, camera, si)
+        # A camera ray goes on from matter, from the surface behind it, or from both.
+        onward = camera.take(dr.arange(mi.UInt32, 2 * n) % n)
+        onward = replace(onward, weight=dr.zeros(mi.Color3f, 2 * n))
+        if surfaces and self.effects.lit:
+            reflected = walk.on_surface(camera, si)
+            if self.effects.bounces or surfaces.lights_can_be_hit:
+                onward.put(reflected, dr.arange(mi.UInt32, n))
         if self.effects.bounces and self.scene.in_view:
-            self._field_paths(walk, camera, transmittance)
+            for index, paths in self._field_paths(walk, camera):
+                onward.put(paths, index + n)
+        walk.run(onward.take(dr.compress(dr.max(onward.weight) > 0)))
 
-    def _surface_paths(self, walk: Walk, camera: Paths, si) -> None:
-        """Direct light on the surfaces that the camera sees, and what comes after."""
-        surfaces = self.scene.surfaces
-        onward = walk.on_surface(camera, si)
-        if self.effects.bounces or (surfaces and surfaces.lights_can_be_hit):
-            walk.run(onward.take(dr.compress(self.hit.is_valid() & (dr.max(onward.weight) > 0))))
-
-    def _field_paths(self, walk: Walk, camera: Paths, transmittance) -> None:
-        """Paths that a camera ray's matter scatters on: one collision, drawn among those that stop the ray."""
-        u = [camera.rng.next_float32() for _ in range(2)]
-        maxt = camera.ray.maxt if self.hit is None else dr.minimum(camera.ray.maxt, self.hit.t)
-        depth = -dr.log(1 - u[0] * (1 - transmittance))
-        stopped, t, which = self.scene.fly(camera.ray, maxt, self.offset, depth, u[1])
-        camera = replace(camera, weight=mi.Color3f(1 - transmittance))
-        dr.eval(stopped, t, which, camera.weight, camera.rng.state)
-        for i, part in enumerate(self.scene.parts):
-            index: Any = dr.compress(stopped & (which == i) & (transmittance < 1))
+    def _field_paths(self, walk: Walk, camera: Paths):
+        """Pairs of indices of camera rays and paths that their matter scatters on: from one of a ray's shading points,
+        drawn by their weights."""
+        samples, unit = self.met
+        t, strand, weight = samples.draw(camera.rng.next_float32())
+        t = (samples.bundle.base + t) * unit
+        camera = replace(camera, weight=mi.Color3f(weight))
+        dr.eval(t, strand, camera.weight, camera.rng.state)
+        for i, part in enumerate(self.scene.in_view):
+            index: Any = dr.compress((weight > 0) & (strand == i))
             if dr.width(index):
-                walk.run(walk.in_field(part, camera.take(index), dr.gather(mi.Float, t, index), 2))
+                yield index, walk.in_field(part, camera.take(index), dr.gather(mi.Float, t, index), 2)

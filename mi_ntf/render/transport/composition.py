@@ -164,12 +164,12 @@ class Composition:
         ]
         return result, unit
 
-    def fly(self, ray, maxt, offset, depth, which, steps=None):
+    def fly(self, ray, maxt, offset, depths, steps=None):
         """:func:`mi_ntf.infer.march.free_flight` of scene rays through all fields: ``(hit, t, index)``, t in scene
         lengths from the ray's origin. `steps`: as for :meth:`strands`."""
         strands, unit = self.strands(ray, self.parts, steps)
-        hit, t, index, bundle = march.free_flight(strands, maxt / unit, offset, depth, which)
-        return hit, (bundle.base + t) * unit, index
+        hit, t, index = march.free_flight(strands, maxt / unit, offset, depths)
+        return hit, t * unit, index
 
     def with_all_lights(self, do):
         """What `do()` returns where those of other runs shine too, marched to."""

