@@ -13,11 +13,13 @@ def draw(report: dict, path: Path) -> None:
     """Write the figure of a report of :func:`mi_ntf.evaluate.bench.bench` as PNG."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(11, 5), layout="constrained")
+    figure = Figure(figsize=(10, 4.8), layout="constrained")
     left, right = figure.subplots(1, 2)
     details = [r["details"] for r in report["rows"]]
     _times(left, next(d for d in details if "intercept_seconds" in d))
     _speed_up(right, [r for r in report["rows"] if "volume_lights_seconds" in r["details"]])
+    lines = right.get_legend_handles_labels()
+    figure.legend(*lines, loc="outside lower right", fontsize=7, ncols=2)  # among the curves it would hide some
     with files.replacing(path) as temporary:
         figure.savefig(temporary, format="png", dpi=110)
 
@@ -40,4 +42,3 @@ def _speed_up(axes, rows: list[dict]) -> None:
         axes.plot(lights, volume / tmap, label=r["what"].split(", ", 2)[2].replace("volume over map, ", ""))
     axes.axhline(92.2, color="0.6", linestyle=":", label="the paper's 92 at 500 lights")
     axes.set(xlabel="lights", yscale="log", ylabel="times faster", title="whole image, volume over map (extrapolated)")
-    axes.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2)  # over the curves it hides them
