@@ -25,8 +25,6 @@ IN_VAIN = 0.5
 """Of what is built for the trial of a method, what is lost: the pictures use it, as if half of the trials failed."""
 MARGIN = 0.9
 """Of `max_error`, what the probes may show: what is taken is what they happen to find good."""
-SHARED = 0.5
-"""Of `max_error`, what fewer lights may err before a method is looked for: of squares a quarter."""
 SAVING = 0.1
 """Of the predicted time, what leaving something out must save at least."""
 FINER = {"map_resolution": 256, "map_components": 2}
@@ -152,23 +150,16 @@ class Chooser:
             look = self._looked(first)
             best = self._judged(look, truth, True, "named")
         else:
-            march = Trial("raymarch", self._price(truth), 0.0, True), truth
-            # Fewer lights are fewer for every method; what they err leaves the method most of the error. The march,
-            # which has none of its own, may do with still fewer.
-            lit = fewest = march
-            if not self._whole:
-                lit = self._without(*march, truth, LIGHTS, SHARED * self._most)
-                fewest = self._without(*lit, truth, LIGHTS, self._most)
-            best, look = self._method(lit[1].composition.settings, *fewest, truth)
+            best, look = self._method(truth)
         if not self._whole:
             best, look = self._without(best, look, truth, OMISSIONS, self._most)
         return Choice(look.composition, self.trials, {"seconds": best.seconds, "error": best.error})
 
-    def _method(self, lit: Settings, march: Trial, marched: Look, truth: Look) -> tuple[Trial, Look]:
-        """The cheapest that keeps to the error, with the lights of `lit`, in place of `march`, the cheapest of the
-        march itself."""
-        full, settings = march.seconds, marched.composition.settings
-        for seconds, candidate in sorted(((self.estimate.seconds(s), s) for s in self._candidates(lit)),
+    def _method(self, truth: Look) -> tuple[Trial, Look]:
+        """The cheapest that keeps to the error, with all lights: of those, fewer may do for any method, and are looked
+        for afterwards."""
+        full = self._price(truth)
+        for seconds, candidate in sorted(((self.estimate.seconds(s), s) for s in self._candidates(self.settings)),
                                          key=lambda pair: pair[0]):
             of_all = self.settings.frames if REGISTRY[candidate.visibility].per_field else 1
             if not self._pays(full - seconds, IN_VAIN * of_all * self.estimate.built(candidate)):
@@ -180,7 +171,7 @@ class Chooser:
                 return self._judged(look, truth, True, "the cheapest that keeps to max_error"), look
             self._judged(look, truth, False, "no cheaper than the march" if good else
                          "off by more than max_error allows")
-        return self._tried(settings, full, march.error, True, "nothing cheaper keeps to max_error"), marched
+        return self._tried(truth.composition.settings, full, 0.0, True, "nothing cheaper keeps to max_error"), truth
 
     @staticmethod
     def _candidates(settings: Settings) -> list[Settings]:
