@@ -141,13 +141,14 @@ class _CameraLight:
             si = hit.compute_surface_interaction(mi.Ray3f(ray))
             if surfaces.shining:
                 walk.add(camera, si.emitter(self.scene.scene).eval(si, hit.is_valid()))
+        reflected = walk.on_surface(camera, si) if surfaces and self.effects.lit else None
+        if not self.effects.bounces and not (surfaces and surfaces.lights_can_be_hit):
+            return
         # A camera ray goes on from matter, from the surface behind it, or from both.
         onward = camera.take(dr.arange(mi.UInt32, 2 * n) % n)
         onward = replace(onward, weight=dr.zeros(mi.Color3f, 2 * n))
-        if surfaces and self.effects.lit:
-            reflected = walk.on_surface(camera, si)
-            if self.effects.bounces or surfaces.lights_can_be_hit:
-                onward.put(reflected, dr.arange(mi.UInt32, n))
+        if reflected:
+            onward.put(reflected, dr.arange(mi.UInt32, n))
         if self.effects.bounces and self.scene.in_view:
             for index, paths in self._field_paths(walk, camera):
                 onward.put(paths, index + n)
