@@ -5,7 +5,7 @@ does not measure.
     python -m mi_ntf.evaluate.lookups whole  …
     python -m mi_ntf.evaluate.lookups drawn  …
     python -m mi_ntf.evaluate.lookups floor  …
-    python -m mi_ntf.evaluate.lookups bounces --size 160
+    python -m mi_ntf.evaluate.lookups bounces --size 320 --spp 16
 
 ``loop``   nanoseconds of τ at a seen point, towards a direction of its own or the same lights as its neighbours.
 ``whole``  a picture under the demo's environment, kernels compiled and atlases made anew; error to `raymarch`.
@@ -13,6 +13,7 @@ does not measure.
 ``floor``  the field's shadow on a floor under an ``ntf`` around the environment, by stock ``path``: the median of three
            pictures of 256 samples; error of the mean of all, of the picture and relative to the shadow in it.
 ``bounces``  three bounces of ``examples/three_fields.py``, atlases at hand: seconds and brightness.
+             The script's own size is 320, with 16 samples.
 
 One line of JSON a scene. Medians; both sides alternate.
 """

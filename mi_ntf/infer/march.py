@@ -330,7 +330,8 @@ def free_flight(strands, maxt, offset, depths):
     −ln(1 − u), u of each field's own): the first of these ends is distributed as in the sum of all densities.
 
     Arguments as :func:`camera_samples`; `depths`: for each strand. Returns ``(hit, t, index)``: whether a ray ends
-    before `maxt`, where, from its origin, and the strand's index. Densities exponential across the pieces of cells.
+    before `maxt`, where, from its origin (`maxt` if not), and the strand's index. Densities exponential across
+    the pieces of cells.
     """
     end, hit, index = maxt, False, 0
     for i, (strand, depth) in enumerate(zip(strands, depths, strict=True)):

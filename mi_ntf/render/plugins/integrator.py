@@ -22,7 +22,8 @@ def integrator_class() -> type:
                                     ``transmittance_atlas``, ``neural_transmittance``, ``ray_network``,
                                     ``transmittance_volume``, ``visibility_mlp``, ``none``, or ``auto``, the cheapest of
                                     the first three (default: auto)
-        samples             integer steps across the unit sphere's diameter (default: 384)
+        samples             integer steps across the unit sphere's diameter (default: 384); flights of further bounces
+                                    take 128 at most, between patches 256
         light_samples       integer lights per shading point, drawn from Mitsuba's emitter sampling and resampled, from
                                     any emitters; 0: all lights, cells of environments among them, and 2 drawn (1 of a
                                     projector or textured spot) of each emitter that is no finite set of lights, such

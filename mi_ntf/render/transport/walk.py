@@ -13,7 +13,8 @@ ROULETTE_DEPTH = 5
 
 STEPS = 128
 """Cells of a further flight across a field's sphere, at most, each asked at the ends of its pieces: brightness of
-`examples/three_fields.py` differs by 0.02 % from that of 384, in 0.8 of the time."""
+`examples/three_fields.py` differs by 0.02 % from that of 384, in 0.8 of the time; of `globe` by 0.013 %, of `cloud` by
+0.005 % (point light, three bounces)."""
 
 
 @dataclass(frozen=True)
