@@ -17,10 +17,6 @@ from . import ops
 from .grid import CELLS
 from .network import NOTHING, density_of
 
-MIN_WEIGHT_RATE = 0.02
-"""Cells that take less than this times their length are not shaded where lights shine from the camera: matter that
-would add less than 2 % of a pixel per unit-sphere radius of depth, the tail of nearly spent rays and the faint rim of a
-skin."""
 PIECES = 3
 """Of a cell, at whose ends densities are asked; neighbours share an end. To pictures of 16 pieces, brightness and RMS
 differ by 0.05 and 0.2 % at most, those of 2 pieces by 0.14 and 0.7 % (`statue`, `globe`, `knot`, `skull`, point light).
@@ -198,13 +194,6 @@ class Bundle:
                 value = dr.select(value > NOTHING, value + dr.log(s.rate), NOTHING)
             found.append(value)
         return found
-
-    def counts(self, shares, step):
-        """Whether a cell of these weights is worth shading: that of some field, in its own unit."""
-        hit = False
-        for s, share in zip(self.strands, shares, strict=True):
-            hit = (share > MIN_WEIGHT_RATE * step * (1 if s.rate is None else s.rate)) | hit
-        return hit
 
 
 @dataclass

@@ -245,30 +245,6 @@ def _compact(count, start, total: int, found: list):
     return ray, values
 
 
-def camera_light(strands, maxt, offset, depth, reflect):
-    """The light of camera rays whose lights all shine from the camera, in one walk: the view's transmittance is theirs.
-
-    Arguments as :func:`camera_samples`; ``reflect(i, x, view)``: radiance, a 3-tuple, that the point `x` of strand
-    `i`, `view` of whose light gets to the camera, reflects. Returns ``(radiance, transmittance)`` per ray.
-    """
-    bundle = Bundle(strands, maxt, offset)
-
-    def shade(depth, here, *light):
-        t, *shares, view = here.sample(depth)
-        for i, share in enumerate(shares):
-            light = [c + share * v for c, v in zip(light, reflect(i, bundle.point(i, t), view), strict=True)]
-        return tuple(light)
-
-    def add(active, last, here, state):
-        # Few cells hold samples that count: the branch skips what the others would cost.
-        hit = active & bundle.counts(here.shares, bundle.step(here.t))
-        return dr.if_stmt((depth, here, *state), hit, shade, lambda depth, here, *light: light, label="shade")
-
-    zero = dr.zeros(type(bundle.base), dr.width(bundle.base))
-    transmittance, light = _walk(bundle, add, (zero, type(zero)(zero), type(zero)(zero)))
-    return light, transmittance
-
-
 @dataclass
 class _Here:
     """A cell on a walk: its lattice's `t`, and how many of its length it is from the beginning (`number`), the view's

@@ -10,7 +10,6 @@ from ...infer import march, shade
 from ..lights import environment
 from .composition import Composition, Part
 from .seen import Seen
-from .shadow import Known
 from .walk import Paths, Walk
 
 
@@ -64,10 +63,6 @@ class _CameraLight:
         found, sums, ray = self.effects, self.sums, self.ray
         strands, unit = self.scene.strands(ray, self.scene.in_view)
         maxt = (dr.minimum(ray.maxt, self.hit.t) if self.hit is not None else ray.maxt) / unit
-        if found.collocated and not sums and found.bounces != "paths":
-            light, transmittance = march.camera_light(strands, maxt, self.offset, self.depth, self._at_camera(strands))
-            self.total[:] = light
-            return transmittance
         wanted = found.lit or bool(sums and sums.needs_points)
         opaque = all(part.medium.field.softness.opaque for part in self.scene.in_view)
         samples = self.seen.samples(wanted, found.collocated, lambda: march.camera_samples(
@@ -109,17 +104,6 @@ class _CameraLight:
         points = shade.Points(x, tuple(-c for c in along), part.medium.reflectance(x))
         points.evaluate()
         return points
-
-    def _at_camera(self, strands):
-        """The `reflect` of :func:`mi_ntf.infer.march.camera_light` for the fields in view."""
-
-        def reflect(i, x, view):
-            part = self.scene.in_view[i]
-            points = shade.Points(x, tuple(-c for c in strands[i].d), part.medium.reflectance(x))
-            light = shade.reflect(points, part.table, Known(view), self.effects.specular)
-            return self._with_bounces(part, points, light)
-
-        return reflect
 
     def _with_bounces(self, part: Part, points, light):
         """`light` that `points` reflect of a run, and, in the first, what comes to them by way of others."""
