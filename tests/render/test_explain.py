@@ -42,10 +42,10 @@ def test_point_light_by_name():
 
 
 def test_what_is_held_for_a_field():
-    """Whatever the lights: 28² maps of 51² texels of two logistics, four numbers each."""
+    """Whatever the lights: 36² maps of 51² texels of two logistics, four halves each."""
     one, many = (explain(SCENE, {"visibility": "transmittance_atlas", "light": light, "res": "16"})
                  for light in ("point", "env"))
-    assert one["memory_bytes"]["maps or volumes"] == many["memory_bytes"]["maps or volumes"] == 4 * 28**2 * 51**2 * 8
+    assert one["memory_bytes"]["maps or volumes"] == many["memory_bytes"]["maps or volumes"] == 2 * 36**2 * 51**2 * 8
     assert one["seconds"]["maps or volumes"] == many["seconds"]["maps or volumes"] > 0
     assert not many["effects"]["transmittance maps"]["on"]
 

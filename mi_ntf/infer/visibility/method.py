@@ -15,14 +15,15 @@ FILLED = 0.785398
 class Options:
     """`step`: length of the camera march's cells, field units; `map_resolution`: texels along a map's side;
     `map_source`: ``field`` or ``network``; `map_components`: logistics a texel that the field's march is fitted by, 1
-    or 2 (the network has its own number); `map_memory`: MiB that the maps or volumes of one part of the lights may
-    take; `map_file`: EXR of `mi-ntf bake` that holds the maps, or none; `cache`: maps are kept for the next frame and
-    on disk (:mod:`mi_ntf.render.maps.map_cache`)."""
+    or 2 (the network has its own number); `half`: in half precision; `map_memory`: MiB that the maps or volumes of one
+    part of the lights may take; `map_file`: EXR of `mi-ntf bake` that holds the maps, or none; `cache`: maps are kept
+    for the next frame and on disk (:mod:`mi_ntf.render.maps.map_cache`)."""
 
     step: float
     map_resolution: int = 192
     map_source: str = "field"
     map_components: int = 1
+    half: bool = False
     map_memory: float = 1024.0
     map_file: str = ""
     cache: bool = False
@@ -37,7 +38,7 @@ class Method:
                  with ``stream``, an opaque seed that the renderer sets, where lookups draw numbers.
                  `table`: the :class:`mi_ntf.infer.lights.LightTable` that what is held per light is made for, and whose
                  moving lights are followed more finely; None: the others. ``keep(width, step, make)`` → ``make()``, or
-                 ``make(values)`` where what it would make, `width` float32 numbers for each of the squared
+                 ``make(values)`` where what it would make, `width` numbers for each of the squared
                  ``map_resolution`` rays of each light, marched in steps of `step`, is at hand; for a field's own maps
                  their table of directions and their options come after `make`. ``some=``: a function of rows of
                  `table` that makes a map of these lights alone, where each light's numbers are its own
@@ -46,8 +47,8 @@ class Method:
     prices       name → nanoseconds on two cores of 2024; the first is what `pair` counts in, the second what `making`
                  does
     making       as `pair`, of what is held for a light; None for methods that hold nothing
-    numbers      ``(medium, table, options)`` → float32 numbers that are held for each of the squared ``map_resolution``
-                 rays of a light
+    numbers      ``(medium, table, options)`` → what is held for each of the squared ``map_resolution`` rays of a light,
+                 in float32 numbers
     per_field    `making` and `numbers` are of all that is held for a field, whatever the lights
     dials        properties of the integrator that it reads
     drawn        name of the method that serves lights which are drawn at random, and all other rays; "": itself

@@ -36,16 +36,17 @@ class TransmittanceMap:
 
     `source`: a :class:`mi_ntf.infer.visibility.map_source.Source`. `values`: what :attr:`values` of such a map were, if
     they are at hand. `hull` (k, 3): points whose convex hull holds all density. Memory: 8 m² bytes a light for one
-    logistic, whose weight is 1 and not stored, 16 K m² for mixtures.
+    logistic, whose weight is 1 and not stored, 16 K m² for mixtures; with `half`, numbers of half precision, half of
+    that.
     """
 
     def __init__(self, lights: LightTable, resolution: int, hull: np.ndarray, source: Source, dj: ModuleType,
-                 values=None):
+                 values=None, half: bool = False):
         self.dj, self.lights, self.count = dj, lights, lights.count
         self.rays = LightRays(lights, hull, resolution, dj)
         self.width = channels(source.components, source.weights)
         count = lights.count * resolution**2
-        self.texels = Texels(self._fit(source, count) if values is None else values, count, self.width, dj)
+        self.texels = Texels(self._fit(source, count) if values is None else values, count, self.width, dj, half)
 
     def _fit(self, source: Source, count: int):
         """The numbers of all texels."""
@@ -64,7 +65,7 @@ class TransmittanceMap:
 
     @property
     def values(self) -> np.ndarray:
-        """`width` float32 numbers a texel, m² texels a light."""
+        """`width` numbers a texel, m² texels a light."""
         return self.texels.numbers()
 
     def tau(self, x, wi, distance, index, active):

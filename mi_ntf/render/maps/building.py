@@ -6,6 +6,7 @@ from pathlib import Path
 import mitsuba as mi
 
 from ...core.errors import MiNtfError
+from ...infer.texels import DTYPES
 from ...infer.visibility import REGISTRY
 from ...infer.visibility.method import Options
 from . import map_cache, map_file
@@ -68,6 +69,7 @@ def build(method: str, medium, table, options: Options):
         # Of several runs of lights, each needs all of the memory, and none of their maps comes again in this picture.
         limit = own.map_memory * 2**20 if lights.count == lights.total else 0
         known = map_cache.lights(medium, lights, own, width, step) if some and limit and lights.count > 1 else None
-        return map_cache.cached(name, make, lights.count * own.map_resolution**2 * width, limit, known, some)
+        return map_cache.cached(name, make, lights.count * own.map_resolution**2 * width, limit, known, some,
+                                DTYPES[own.half])
 
     return REGISTRY[method].build(medium, table, options, mi, keep)

@@ -27,7 +27,9 @@ LARGEST_FILE = 256 << 20
 FOLDER_LIMIT = 2 << 30
 """Bytes: larger maps are not written; the files used longest ago go when the folder is full."""
 SEAL = hashlib.sha256().digest_size
-"""Bytes at the start of a file that depend on all others and on its name; float32 numbers follow."""
+"""Bytes at the start of a file that depend on all others and on its name; numbers follow."""
+
+FULL = np.dtype("<f4")
 
 _maps: OrderedDict[str, Any] = OrderedDict()
 _lights: dict[str, list] = {}
@@ -87,28 +89,29 @@ def lights(medium, table, options, width: int, step: float) -> list:
     return [(facts, where.tobytes(), bool(is_point)) for where, is_point in rows]
 
 
-def cached(name: str, make, count: int, limit: float, each: list | None = None, some=None):
-    """The map called `name`, of `count` numbers: from memory, else ``make(values)`` of those in its file, else
-    ``make()``, which is then kept on disk.
+def cached(name: str, make, count: int, limit: float, each: list | None = None, some=None, kind: type = np.float32):
+    """The map called `name`, of `count` numbers of NumPy's `kind`: from memory, else ``make(values)`` of those in its
+    file, else ``make()``, which is then kept on disk.
 
     `limit`: bytes that maps in memory may take, this one and its making included; a map that takes more is not kept
     there. `each`: :func:`lights`, where a map in memory may hold some of them already; ``some(rows)`` then makes the
     map of the others.
     """
-    where = mode()
+    where, dtype = mode(), np.dtype(kind).newbyteorder("<")
+    size = dtype.itemsize * count
     if where == "off":
         return make()
     _used.add(name)
     if name in _maps:
         _maps.move_to_end(name)
         return _maps[name]
-    values = _read(name, count) if where == "on" else None
+    values = _read(name, count, dtype) if where == "on" else None
     known = _joined(each, some, count) if values is None and each and some else None
-    _make_room(limit - 4 * count)
+    _make_room(limit - size)
     result = make() if values is None and known is None else make(known if values is None else values)
-    if where == "on" and values is None and _written and 4 * count <= LARGEST_FILE:
-        _write(name, result.values)
-    if 4 * count <= limit:
+    if where == "on" and values is None and _written and size <= LARGEST_FILE:
+        _write(name, result.values, dtype)
+    if size <= limit:
         _maps[name] = result
         if each:
             _lights[name] = each
@@ -182,11 +185,11 @@ def _seal(name: str, values: np.ndarray) -> bytes:
     return digest.digest()
 
 
-def _read(name: str, count: int):
-    content = user_cache.read(_file(name), SEAL + 4 * count)
+def _read(name: str, count: int, dtype: np.dtype = FULL):
+    content = user_cache.read(_file(name), SEAL + dtype.itemsize * count)
     if content is None:
         return None
-    values = np.frombuffer(content, "<f4", offset=SEAL)
+    values = np.frombuffer(content, dtype, offset=SEAL)
     if content[:SEAL] != _seal(name, values):
         return None
     with suppress(OSError):
@@ -194,8 +197,8 @@ def _read(name: str, count: int):
     return values
 
 
-def _write(name: str, values: np.ndarray) -> None:
-    values = np.ascontiguousarray(values, "<f4")
+def _write(name: str, values: np.ndarray, dtype: np.dtype = FULL) -> None:
+    values = np.ascontiguousarray(values, dtype)
     if np.isfinite(values).all() and user_cache.write(_file(name), _seal(name, values), values):
         with suppress(OSError):  # of other processes that tidy up as well
             _tidy(_folder() / "maps")

@@ -1,7 +1,7 @@
 """Transmittance maps as EXR: ``mi-ntf bake``, and the integrator's ``map_file``.
 
-A multi-part file, one part a light, float32 channels ``a`` and ``b`` (one logistic) or ``w0 a0 b0 w1 a1 b1`` (mixtures;
-see :mod:`mi_ntf.core.mixture`), the light's rays along rows and columns as in
+A multi-part file, one part a light, channels ``a`` and ``b`` (one logistic) or ``w0 a0 b0 w1 a1 b1`` (mixtures;
+see :mod:`mi_ntf.core.mixture`), float32, an atlas's of half precision, the light's rays along rows and columns as in
 :mod:`mi_ntf.infer.visibility.light_rays`. The attribute ``mi_ntf`` of each part is JSON: the field's hash, the light's
 place in field coordinates, how the map was made and a hash of its texels.
 """
@@ -16,6 +16,7 @@ import OpenEXR
 
 from ...core import files
 from ...core.errors import MiNtfError
+from ...infer.texels import DTYPES
 from ...infer.visibility.light_rays import frames
 
 ATTRIBUTE = "mi_ntf"
@@ -72,9 +73,9 @@ def read(path: Path, medium, table, options, width: int) -> np.ndarray:
     parts = _parts(path)
     if len(parts) != table.total:  # the library leaves out those that it cannot read
         raise MiNtfError(f"map_file {path} is damaged: {len(parts)} of {table.total} lights can be read; bake it anew")
-    values = np.zeros((table.count, largest, width), np.float32)
+    values = np.zeros((table.count, largest, width), DTYPES[options.half])
     for k, (part, digest) in enumerate(zip(parts[mine], digests, strict=True)):
-        texels = _texels(path, k, part, width, shapes[k])
+        texels = _texels(path, k, part, shapes[k], values)
         if _digest(texels) != digest:
             raise _damaged(path, k, "holds other texels than were written")
         values[k, : shapes[k][0] * shapes[k][1]] = texels.reshape(-1, width)
@@ -111,23 +112,23 @@ def _about(path: Path, k: int, part) -> dict:
     return found
 
 
-def _texels(path: Path, k: int, part, width: int, shape: tuple[int, int]) -> np.ndarray:
-    """(lines, columns, width) float32."""
-    names = _names(width)
+def _texels(path: Path, k: int, part, shape: tuple[int, int], like: np.ndarray) -> np.ndarray:
+    """(lines, columns, width) numbers, as wide and of the type as `like`."""
+    names = _names(like.shape[-1])
     if set(part.channels) != set(names.values()):
         raise _damaged(path, k, f"has channels {', '.join(sorted(part.channels))}, expected "
                                 + ", ".join(names.values()))
-    texels = np.zeros((*shape, width), np.float32)
+    texels = np.zeros((*shape, like.shape[-1]), like.dtype)
     for c, name in names.items():
         pixels = part.channels[name].pixels
-        if pixels.shape != shape or pixels.dtype != np.float32:
+        if pixels.shape != shape or pixels.dtype != like.dtype:
             raise _damaged(path, k, f"channel {name} is {pixels.dtype} of shape {pixels.shape}")
         texels[..., c] = pixels
     return texels
 
 
 def _digest(texels: np.ndarray) -> str:
-    return hashlib.sha256(np.ascontiguousarray(texels, "<f4").data).hexdigest()
+    return hashlib.sha256(np.ascontiguousarray(texels, texels.dtype.newbyteorder("<")).data).hexdigest()
 
 
 def _compare(path: Path, k: int, found: dict, wanted: dict) -> None:
