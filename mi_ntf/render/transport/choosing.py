@@ -23,7 +23,7 @@ TRIAL = 0.5
 """Seconds that a trial takes: what saves less is not tried."""
 IN_VAIN = 0.5
 """Of what is built for the trial of a method, what is lost: the pictures use it, as if half of the trials failed."""
-MARGIN = 0.9
+MARGIN = 0.95
 """Of `max_error`, what the probes may show: what is taken is what they happen to find good."""
 SAVING = 0.1
 """Of the predicted time, what leaving something out must save at least."""
