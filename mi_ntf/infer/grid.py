@@ -211,9 +211,9 @@ def _support_points(dense: np.ndarray, directions: int = 1200) -> np.ndarray:
     phi = np.arange(directions) * np.pi * (3 - 5**0.5)
     fan = np.stack([np.sqrt(1 - z * z) * np.cos(phi), np.sqrt(1 - z * z) * np.sin(phi), z], 1)
     fan = np.concatenate([fan, np.eye(3), -np.eye(3)])
-    furthest = np.unique(np.concatenate([(points @ part.T).argmax(0) for part in np.array_split(fan, 40)]))
-    reach = np.stack(np.meshgrid(*[[-1, 1]] * 3), -1).reshape(-1, 3) * (2 / n)  # a voxel fades out at its neighbours
-    return np.clip(np.unique((points[furthest][:, None] + reach).reshape(-1, 3), axis=0), -1, 1)
+    furthest = np.concatenate([(points @ part.T).argmax(0) for part in np.array_split(fan, 40)])
+    reach = np.where(fan < 0, -2 / n, 2 / n)  # a voxel fades out at its neighbours
+    return np.clip(np.unique(points[furthest] + reach, axis=0), -1, 1)
 
 
 def _chebyshev_distance(occupied: np.ndarray, limit: int = 16) -> np.ndarray:

@@ -10,7 +10,7 @@ import pytest
 from helpers import fields, hard_cases
 
 from mi_ntf.core import field_file
-from mi_ntf.infer import octahedral
+from mi_ntf.infer import octahedral, texels
 from mi_ntf.infer.lights import LightTable
 from mi_ntf.infer.visibility import outside, raymarch, transmittance_atlas
 from mi_ntf.infer.visibility.method import Options
@@ -95,6 +95,22 @@ def test_bounded_and_made_of_the_same_bits_each_time(statue):
     assert first.min() >= 0 and first.max() <= 1
     told = 4 * transmittance_atlas.numbers(captured()[0], None, Options(2 / 384))
     assert atlas.maps.texels.nbytes == told <= 64 << 20
+
+
+def test_numbers_of_half_precision(variant):
+    """Rows read are those written, rounded to eleven bits, and the file's are the texture's."""
+    rows = np.random.default_rng(4).normal(size=(5000, 8)).astype(np.float32)
+    kept = {half: texels.Texels(rows.ravel(), 5000, 8, mi, half) for half in (False, True)}
+    index = dr.arange(mi.UInt32, 5000)
+    for half, found in kept.items():
+        read = np.stack([np.array(c) for c in found.row(index, mi.Bool(True))], 1)
+        np.testing.assert_array_equal(read, rows.astype(found.dtype).astype(np.float32))
+        np.testing.assert_array_equal(found.numbers(), read.ravel().astype(found.dtype))
+        assert found.nbytes == (2 if half else 4) * rows.size
+    made = texels.blank(5000, 8, mi)
+    dr.scatter(made, mi.Float(rows.ravel()), dr.arange(mi.UInt32, rows.size))
+    again = texels.Texels(made, 5000, 8, mi, True)
+    np.testing.assert_array_equal(again.numbers(), kept[True].numbers())
 
 
 def test_directions_are_drawn_from_the_stream_without_bias(statue, monkeypatch):

@@ -42,7 +42,7 @@ def test_what_methods_spend_by_hand():
     pairs = 0.5 * 300_000 * 50
     assert spent(WORK, "raymarch") == pytest.approx(pairs * MARCH)
     assert spent(WORK, "transmittance_map") == pytest.approx(50 * MAP + pairs * LOOKUP, rel=1e-6)
-    atlas = 0.785398 * transmittance_atlas.RAYS * 0.6 * 576
+    atlas = 0.785398 * transmittance_atlas.RAYS * 0.5 * 576
     assert spent(WORK, "transmittance_atlas") == pytest.approx(atlas + pairs * ATLAS, rel=1e-6)
 
 

@@ -183,9 +183,8 @@ def numbers(medium, lights, options: Options) -> int:
 
 
 def making(work, prices) -> float:
-    """ns of all maps: a ray costs 0.6 texels of a light's map (0.55 to 0.72 on five objects), a fifth of the steps and
-    two logistics to fit."""
-    return FILLED * RAYS * 0.6 * work.samples * (prices.texel + queries(work, prices))
+    """ns of all maps: a ray costs half a texel of a light's map, a seventh of the steps and two logistics to fit."""
+    return FILLED * RAYS * 0.5 * work.samples * (prices.texel + queries(work, prices))
 
 
 METHOD = Method(

@@ -7,9 +7,11 @@ where the two halves lose least. Suns and lamps end in cells of their own. A cel
 from its centre of radiance.
 """
 
+import hashlib
 import heapq
 import itertools
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -24,6 +26,9 @@ FLOOR = 1e-2
 """Share of an even sky that cells are cut by: dark regions too get a few, whose texels then have useful gradients."""
 SKY = 256, 512
 """Texels of the map that a ``sunsky`` without its sun is looked up in. The horizon lies between two rows."""
+KEPT = 8
+"""Results of :func:`cells` that are kept."""
+_kept: dict[tuple, Any] = {}
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(6)
 
 
@@ -138,7 +143,18 @@ class Cells:
 
 
 def cells(image: np.ndarray, limit: int) -> Cells:
-    """At most `limit` cells of a map (height, width, 3); they cover the sphere, those without light included."""
+    """At most `limit` cells of a map (height, width, 3); they cover the sphere, those without light included. The last
+    few are kept: every trial and every frame asks for them again."""
+    image = np.ascontiguousarray(image)
+    key = hashlib.blake2b(image.data).digest(), image.shape, image.dtype.str, limit
+    found = _kept.pop(key, None) or _cells(image, limit)
+    while len(_kept) >= KEPT:
+        del _kept[next(iter(_kept))]
+    _kept[key] = found
+    return found
+
+
+def _cells(image: np.ndarray, limit: int) -> Cells:
     height, width = image.shape[:2]
     latitude, longitude = axes(height, width, limit)
     blocks = integrate(image, latitude, longitude)

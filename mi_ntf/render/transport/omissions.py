@@ -19,9 +19,13 @@ def _no_bounces(settings: Settings, composition: Composition) -> Settings | None
     return settings.but(max_depth=2) if composition.effects.bounces else None
 
 
-def _fewer_lights(settings: Settings, composition: Composition) -> Settings | None:
-    most = max((d.shining for d in composition.lights.discrete), default=0)
-    return settings.but(environment_lights=most // 2) if most > FEWEST else None
+def _fewer_lights(share: float) -> "Omission":
+    """So many of them remain."""
+    def fewer(settings: Settings, composition: Composition) -> Settings | None:
+        most = max((d.shining for d in composition.lights.discrete), default=0)
+        return settings.but(environment_lights=int(share * most)) if most > FEWEST else None
+
+    return fewer
 
 
 def _bright_lights(settings: Settings, composition: Composition) -> Settings | None:
@@ -49,7 +53,10 @@ def _no_lobes(settings: Settings, composition: Composition) -> Settings | None:
 
 
 Omission = Callable[[Settings, Composition], Settings | None]
-LIGHTS: dict[str, Omission] = {"half of the environment's lights": _fewer_lights, "dim lights": _bright_lights}
+LIGHTS: dict[str, Omission] = {
+    "half of the environment's lights": _fewer_lights(1 / 2),
+    "a quarter of the environment's lights": _fewer_lights(3 / 4),
+    "dim lights": _bright_lights}
 OMISSIONS: dict[str, Omission] = {
     "further bounces": _no_bounces, "small fields": _no_small_field, **LIGHTS, "specular lobes": _no_lobes}
 """What may be left out, in the order in which it is tried."""

@@ -20,8 +20,8 @@ GROUP = 4
 """Pixels side by side that are rendered together, as pictures are: rays of scattered ones that march in one packet wait
 for each other, which made probes look four times as dear."""
 CAUTION = 0.5
-"""Standard errors that are added to a mean square: a few pixels at thin parts have much of it, so it spreads widely, and
-whole ones refused methods that keep to a limit by a quarter (`globe` by an atlas)."""
+"""Standard errors that are added to a mean square. A few pixels at thin parts have much of it, so it spreads widely:
+whole ones refused what keeps to a limit by a quarter (`globe` by an atlas)."""
 SMALL, WITHIN = 0.01, 96
 """A field whose bounds take less than this share of the picture gets as many pixels of its own."""
 
