@@ -167,4 +167,5 @@ def _vector(rows: np.ndarray):
 
 
 def _rows(v) -> np.ndarray:
+    dr.eval(v)  # together, or each would be computed by itself
     return np.stack([c.numpy() for c in v], 1).astype(np.float64)

@@ -7,13 +7,13 @@ under a `time_budget` alone, what has the smallest error when the time is over, 
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import mitsuba as mi
 
 from ...infer.visibility import REGISTRY
-from ..scene import effects
 from ..scene.settings import Limits, Settings
+from .choice import Choice, Trial
 from .composition import Composition
 from .estimate import Estimate
 from .omissions import LIGHTS, OMISSIONS
@@ -39,37 +39,6 @@ UNTOLD = 32
 """Samples a pixel that a render is taken to have if a limit of noise says how many."""
 SPARED = 0.2
 """Of the time that is left, what a trial may take under a `time_budget`."""
-
-
-@dataclass(frozen=True)
-class Trial:
-    """Something in place of the march of all that the scene calls for: `name`, its `error` (relative RMSE; nan: not
-    measured) and `seconds` of a picture, predicted or those of its probes; whether it is `taken`, and why."""
-
-    name: str
-    seconds: float
-    error: float = math.nan
-    taken: bool = False
-    why: str = ""
-
-
-@dataclass
-class Choice:
-    """`composition`: to render with; `trials`: what was looked at, in order; `predicted`: seconds, error."""
-
-    composition: Composition
-    trials: list[Trial] = field(default_factory=list)
-    predicted: dict = field(default_factory=dict)
-
-    @property
-    def effects(self) -> effects.Effects:
-        """Those of the composition, with what the trials say for its method."""
-        found, taken = self.composition.effects, [t for t in self.trials if t.taken]
-        return replace(found, reason=taken[-1].why) if taken else found
-
-    def told(self) -> dict:
-        """``predicted`` and ``trials`` as numbers and words."""
-        return {"predicted": self.predicted, "trials": [vars(t) for t in self.trials]}
 
 
 class Chooser:
@@ -119,12 +88,11 @@ class Chooser:
         self.patches = look.composition.patches  # where light bounces between is the same for all of them
         return look
 
-    def _marched(self) -> Look:
+    def _marched(self, march: Settings) -> Look:
         """The probes by the march, which also tell how far off the prices are."""
         pixels = self._size[0] * self._size[1]
         few, worth = probed(pixels) * pixels, PART * pixels * self._spp * self.settings.frames / SAMPLES
         self.probes = Probes(self.sensor, self.estimate.media, round(min(max(few, worth), MANY * few)))
-        march = self.settings.but(visibility="raymarch")
         truth = self._looked(march)
         self.estimate.dearer = self._price(truth) / max(self.estimate.seconds(march), 1e-9)
         return truth
@@ -145,29 +113,52 @@ class Chooser:
             error, why = (math.nan, "named") if named else (0.0, "all else saves less than a trial takes")
             best = self._tried(first, seconds, error, True, why)
             return Choice(self._composed(first), self.trials, {"seconds": best.seconds, "error": best.error})
-        truth = self._marched()
+        plain = self._plain(self.settings)
+        truth = self._marched(plain.but(visibility="raymarch"))
         if named:
-            look = self._looked(first)
+            look = self._looked(plain)
             best = self._judged(look, truth, True, "named")
         else:
             best, look = self._method(truth)
+        if plain != self.settings:
+            best, look, truth = self._with_bounces(best, look, truth)
         if not self._whole:
             best, look = self._without(best, look, truth, OMISSIONS, self._most)
         return Choice(look.composition, self.trials, {"seconds": best.seconds, "error": best.error})
 
+    def _plain(self, settings: Settings) -> Settings:
+        """Without bounces between patches, which the march would light at the price of a picture; as they only add to
+        what is seen, they come afterwards."""
+        return settings.but(max_depth=2) if self.estimate.effects.bounces == "radiosity" else settings
+
+    def _whole_of(self, plain: Settings) -> Settings:
+        """With the bounces again that :meth:`_plain` left out."""
+        return plain.but(max_depth=self.settings.max_depth)
+
+    def _bouncing(self, plain: Settings) -> float:
+        """Seconds of those, predicted."""
+        return self.estimate.seconds(self._whole_of(plain)) - self.estimate.seconds(plain)
+
+    def _with_bounces(self, best: Trial, look: Look, truth: Look) -> tuple[Trial, Look, Look]:
+        """`best`, its `look` and the `truth` with the further bounces that they lack, of the method chosen: its error
+        is a small part of a small part of the light."""
+        whole = self._looked(self._whole_of(look.composition.settings))
+        self.trials[-1] = best = replace(best, seconds=self._price(whole))
+        return best, whole, replace(truth, radiance=truth.radiance + whole.radiance - look.radiance)
+
     def _method(self, truth: Look) -> tuple[Trial, Look]:
         """The cheapest that keeps to the error, with all lights: of those, fewer may do for any method, and are looked
         for afterwards."""
-        full = self._price(truth)
-        for seconds, candidate in sorted(((self.estimate.seconds(s), s) for s in self._candidates(self.settings)),
-                                         key=lambda pair: pair[0]):
+        full = self._price(truth) + self._bouncing(truth.composition.settings)
+        found = [(self.estimate.seconds(self._whole_of(s)), s) for s in self._candidates(self._plain(self.settings))]
+        for seconds, candidate in sorted(found, key=lambda pair: pair[0]):
             of_all = self.settings.frames if REGISTRY[candidate.visibility].per_field else 1
             if not self._pays(full - seconds, IN_VAIN * of_all * self.estimate.built(candidate)):
                 self._tried(candidate, seconds, why="saves less than a trial takes")
                 continue
             look = self._looked(candidate)
             good = self.probes.error(look, truth, self._spp) <= self._most
-            if good and len(look.composition.runs) == 1 and self._price(look) < full:
+            if good and len(look.composition.runs) == 1 and self._price(look) + self._bouncing(candidate) < full:
                 return self._judged(look, truth, True, "the cheapest that keeps to max_error"), look
             self._judged(look, truth, False, "no cheaper than the march" if good else
                          "off by more than max_error allows")
@@ -225,7 +216,7 @@ class Chooser:
         samples = SAMPLES * probed(self._size[0] * self._size[1])
         if max(self.estimate.each(march) * samples, TRIAL) > SPARED * self._left():
             return self._untried(march)
-        truth = self._marched()
+        truth = self._marched(march)
         best, least = truth, self._ends_at(truth, truth)
         self._tried(march, self._price(truth), least, True, "smallest error when the time is over")
         for settings in self._candidates(self.settings):

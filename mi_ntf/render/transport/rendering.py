@@ -11,6 +11,7 @@ from ...core.errors import MiNtfError
 from ..scene.camera import Camera, Reconstruction
 from ..scene.settings import Limits, Settings
 from . import aovs, camera_light, choosing, passes
+from .choice import Choice
 
 CHUNK = 1 << 18
 """Camera rays in flight: bounds the memory at about half a GiB whatever the image and the number of lights."""
@@ -161,7 +162,7 @@ def _stop(pixels: Reconstruction, run: int, first: int, runs: int) -> None:
     )
 
 
-def _achieved(limits: Limits, choice: choosing.Choice, counted: passes.Passes) -> dict:
+def _achieved(limits: Limits, choice: Choice, counted: passes.Passes) -> dict:
     """What came of the limits; logged where there are any."""
     effects = choice.effects
     found = {
