@@ -154,14 +154,14 @@ def total(seconds: list[float], number: int) -> float:
 
 def noise_case(name: str, light: str, size: int, spp: int) -> list[dict[str, Any]]:
     """Rows of `THRESHOLDS`: the noise found, and |I − truth| over √truth as the threshold counts, less the truth's own,
-    which its halves tell."""
+    which its halves tell. All by the march, or what methods differ by would count as noise."""
     loaded, rows = scene(name, light, size, spp), []
-    halves = [picture(loaded, integrator(), 100 + k, TRUTH // 2)[0] for k in range(2)]
+    halves = [picture(loaded, integrator(visibility="raymarch"), 100 + k, TRUTH // 2)[0] for k in range(2)]
     truth = np.mean(halves, 0)
     scale = np.sqrt(np.maximum(truth.sum(-1), 0)).sum()
     own = np.abs(halves[0] - halves[1]).sum() / 2 / scale
     for threshold in THRESHOLDS:
-        nrf = integrator(noise_threshold=threshold)
+        nrf = integrator(visibility="raymarch", noise_threshold=threshold)
         image, seconds = picture(loaded, nrf, 1)
         off = math.sqrt(max((np.abs(image - truth).sum() / scale) ** 2 - own**2, 0.0))
         rows.append({"scene": name, "light": light, "threshold": threshold, "found": nrf.achieved["noise"],
