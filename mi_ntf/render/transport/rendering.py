@@ -54,6 +54,8 @@ def render(integrator, scene, sensor, seed, spp: int, develop: bool):
             halves.add(block, camera.spp, picture)
         if not whole:
             break
+        if integrator.limits.of_samples:
+            halves.wait()
         counted.done(camera.spp, halves.noise() if integrator.limits.noise > 0 else math.nan)
         samples = counted.next() if integrator.limits.of_samples else 0
     integrator.achieved = _achieved(integrator.limits, choice, counted)
@@ -91,6 +93,11 @@ class _Halves:
             self._film.clear()
         for each in self._blocks:
             self._film.put_block(each)
+
+    def wait(self) -> None:
+        """Until all is computed: kernels run beside the program, and a clock would see them in the next pass."""
+        dr.eval([block.tensor() for block in self._blocks])
+        dr.sync_thread()
 
     def _weight(self, block):
         """What the filter's weights of each pixel sum to."""
