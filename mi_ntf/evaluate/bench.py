@@ -77,7 +77,7 @@ def _sections(sizes: Sizes) -> dict[str, Callable[[], list[Row]]]:
 
 @contextmanager
 def _atlas(resolution: int | None):
-    """Within, the maps of an atlas have `resolution`² texels: two million rays take seconds, and --quick makes many."""
+    """Within, the maps of an atlas have `resolution`² texels: millions of rays take a second, --quick makes many."""
     before = transmittance_atlas.RESOLUTION
     transmittance_atlas.RESOLUTION = resolution or before
     try:

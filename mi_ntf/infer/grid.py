@@ -198,7 +198,8 @@ def _any(dense: np.ndarray, first: np.ndarray, last: np.ndarray, cells: int) -> 
 
 def _support_points(dense: np.ndarray, directions: int = 1200) -> np.ndarray:
     """Points that lie furthest along many directions of all that interpolation between the voxels `dense` (z, y, x) can
-    reach, (k, 3) float64; the origin where there are none. What their hull misses, 1e-3, has hardly any density."""
+    reach, (k, 3) float64; the origin where there are none. What their hull misses has hardly any density: 1e-4 on
+    average, 0.005 at most, along directions in between (four objects)."""
     n = dense.shape[0]
     lines = np.argwhere(dense.any(2))
     if not len(lines):

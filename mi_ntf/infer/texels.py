@@ -33,7 +33,7 @@ class Texels:
         """The numbers of row `number`, float32; 0 where not `active`."""
         u, v = self.dj.Float(number % COLUMNS), self.dj.Float(number // COLUMNS)
         found = self.texture.eval(self.dj.Array2f((u + 0.5) * (1 / COLUMNS), (v + 0.5) * self._line), active)
-        return [self.dj.Float(number) for number in found]
+        return [self.dj.Float(value) for value in found]
 
     def numbers(self) -> np.ndarray:
         """All of them."""

@@ -168,8 +168,26 @@ def test_one_light_for_an_even_sky():
 
 def test_one_map_makes_the_same_lights_twice(rng):
     image = rng.uniform(0, 1, (300, 601, 3)).astype(np.float32)
-    a, b = (environment.cells(image.copy(), 512) for _ in range(2))
+    a = environment.cells(image.copy(), 512)
+    assert environment.cells(image.copy(), 512) is a  # kept
+    environment._kept.clear()
+    b = environment.cells(image.copy(), 512)
+    assert b is not a
     assert (a.power == b.power).all() and (a.direction == b.direction).all() and (a.bounds == b.bounds).all()
+
+
+def test_lights_that_are_kept_are_of_the_same_map(rng):
+    """Another texel, another number of lights: others; a few maps later they are let go."""
+    image = rng.uniform(0, 1, (8, 16, 3)).astype(np.float32)
+    first, fewer = environment.cells(image, 32), environment.cells(image, 16)
+    assert (len(first.power), len(fewer.power)) == (32, 16)
+    image[3, 4] += 1
+    brighter = environment.cells(image, 32)
+    assert brighter.power.sum() > first.power.sum()
+    for limit in range(1, environment.KEPT + 4):
+        environment.cells(image, limit)
+    assert len(environment._kept) == environment.KEPT
+    assert environment.cells(image, 32) is not brighter
 
 
 @pytest.mark.parametrize("place", ["texel", "sun"])

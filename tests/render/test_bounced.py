@@ -1,11 +1,13 @@
 """Further bounces without noise: against stock ``path`` on meshes of the same shape, and against traced paths."""
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import fields, pictures
 
 from mi_ntf.core.errors import MiNtfError
+from mi_ntf.render.transport import bounced
 
 PLACES = (-0.65, 0.65)
 RADIUS = 0.5 + 0.01 * np.log(np.exp(5) * 0.01 / np.log(2))
@@ -110,6 +112,20 @@ def test_few_drawn_lights_bounce_like_many(skin):
     assert few.mean() == pytest.approx(many.mean(), rel=0.01)
     bright = many > 0.3 * many.max()
     assert np.sqrt(((few - many)[bright] ** 2).mean()) < 0.03 * many[bright].mean()
+
+
+def test_what_is_read_back_is_computed_once(variant):
+    """One kernel for three channels."""
+    values = dr.arange(mi.Float, 1000) + 1
+    dr.eval(values)
+    light = mi.Color3f(dr.sqrt(values), dr.log(values), values * values)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        rows = bounced._rows(light)
+        launched = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+    assert len(launched) == 1
+    x = np.arange(1, 1001)
+    np.testing.assert_allclose(rows, np.stack([np.sqrt(x), np.log(x), x * x], 1), rtol=1e-6)
 
 
 def test_a_field_that_no_line_meets(tmp_path):

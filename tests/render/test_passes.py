@@ -2,6 +2,7 @@
 
 import math
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -99,6 +100,16 @@ def test_more_passes_are_the_same_picture(blobs):
         assert passed[..., channel].mean() == pytest.approx(whole[..., channel].mean(), rel=0.01)
     full = whole[..., 5] > 0.5
     np.testing.assert_allclose(passed[full][:, 4], whole[full][:, 4], rtol=0.02)
+
+
+def test_the_clock_waits_for_a_pass(blobs, monkeypatch):
+    """Kernels run beside the program: seconds that are read before they end would count for the next pass."""
+    events, sync, done = [], dr.sync_thread, passes.Passes.done
+    monkeypatch.setattr(dr, "sync_thread", lambda: (events.append("wait"), sync()))
+    monkeypatch.setattr(passes.Passes, "done", lambda self, *about: (events.append("read"), done(self, *about)))
+    mi.render(scenes.scene(blobs, nrf(noise_threshold=0.05), {"light": scenes.light("point")}, size=8))
+    reads = [i for i, event in enumerate(events) if event == "read"]
+    assert len(reads) > 2 and all(events[i - 1] == "wait" for i in reads)
 
 
 def test_without_limits_samples_are_one_pass(blobs):

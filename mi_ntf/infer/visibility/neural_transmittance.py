@@ -1,7 +1,7 @@
 """``neural_transmittance``: the ray network, asked once for each ray of an atlas, and remembered.
 
 What is learned: the transmittance along any whole ray, as logistics (Shafiei et al. 2021; method.md, section 4). What
-is remembered: its answers for the rays of :mod:`mi_ntf.infer.visibility.transmittance_atlas`, two million of them.
+is remembered: its answers for the rays of :mod:`mi_ntf.infer.visibility.transmittance_atlas`, three million of them.
 What it costs: those queries once per field, then an atlas lookup per point and light.
 """
 

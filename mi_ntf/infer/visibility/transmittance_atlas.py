@@ -44,7 +44,8 @@ REACH = 0.064
 DARK = 3e-4
 """Where the map lets no more through than this, nobody looks how much of that the sum close to x would take."""
 NEAREST_PIVOT, PIVOT = 0.16, 0.7
-"""The pivot's least distance from x, and its share of the way to the middle of the chord."""
+"""The pivot's least distance from x, and its share of the way to the middle of the chord: `globe` errs by 1.6 % with a
+half of it, by 1.5 % with 0.7; `statue` by 1.0 % with both."""
 OUTSIDE = 0.98
 """Squared distance from the origin where points lie in no skin: maps are read from the sphere on."""
 COARSE = 7.0

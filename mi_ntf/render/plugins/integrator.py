@@ -123,16 +123,11 @@ def integrator_class() -> type:
             return aovs.channel_names(tuple(known), self.lights_seen)
 
         def to_string(self):
-            return (
-                f"NRFIntegrator[\n  visibility = {self.visibility},\n  samples = {self.samples},\n"
-                f"  light_samples = {self.light_samples},\n  environment_lights = {self.environment_lights},\n"
-                f"  map_resolution = {self.map_resolution},\n  map_source = {self.map_source},\n"
-                f"  map_components = {self.map_components},\n  map_memory = {self.map_memory},\n"
-                f"  map_file = {self.map_file},\n"
-                f"  max_depth = {self.max_depth},\n  bounces = {self.bounces},\n  aovs = {', '.join(self.aovs)},\n"
-                f"  hide_emitters = {self.hide_emitters},\n  noise_threshold = {self.limits.noise},\n"
-                f"  max_error = {self.limits.error},\n"
-                f"  time_budget = {self.limits.seconds},\n  frames = {self.frames},\n  timeout = {self.timeout}\n]"
-            )
+            limits = self.limits
+            shown = {"aovs": ", ".join(self.aovs), "noise_threshold": limits.noise, "max_error": limits.error,
+                     "time_budget": limits.seconds}
+            lines = (f"  {name} = {shown[name] if name in shown else getattr(self, name)}"
+                     for name in properties.INTEGRATOR)
+            return "NRFIntegrator[\n" + ",\n".join(lines) + "\n]"
 
     return NRFIntegrator
