@@ -137,6 +137,25 @@ def test_frames_share_what_is_built_and_the_choice(blobs, monkeypatch, frames, v
     assert loaded.integrator().achieved["trials"] == first["trials"]
 
 
+@pytest.mark.parametrize("moves", [False, True])
+def test_lights_that_stand_still_share_their_maps(blobs, trials_are_free, monkeypatch, moves):
+    """A map that is made anew for each frame is dearer than the march, one that is made once is not."""
+    def each(settings):
+        return 2.0 if settings.visibility == "raymarch" else 1.0 if settings.still else 3.0
+
+    prices(monkeypatch, each)
+    monkeypatch.setattr(estimate.Estimate, "seconds", lambda self, s: each(s))
+    loaded = scenes.scene(blobs, nrf(max_error=0.3, frames=20), {"light": scenes.light("point")}, size=16, spp=1)
+    params, taken = mi.traverse(loaded), []
+    for seed in range(4):
+        mi.render(loaded, seed=seed)
+        taken.append(loaded.integrator().achieved["visibility"])
+        if moves:
+            params["light.position"] += mi.Point3f(0.01, 0, 0)
+            params.update()
+    assert taken == ["raymarch", *(["raymarch"] if moves else ["transmittance_map"]) * 3]
+
+
 def test_time_for_the_march(blobs):
     """Where it fits it has no error; where not even one sample does, that is said."""
     lights = {"light": scenes.light("env")}
@@ -144,6 +163,20 @@ def test_time_for_the_march(blobs):
     chooser = choosing.Chooser(loaded, choosing.Settings.of(loaded.integrator()), loaded.integrator().limits,
                                loaded.sensors()[0], 1, None)
     assert chooser.choose().composition.effects.visibility == "raymarch"
+
+
+@pytest.mark.parametrize(("gain", "tried"), [(0.6, False), (0.01, True)])
+def test_a_trial_of_much_of_the_time_must_promise_much(blobs, monkeypatch, gain, tried):
+    """Of 100 s, a map of 30: what makes the error a little smaller in the rest is not worth it."""
+    prices(monkeypatch, lambda s: 1.0 if s.visibility == "raymarch" else gain)
+    monkeypatch.setattr(choosing, "REGISTRY", {n: REGISTRY[n] for n in ("raymarch", "transmittance_map")})
+    monkeypatch.setattr(estimate.Estimate, "built", lambda self, s: 30.0)
+    monkeypatch.setattr(estimate.Estimate, "each", lambda self, s: 1.0 if s.visibility == "raymarch" else gain)
+    loaded = scenes.scene(blobs, nrf(time_budget=100), {"light": scenes.light("point")}, size=16, spp=1)
+    chooser = choosing.Chooser(loaded, choosing.Settings.of(loaded.integrator()), loaded.integrator().limits,
+                               loaded.sensors()[0], 1, None)
+    chooser.choose()
+    assert (len(chooser.trials) > 1) == tried
 
 
 def test_a_budget_that_cannot_be_kept_is_said(blobs, monkeypatch, capfd):

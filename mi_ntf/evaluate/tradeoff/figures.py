@@ -14,6 +14,8 @@ from .reading import error, groups, measured, total
 
 COLOURS = ("#3b82e0", "#e0433a", "#2f9e44", "#e39b1a", "#8b5cf6", "#0ea5b7", "#d6409f", "#8a6d3b", "#7d7d7d")
 MARKERS = "osD^vPXph"
+APART = 14
+"""Dots between marks whose numbers do not meet."""
 EQUAL_NOISE = 0.05
 """Relative noise at which the second curve compares bias."""
 
@@ -29,12 +31,24 @@ def curve(rows: list[dict[str, Any]]) -> str:
     figure = new_figure(9.5, 5.2)
     axes = figure.add_subplot()
     plain(axes)
-    for row in draw(axes, rows):
-        axes.annotate(str(row["number"]), (total(row), row["error"]), xytext=(-6, -11), textcoords="offset points",
-                      fontsize=8, color=GREY, ha="right")
+    ends = draw(axes, rows)
     _log(axes, "seconds of a picture, maps made anew, kernels compiled", "relative error of a picture")
+    _number(axes, ends)
     axes.legend(frameon=False, labelcolor=GREY, fontsize=8, loc="upper left", bbox_to_anchor=(1.01, 1))
     return _svg(figure)
+
+
+def _number(axes, ends: list[dict[str, Any]]) -> None:
+    """Numbers of the front `ends`, below and left of their marks; above and right where the one before is near."""
+    axes.get_figure(root=True).draw_without_rendering()  # gives axes their size
+    below, before = True, np.full(2, -np.inf)
+    for row in ends:
+        place = total(row), row["error"]
+        at = axes.transData.transform(place)
+        below = not below if np.abs(at - before).max() < APART else True
+        axes.annotate(str(row["number"]), place, xytext=(-6, -11) if below else (6, 5), textcoords="offset points",
+                      fontsize=8, color=GREY, ha="right" if below else "left")
+        before = at
 
 
 def panel(axes, result: dict[str, Any], environment: bool, fontsize: float = 11.0) -> None:

@@ -13,10 +13,6 @@ LOOPS = {"camera march": "camera march", "lights": "lights", "free flight": "bou
 """Label of a kernel's loop → stage. Kernels of none of them: before the first camera march they make maps, after one
 they fetch reflectance, or are small."""
 
-
-UNIT = 16384
-"""Entries of a kernel that Dr.Jit gives to one thread of a processor at a time (DRJIT_POOL_BLOCK_SIZE of drjit-core):
-less work than that for each leaves some idle."""
 BUILT = ("maps or volumes", "bounces")
 """Stages that do not grow with pixels and samples."""
 
@@ -56,22 +52,14 @@ def _watching():
 
 def watch(work):
     """``(result, stages)``: what `work()` returns, and the seconds of its kernels as in :func:`by_stage`, compilation
-    left out, as they would be if work were enough for all threads. It evaluates what it returns itself."""
+    left out. It evaluates what it returns itself. Dr.Jit shares kernels of a hundred entries among all threads."""
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.sync_thread()
         with _watching() as history:
             result = work()
             dr.sync_thread()
             history.extend(dr.kernel_history())
-    return result, by_stage([_on_all_threads(kernel) for kernel in history])["stages"]
-
-
-def _on_all_threads(kernel: dict) -> dict:
-    """The `kernel` of a history with the time that a larger one would take for as much."""
-    if kernel.get("backend") != dr.JitBackend.LLVM:
-        return kernel
-    busy = min(-(-kernel["size"] // UNIT), dr.thread_count()) / max(dr.thread_count(), 1)
-    return kernel | {"execution_time": kernel["execution_time"] * busy}
+    return result, by_stage(history)["stages"]
 
 
 @contextmanager

@@ -64,7 +64,7 @@ class Work:
     source        of maps: ``field`` or ``network``
     network       the field is its networks, not its grid, of `voxels`³
     patches       that light bounces between, 0 where it does not by radiosity
-    frames        pictures that share what is built for a field
+    frames        pictures that share what is built for a field; `still`: and for each light
     """
 
     rays: float
@@ -81,6 +81,7 @@ class Work:
     drawn: int = 0
     others: float = 0.0
     frames: int = 1
+    still: bool = False
 
 
 def per_pair(work: Work, c: Constants) -> float:
@@ -100,8 +101,8 @@ def making(work: Work, c: Constants) -> float:
 
 
 def shared(work: Work, c: Constants) -> float:
-    """ns of :func:`making` that fall on one of `work.frames` pictures; lights may move between them."""
-    return making(work, c) / (work.frames if REGISTRY[work.method].per_field else 1)
+    """ns of :func:`making` that fall on one of `work.frames` pictures."""
+    return making(work, c) / (work.frames if work.still or REGISTRY[work.method].per_field else 1)
 
 
 def asking(work: Work, c: Constants) -> float:

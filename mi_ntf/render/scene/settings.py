@@ -8,7 +8,8 @@ class Settings:
     """As in the plugin's table, and what is left out of what the scene calls for: `specular`, whether specular lobes
     take part; `dimmest`, share of all light that the dimmest lights have which do not; `without`, numbers of the media
     that do not; `share`, (part, parts): the discrete lights of one part, and in part 0 all else: parts add up to the
-    picture; `only`, numbers of the emitters that shine, None: all (of a scene without surfaces)."""
+    picture; `only`, numbers of the emitters that shine, None: all (of a scene without surfaces); `still`, whether
+    lights and fields are known to stand still, so that `frames` share what is made for each light, too."""
 
     visibility: str
     samples: int
@@ -28,6 +29,7 @@ class Settings:
     without: tuple[int, ...] = ()
     share: tuple[int, int] = (0, 1)
     only: tuple[int, ...] | None = None
+    still: bool = False
 
     @classmethod
     def of(cls, integrator) -> "Settings":

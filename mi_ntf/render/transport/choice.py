@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass, field, replace
 
 from ..scene import effects
+from ..scene.settings import Settings
 from .composition import Composition
 
 
@@ -36,3 +37,16 @@ class Choice:
     def told(self) -> dict:
         """``predicted`` and ``trials`` as numbers and words."""
         return {"predicted": self.predicted, "trials": [vars(t) for t in self.trials]}
+
+
+@dataclass(frozen=True)
+class Kept:
+    """A choice for frames to come that have the same `key`; `placed`: where lights and fields were; `dearer`: that of
+    :class:`mi_ntf.render.transport.estimate.Estimate`."""
+
+    key: tuple
+    placed: tuple
+    dearer: float
+    settings: Settings
+    trials: list[Trial]
+    predicted: dict

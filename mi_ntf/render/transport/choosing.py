@@ -13,7 +13,7 @@ import mitsuba as mi
 
 from ...infer.visibility import REGISTRY
 from ..scene.settings import Limits, Settings
-from .choice import Choice, Trial
+from .choice import Choice, Kept, Trial
 from .composition import Composition
 from .estimate import Estimate
 from .omissions import LIGHTS, OMISSIONS
@@ -37,8 +37,11 @@ GLINTS = 4096
 thousandth of the pixels, which had half of the squared error of `skull`."""
 UNTOLD = 32
 """Samples a pixel that a render is taken to have if a limit of noise says how many."""
-SPARED = 0.2
-"""Of the time that is left, what a trial may take under a `time_budget`."""
+SPARED, RISKED, WORTH = 0.2, 0.4, 0.7
+"""Of the time that is left, what a trial may take under a `time_budget`; and what one may whose error, as far as it can
+be foreseen, is below so much of the least so far: a march of two samples is far off, and an atlas takes a second."""
+OFF = 0.02
+"""Relative RMSE of lookups, as far as it can be foreseen (1 to 3 % by an atlas, 2 to 5 % by maps)."""
 
 
 class Chooser:
@@ -66,19 +69,42 @@ class Chooser:
         found = self.estimate.effects
         if found.gradients or not found.needs_visibility or found.visibility == "none":
             return Choice(self._composed(self.settings))
-        if self._before and self._before[0] == self._key():
-            _, settings, self.trials, predicted = self._before
-            return Choice(self._composed(settings), self.trials, predicted)
+        before = self._before
+        if before and before.key == self._key():
+            if not self._worth_again(before):
+                self.trials = before.trials
+                return Choice(self._composed(before.settings), self.trials, before.predicted)
+            self.settings = self.settings.but(still=True)
         return self._by_error() if self.limits.error else self._by_time()
 
-    def kept(self, choice: Choice):
+    def kept(self, choice: Choice) -> Kept | None:
         """For the next frame: where it is one of the same scene with as many lights, the choice is made once."""
-        return (self._key(), choice.composition.settings, choice.trials, choice.predicted) if choice.trials else None
+        if not choice.trials:
+            return None
+        return Kept(self._key(), self._placed(), self.estimate.dearer, choice.composition.settings, choice.trials,
+                    choice.predicted)
 
-    def _key(self):
+    def _key(self) -> tuple:
         lights = self.estimate.lights
-        return (id(self.scene), self.settings, self.limits, self._size, self._spp, tuple(lights.kinds),
-                len(lights.rows.power))
+        return (id(self.scene), self.settings.but(still=False), self.limits, self._size, self._spp,
+                tuple(lights.kinds), len(lights.rows.power))
+
+    def _placed(self) -> tuple:
+        """Where fields and lights are."""
+        rows = self.estimate.lights.rows
+        return rows.where.tobytes(), *(m.frame.placement() for m in self.estimate.media)
+
+    def _worth_again(self, before: Kept) -> bool:
+        """Whether lights that stand where they stood may make a map for each worth its price, which further frames
+        share; before, they might have moved."""
+        if (before.settings.still or before.placed != self._placed() or self.settings.visibility != "auto"
+                or not self.limits.error):
+            return False
+        self.estimate.dearer = before.dearer
+        still = self._plain(self.settings.but(still=True))
+        found = [self.estimate.seconds(self._whole_of(s)) for s in self._candidates(still)
+                 if not REGISTRY[s.visibility].per_field]
+        return bool(found) and self._pays(before.predicted["seconds"] - min(found), TRIAL)
 
     def _composed(self, settings: Settings) -> Composition:
         return Composition(self.scene, settings, self.sensor, self._spp, self.patches)
@@ -98,8 +124,12 @@ class Chooser:
         return truth
 
     def _price(self, look: Look) -> float:
-        """Seconds of a picture, what is built shared among the frames."""
-        return look.built / self.settings.frames + look.each * self._spp
+        """Seconds of a picture, what is built shared among the frames that it serves."""
+        return look.built / self._served(look.composition.settings) + look.each * self._spp
+
+    def _served(self, settings: Settings) -> int:
+        """Frames that share what is built."""
+        return self.settings.frames if self.settings.still or REGISTRY[settings.visibility].per_field else 1
 
     def _pays(self, saved: float, lost: float = 0.0) -> bool:
         """Whether so many seconds less a picture are worth a trial, which loses `lost` seconds of building."""
@@ -152,8 +182,7 @@ class Chooser:
         full = self._price(truth) + self._bouncing(truth.composition.settings)
         found = [(self.estimate.seconds(self._whole_of(s)), s) for s in self._candidates(self._plain(self.settings))]
         for seconds, candidate in sorted(found, key=lambda pair: pair[0]):
-            of_all = self.settings.frames if REGISTRY[candidate.visibility].per_field else 1
-            if not self._pays(full - seconds, IN_VAIN * of_all * self.estimate.built(candidate)):
+            if not self._pays(full - seconds, IN_VAIN * self._served(candidate) * self.estimate.built(candidate)):
                 self._tried(candidate, seconds, why="saves less than a trial takes")
                 continue
             look = self._looked(candidate)
@@ -219,10 +248,14 @@ class Chooser:
         truth = self._marched(march)
         best, least = truth, self._ends_at(truth, truth)
         self._tried(march, self._price(truth), least, True, "smallest error when the time is over")
-        for settings in self._candidates(self.settings):
-            built = self.estimate.built(settings)
-            hoped = self._noise(truth, (self._left() - built) / max(self.estimate.each(settings), 1e-9))
-            if built + TRIAL > SPARED * self._left() or hoped > least:
+        # What is built fast goes first: what it finds spares the others.
+        for settings in sorted(self._candidates(self.settings), key=self.estimate.built):
+            left, taken = self._left(), self.estimate.built(settings) + TRIAL
+            samples = (left - taken) / max(self.estimate.each(settings), 1e-9)
+            hoped = math.hypot(OFF, self._noise(truth, samples))
+            late = best.each > left  # not even one sample of it fits: whatever is faster
+            most = (RISKED if hoped < WORTH * least else SPARED) * left
+            if self.estimate.each(settings) > best.each if late else hoped > least or taken > most:
                 continue
             look = self._looked(settings)
             error = self._ends_at(look, truth)
@@ -243,11 +276,12 @@ class Chooser:
 
     def _ends_at(self, look: Look, truth: Look) -> float:
         """Error of a picture by what is left of the time."""
-        bias = self.probes.error(look, truth, self._spp)
-        return math.hypot(bias, self._noise(truth, self._left() / max(look.each, 1e-9)))
+        samples = self._left() / max(look.each, 1e-9)
+        return math.hypot(self.probes.error(look, truth, max(samples, 1.0)), self._noise(truth, samples))
 
     def _noise(self, truth: Look, samples: float) -> float:
-        return self.probes.noise(truth) / math.sqrt(max(samples, 1.0))
+        """Of fewer than one it is what there is not time for, and tells apart what is too slow from what is not."""
+        return self.probes.noise(truth) / math.sqrt(max(samples, 1e-3))
 
     def _left(self) -> float:
         return max(self.limits.seconds - self._gone(), 1e-3)

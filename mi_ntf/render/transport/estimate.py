@@ -47,7 +47,7 @@ class Estimate:
             work = model.work(settings, medium, settings.visibility, self._rays if seen else 0,
                               self._count(settings), effects.drawn(settings, self.lights), others)
             patches = model.patches(medium.field.grid) if bounces == "radiosity" else 0
-            works.append(replace(work, patches=patches))
+            works.append(replace(work, patches=patches, still=settings.still))
         return works
 
     def _count(self, settings: Settings) -> int:

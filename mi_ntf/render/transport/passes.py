@@ -50,7 +50,8 @@ class Passes:
 
     def first(self, samples: int, runs: int) -> int:
         """Samples of the first pass, `samples` by the scene: those, unless a limit decides. Several runs of lights are
-        made anew for each pass: few passes then."""
+        made anew for each pass: few passes then. What went before is no pass's."""
+        self._started = self._clock()
         return samples if not self.limits.of_samples or runs > 1 else 1
 
     def done(self, samples: int, noise: float) -> None:

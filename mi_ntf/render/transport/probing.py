@@ -88,7 +88,7 @@ class Probes:
             dr.eval(total)
         return composition, np.array(total).T.reshape(self.count, SAMPLES, 3)
 
-    def error(self, found: Look, truth: Look, spp: int) -> float:
+    def error(self, found: Look, truth: Look, spp: float) -> float:
         """Relative RMSE of a picture of `spp` samples, with a margin for so few pixels; 0 for a black truth. Both are
         seen along the same rays. Two halves of the samples share a bias, not their noise, which their product leaves
         out: more samples make that smaller, and where lights are drawn it is not a method's own."""
