@@ -14,29 +14,22 @@ import mitsuba as mi
 from ...infer.visibility import REGISTRY
 from ..scene.settings import Limits, Settings
 from .choice import Choice, Kept, Trial
-from .composition import Composition
 from .estimate import Estimate
 from .omissions import LIGHTS, OMISSIONS
 from .probing import SAMPLES, Look, Probes, probed
+from .trials import Trials
 
 TRIAL = 0.5
 """Seconds that a trial takes: what saves less is not tried."""
-IN_VAIN = 0.5
-"""Of what is built for the trial of a method, what is lost: the pictures use it, as if half of the trials failed."""
 MARGIN = 0.95
 """Of `max_error`, what the probes may show: what is taken is what they happen to find good."""
 SAVING = 0.1
 """Of the predicted time, what leaving something out must save at least."""
 FINER = {"map_resolution": 256, "map_components": 2}
 """Dials of a map for smaller errors."""
-PART, MANY = 0.005, 4
-"""Of the samples of all frames, what the probes may be, up to so many times those of one picture: fewer of them leave
-more room for chance, and good methods are then refused."""
 GLINTS = 4096
 """Pixels in which few lights are looked for glints: a lobe sees one light where it should see a patch of the sky, in a
 thousandth of the pixels, which had half of the squared error of `skull`."""
-UNTOLD = 32
-"""Samples a pixel that a render is taken to have if a limit of noise says how many."""
 SPARED, RISKED, WORTH = 0.2, 0.4, 0.7
 """Of the time that is left, what a trial may take under a `time_budget`; and what one may whose error, as far as it can
 be foreseen, is below so much of the least so far: a march of two samples is far off, and an atlas takes a second."""
@@ -44,19 +37,14 @@ OFF = 0.02
 """Relative RMSE of lookups, as far as it can be foreseen (1 to 3 % by an atlas, 2 to 5 % by maps)."""
 
 
-class Chooser:
-    """For one render of `scene` by `settings` and `limits`, with `spp` samples a pixel unless a limit says how many.
-    `gone`: seconds that the render has taken so far; `before`: :meth:`kept` of an earlier frame; `whole`: nothing is
-    left out, whatever it is worth."""
+class Chooser(Trials):
+    """What a render by `settings` is to be. `gone`: seconds that it has taken so far; `before`: :meth:`kept` of an
+    earlier frame; `whole`: nothing is left out, whatever it is worth. All else as in :class:`Trials`."""
 
     def __init__(self, scene, settings: Settings, limits: Limits, sensor, spp: int, patches,
                  gone: Callable[[], float] = lambda: 0.0, before=None, whole: bool = False):
-        self.scene, self.settings, self.limits, self.sensor, self.patches = scene, settings, limits, sensor, patches
-        self._spp = UNTOLD if limits.noise > 0 else spp
+        super().__init__(scene, settings, limits, sensor, spp, patches)
         self._gone, self._before, self._whole = gone, before, whole
-        self._size = tuple(int(n) for n in sensor.film().crop_size())
-        self.trials: list[Trial] = []
-        self._errors: dict[Settings, float] = {}
         self._most = MARGIN * limits.error
         self._bare: tuple[Probes, Look] | None = None
 
@@ -105,31 +93,6 @@ class Chooser:
         found = [self.estimate.seconds(self._whole_of(s)) for s in self._candidates(still)
                  if not REGISTRY[s.visibility].per_field]
         return bool(found) and self._pays(before.predicted["seconds"] - min(found), TRIAL)
-
-    def _composed(self, settings: Settings) -> Composition:
-        return Composition(self.scene, settings, self.sensor, self._spp, self.patches)
-
-    def _looked(self, settings: Settings) -> Look:
-        look = self.probes.look(lambda: self._composed(settings))
-        self.patches = look.composition.patches  # where light bounces between is the same for all of them
-        return look
-
-    def _marched(self, march: Settings) -> Look:
-        """The probes by the march, which also tell how far off the prices are."""
-        pixels = self._size[0] * self._size[1]
-        few, worth = probed(pixels) * pixels, PART * pixels * self._spp * self.settings.frames / SAMPLES
-        self.probes = Probes(self.sensor, self.estimate.media, round(min(max(few, worth), MANY * few)))
-        truth = self._looked(march)
-        self.estimate.dearer = self._price(truth) / max(self.estimate.seconds(march), 1e-9)
-        return truth
-
-    def _price(self, look: Look) -> float:
-        """Seconds of a picture, what is built shared among the frames that it serves."""
-        return look.built / self._served(look.composition.settings) + look.each * self._spp
-
-    def _served(self, settings: Settings) -> int:
-        """Frames that share what is built."""
-        return self.settings.frames if self.settings.still or REGISTRY[settings.visibility].per_field else 1
 
     def _pays(self, saved: float, lost: float = 0.0) -> bool:
         """Whether so many seconds less a picture are worth a trial, which loses `lost` seconds of building."""
@@ -182,7 +145,8 @@ class Chooser:
         full = self._price(truth) + self._bouncing(truth.composition.settings)
         found = [(self.estimate.seconds(self._whole_of(s)), s) for s in self._candidates(self._plain(self.settings))]
         for seconds, candidate in sorted(found, key=lambda pair: pair[0]):
-            if not self._pays(full - seconds, IN_VAIN * self._served(candidate) * self.estimate.built(candidate)):
+            # What is built for it may be in vain: maps of a sky with a sun take five seconds and err by 6 %.
+            if not self._pays(full - seconds, self._served(candidate) * self.estimate.built(candidate)):
                 self._tried(candidate, seconds, why="saves less than a trial takes")
                 continue
             look = self._looked(candidate)
@@ -293,16 +257,3 @@ class Chooser:
                 mi.LogLevel.Warn,
                 f"nrf integrator: time_budget is {self.limits.seconds:.3g} s, but one sample a pixel takes about "
                 f"{each:.3g} s by {settings.visibility}; that will be rendered")
-
-    def _judged(self, look: Look, truth: Look, taken: bool, why: str, what: str = "") -> Trial:
-        error = self.probes.error(look, truth, self._spp)
-        self._errors[look.composition.settings] = error
-        return self._tried(look.composition.settings, self._price(look), error, taken, why, what)
-
-    def _tried(self, settings: Settings, seconds: float, error: float = math.nan, taken: bool = False, why: str = "",
-               what: str = "") -> Trial:
-        dials = [f"{settings.map_resolution}², {settings.map_components} logistics"] if REGISTRY[
-            settings.visibility].drawn else []
-        name = " ".join([settings.visibility, *dials, *([f"without {what}"] if what else [])])
-        self.trials.append(Trial(name, seconds, error, taken, why))
-        return self.trials[-1]
