@@ -17,12 +17,13 @@ from .choice import Choice, Kept, Trial
 from .estimate import Estimate
 from .omissions import LIGHTS, OMISSIONS
 from .probing import SAMPLES, Look, Probes, probed
-from .trials import Trials
+from .trials import CLOSER, Trials
 
 TRIAL = 0.5
 """Seconds that a trial takes: what saves less is not tried."""
 MARGIN = 0.95
 """Of `max_error`, what the probes may show: what is taken is what they happen to find good."""
+TOO_FAR = "off by more than max_error allows"
 SAVING = 0.1
 """Of the predicted time, what leaving something out must save at least."""
 FINER = {"map_resolution": 256, "map_components": 2}
@@ -89,9 +90,10 @@ class Chooser(Trials):
                 or not self.limits.error):
             return False
         self.estimate.dearer = before.dearer
-        still = self._plain(self.settings.but(still=True))
-        found = [self.estimate.seconds(self._whole_of(s)) for s in self._candidates(still)
-                 if not REGISTRY[s.visibility].per_field]
+        off = {t.name for t in before.trials if t.why == TOO_FAR}
+        found = [self.estimate.seconds(self._whole_of(s))
+                 for s in self._candidates(self._plain(self.settings.but(still=True)), False)
+                 if self._name(s) not in off]
         return bool(found) and self._pays(before.predicted["seconds"] - min(found), TRIAL)
 
     def _pays(self, saved: float, lost: float = 0.0) -> bool:
@@ -107,16 +109,19 @@ class Chooser(Trials):
             best = self._tried(first, seconds, error, True, why)
             return Choice(self._composed(first), self.trials, {"seconds": best.seconds, "error": best.error})
         plain = self._plain(self.settings)
-        truth = self._marched(plain.but(visibility="raymarch"))
+        self._marched(plain.but(visibility="raymarch"))
         if named:
             look = self._looked(plain)
-            best = self._judged(look, truth, True, "named")
+            best = self._judged(look, True, "named")
         else:
-            best, look = self._method(truth)
+            best, look = self._for_all_lights(plain)
         if plain != self.settings:
-            best, look, truth = self._with_bounces(best, look, truth)
+            best, look = self._with_bounces(best, look)
         if not self._whole:
-            best, look = self._without(best, look, truth, OMISSIONS, self._most)
+            best, look = self._without(best, look, OMISSIONS, self._most)
+        if not named:
+            maps = self._candidates(look.composition.settings, False)
+            best, look = self._cheaper(best, maps, self._looked, lambda _: 0.0) or (best, look)
         return Choice(look.composition, self.trials, {"seconds": best.seconds, "error": best.error})
 
     def _plain(self, settings: Settings) -> Settings:
@@ -132,43 +137,66 @@ class Chooser(Trials):
         """Seconds of those, predicted."""
         return self.estimate.seconds(self._whole_of(plain)) - self.estimate.seconds(plain)
 
-    def _with_bounces(self, best: Trial, look: Look, truth: Look) -> tuple[Trial, Look, Look]:
-        """`best`, its `look` and the `truth` with the further bounces that they lack, of the method chosen: its error
-        is a small part of a small part of the light."""
+    def _with_bounces(self, best: Trial, look: Look) -> tuple[Trial, Look]:
+        """`best` and its `look`, as well as the truth, with the further bounces that they lack, of the method chosen:
+        its error is a small part of a small part of the light."""
         whole = self._looked(self._whole_of(look.composition.settings))
         self.trials[-1] = best = replace(best, seconds=self._price(whole))
-        return best, whole, replace(truth, radiance=truth.radiance + whole.radiance - look.radiance)
+        self.truth = replace(self.truth, radiance=self.truth.radiance + whole.radiance - look.radiance)
+        return best, whole
 
-    def _method(self, truth: Look) -> tuple[Trial, Look]:
-        """The cheapest that keeps to the error, with all lights: of those, fewer may do for any method, and are looked
-        for afterwards."""
-        full = self._price(truth) + self._bouncing(truth.composition.settings)
-        found = [(self.estimate.seconds(self._whole_of(s)), s) for s in self._candidates(self._plain(self.settings))]
+    def _for_all_lights(self, plain: Settings) -> tuple[Trial, Look]:
+        """The cheapest that keeps to the error, of what no light needs for itself: fewer lights may do for any method,
+        are looked for afterwards, and want fewer maps."""
+        full = self._price(self.truth) + self._bouncing(self.truth.composition.settings)
+        found = self._cheaper(Trial("raymarch", full), self._candidates(plain, True), self._closely, self._bouncing)
+        return found or (self._tried(self.truth.composition.settings, full, 0.0, True,
+                                     "nothing that serves all lights is cheaper and keeps to max_error"), self.truth)
+
+    def _cheaper(self, best: Trial, candidates: list[Settings], looked: Callable[[Settings], Look],
+                 more: Callable[[Settings], float]) -> tuple[Trial, Look] | None:
+        """The first of `candidates`, by price, that keeps to the error and is cheaper than `best`; None: none is.
+        `more`: seconds of what is not looked at."""
+        found = [(self.estimate.seconds(s) + more(s), s) for s in candidates]
         for seconds, candidate in sorted(found, key=lambda pair: pair[0]):
             # What is built for it may be in vain: maps of a sky with a sun take five seconds and err by 6 %.
-            if not self._pays(full - seconds, self._served(candidate) * self.estimate.built(candidate)):
+            if not self._pays(best.seconds - seconds, self._served(candidate) * self.estimate.built(candidate)):
                 self._tried(candidate, seconds, why="saves less than a trial takes")
                 continue
-            look = self._looked(candidate)
-            good = self.probes.error(look, truth, self._spp) <= self._most
-            if good and len(look.composition.runs) == 1 and self._price(look) + self._bouncing(candidate) < full:
-                return self._judged(look, truth, True, "the cheapest that keeps to max_error"), look
-            self._judged(look, truth, False, "no cheaper than the march" if good else
-                         "off by more than max_error allows")
-        return self._tried(truth.composition.settings, full, 0.0, True, "nothing cheaper keeps to max_error"), truth
+            tried = looked(candidate)
+            good = self._error(tried) <= self._most
+            if good and len(tried.composition.runs) == 1 and self._price(tried) + more(candidate) < best.seconds:
+                return self._judged(tried, True, "the cheapest that keeps to max_error"), tried
+            self._judged(tried, False, "no cheaper" if good else TOO_FAR)
+        return None
+
+    def _closely(self, settings: Settings) -> Look:
+        return self._closer(self._looked(settings))
+
+    def _closer(self, look: Look) -> Look:
+        """`look`; through more pixels, from then on, where it is chance that refuses what would save much."""
+        saved = (self._price(self.truth) - self._price(look)) * self.settings.frames
+        while self._error(look, -1.0) <= self._most < self._error(look):
+            samples = CLOSER * self.probes.count * SAMPLES / math.prod(self._size)
+            if samples * (self.truth.each + look.each) > RISKED * saved:
+                break
+            self._more_pixels()
+            look = self._again(look)
+        return look
 
     @staticmethod
-    def _candidates(settings: Settings) -> list[Settings]:
-        """What ``auto`` may choose, with the settings' own dials and finer ones."""
+    def _candidates(settings: Settings, of_all: bool) -> list[Settings]:
+        """What ``auto`` may choose in place of the march, with the settings' own dials and finer ones; `of_all`: what
+        is built for all lights together, else for each."""
         found = []
         for name, method in REGISTRY.items():
-            if method.automatic and name != "raymarch":
+            if method.automatic and name != "raymarch" and method.per_field == of_all:
                 found.append(settings.but(visibility=name))
                 if set(FINER) <= set(method.dials):
                     found.append(settings.but(visibility=name, **FINER))
         return found
 
-    def _without(self, best: Trial, look: Look, truth: Look, omissions: dict, limit: float) -> tuple[Trial, Look]:
+    def _without(self, best: Trial, look: Look, omissions: dict, limit: float) -> tuple[Trial, Look]:
         """Like `best`, without what the picture hardly shows, by `limit`."""
         for name, of in omissions.items():
             while (settings := of(look.composition.settings, look.composition)) is not None:
@@ -182,11 +210,11 @@ class Chooser(Trials):
                     self._tried(settings, best.seconds * share, error, False, "kept: fewer lights would glint", name)
                     break
                 tried = self._looked(settings)
-                good = self.probes.error(tried, truth, self._spp) <= limit
+                good = self._error(tried) <= limit
                 cheaper = self._price(tried) < best.seconds
                 why = (f"kept: it is off by more than {limit:.2%}" if not good else
                        "left out: the picture keeps to max_error" if cheaper else "kept: it costs nothing")
-                trial = self._judged(tried, truth, good and cheaper, why, name)
+                trial = self._judged(tried, good and cheaper, why, name)
                 if not trial.taken:
                     break
                 best, look = trial, tried
@@ -209,20 +237,21 @@ class Chooser(Trials):
         samples = SAMPLES * probed(self._size[0] * self._size[1])
         if max(self.estimate.each(march) * samples, TRIAL) > SPARED * self._left():
             return self._untried(march)
-        truth = self._marched(march)
-        best, least = truth, self._ends_at(truth, truth)
-        self._tried(march, self._price(truth), least, True, "smallest error when the time is over")
+        self._marched(march)
+        best, least = self.truth, self._ends_at(self.truth)
+        self._tried(march, self._price(best), least, True, "smallest error when the time is over")
         # What is built fast goes first: what it finds spares the others.
-        for settings in sorted(self._candidates(self.settings), key=self.estimate.built):
+        both = [s for of_all in (True, False) for s in self._candidates(self.settings, of_all)]
+        for settings in sorted(both, key=self.estimate.built):
             left, taken = self._left(), self.estimate.built(settings) + TRIAL
             samples = (left - taken) / max(self.estimate.each(settings), 1e-9)
-            hoped = math.hypot(OFF, self._noise(truth, samples))
+            hoped = math.hypot(OFF, self._noise(samples))
             late = best.each > left  # not even one sample of it fits: whatever is faster
             most = (RISKED if hoped < WORTH * least else SPARED) * left
             if self.estimate.each(settings) > best.each if late else hoped > least or taken > most:
                 continue
             look = self._looked(settings)
-            error = self._ends_at(look, truth)
+            error = self._ends_at(look)
             better = error < least and len(look.composition.runs) == 1
             self._tried(settings, self._price(look), error, better,
                         "smallest error when the time is over" if better else "a larger error when the time is over")
@@ -238,14 +267,14 @@ class Chooser(Trials):
         self._warn(self.estimate.each(settings), settings)
         return Choice(self._composed(settings), predicted={"seconds": self.limits.seconds, "error": math.nan})
 
-    def _ends_at(self, look: Look, truth: Look) -> float:
+    def _ends_at(self, look: Look) -> float:
         """Error of a picture by what is left of the time."""
         samples = self._left() / max(look.each, 1e-9)
-        return math.hypot(self.probes.error(look, truth, max(samples, 1.0)), self._noise(truth, samples))
+        return math.hypot(self.probes.error(look, self.truth, max(samples, 1.0)), self._noise(samples))
 
-    def _noise(self, truth: Look, samples: float) -> float:
+    def _noise(self, samples: float) -> float:
         """Of fewer than one it is what there is not time for, and tells apart what is too slow from what is not."""
-        return self.probes.noise(truth) / math.sqrt(max(samples, 1e-3))
+        return self.probes.noise(self.truth) / math.sqrt(max(samples, 1e-3))
 
     def _left(self) -> float:
         return max(self.limits.seconds - self._gone(), 1e-3)

@@ -88,10 +88,10 @@ class Probes:
             dr.eval(total)
         return composition, np.array(total).T.reshape(self.count, SAMPLES, 3)
 
-    def error(self, found: Look, truth: Look, spp: float) -> float:
-        """Relative RMSE of a picture of `spp` samples, with a margin for so few pixels; 0 for a black truth. Both are
-        seen along the same rays. Two halves of the samples share a bias, not their noise, which their product leaves
-        out: more samples make that smaller, and where lights are drawn it is not a method's own."""
+    def error(self, found: Look, truth: Look, spp: float, caution: float = CAUTION) -> float:
+        """Relative RMSE of a picture of `spp` samples, with `caution` standard errors for so few pixels; 0 for a black
+        truth. Both are seen along the same rays. Two halves of the samples share a bias, not their noise, which their
+        product leaves out: more samples make that smaller, and where lights are drawn it is not a method's own."""
         off, half = found.radiance - truth.radiance, SAMPLES // 2
         both, one, other = off.mean(1), off[:, :half].mean(1), off[:, half:].mean(1)
         share = 0.0 if truth.composition.lights.sampled else SAMPLES / spp
@@ -100,7 +100,7 @@ class Probes:
         groups = (self.weight * (squares - mean)).reshape(-1, GROUP).sum(1)  # neighbours are alike
         spread = math.sqrt(float((groups**2).sum()))
         power = float(self.weight @ (truth.radiance.mean(1) ** 2).mean(1))
-        return math.sqrt(max(mean + CAUTION * spread, 0.0) / power) if power > 0 else 0.0
+        return math.sqrt(max(mean + caution * spread, 0.0) / power) if power > 0 else 0.0
 
     def noise(self, look: Look) -> float:
         """Relative RMS error of a picture of one sample a pixel, whose filter takes the mean of several."""
