@@ -157,9 +157,10 @@ def test_chance_is_asked_again_where_much_is_at_stake(blobs, trials_are_free, mo
     assert (max(counts) == 4 * min(counts)) == (taken != "raymarch")
 
 
-@pytest.mark.parametrize("moves", [False, True])
-def test_lights_that_stand_still_share_their_maps(blobs, trials_are_free, monkeypatch, moves):
-    """A map that is made anew for each frame is dearer than the march, one that is made once is not."""
+@pytest.mark.parametrize(("moves", "maps"), [((), (1, 2, 3, 4)), ((0,), ()), ((1,), (1,))])
+def test_lights_that_stand_still_share_their_maps(blobs, trials_are_free, monkeypatch, moves, maps):
+    """A map that is made anew for each frame is dearer than the march, one that is made once is not. `moves`: frames
+    after which a light moves; `maps`: frames with maps, none once anything has moved."""
     def each(settings):
         return 2.0 if settings.visibility == "raymarch" else 1.0 if settings.still else 3.0
 
@@ -167,13 +168,13 @@ def test_lights_that_stand_still_share_their_maps(blobs, trials_are_free, monkey
     monkeypatch.setattr(estimate.Estimate, "seconds", lambda self, s: each(s))
     loaded = scenes.scene(blobs, nrf(max_error=0.3, frames=20), {"light": scenes.light("point")}, size=16, spp=1)
     params, taken = mi.traverse(loaded), []
-    for seed in range(4):
-        mi.render(loaded, seed=seed)
+    for frame in range(5):
+        mi.render(loaded, seed=frame)
         taken.append(loaded.integrator().achieved["visibility"])
-        if moves:
+        if frame in moves:
             params["light.position"] += mi.Point3f(0.01, 0, 0)
             params.update()
-    assert taken == ["raymarch", *(["raymarch"] if moves else ["transmittance_map"]) * 3]
+    assert taken == ["transmittance_map" if frame in maps else "raymarch" for frame in range(5)]
 
 
 def test_time_for_the_march(blobs):
@@ -197,6 +198,18 @@ def test_a_trial_of_much_of_the_time_must_promise_much(blobs, monkeypatch, gain,
                                loaded.sensors()[0], 1, None)
     chooser.choose()
     assert (len(chooser.trials) > 1) == tried
+
+
+def test_what_is_too_slow_is_given_up(blobs, monkeypatch):
+    """Not even one sample by the march fits into the time; a map that takes most of it leaves room for some."""
+    prices(monkeypatch, lambda s: 50.0 if s.visibility == "raymarch" else 1.0)
+    monkeypatch.setattr(choosing, "REGISTRY", {n: REGISTRY[n] for n in ("raymarch", "transmittance_map")})
+    monkeypatch.setattr(estimate.Estimate, "built", lambda self, s: 8.0)
+    monkeypatch.setattr(estimate.Estimate, "each", lambda self, s: 0.01)
+    loaded = scenes.scene(blobs, nrf(time_budget=10), {"light": scenes.light("point")}, size=16, spp=1)
+    chooser = choosing.Chooser(loaded, choosing.Settings.of(loaded.integrator()), loaded.integrator().limits,
+                               loaded.sensors()[0], 1, None)
+    assert chooser.choose().composition.effects.visibility == "transmittance_map"
 
 
 def test_a_budget_that_cannot_be_kept_is_said(blobs, monkeypatch, capfd):

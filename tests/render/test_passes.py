@@ -61,6 +61,14 @@ def test_time_is_kept_and_used(each):
     assert found.seconds >= 18 or found.count == passes.MOST
 
 
+def test_the_choice_is_no_pass():
+    """It takes of the budget, but a further pass need not fit into as much again."""
+    machine = Machine(Limits(seconds=20), each=0.5, compiling=0.0)
+    machine.now = 12.0  # spent on the choice
+    found = machine.run()
+    assert 18 <= found.seconds <= 20 and found.count >= 12
+
+
 def test_the_first_limit_wins():
     assert Machine(Limits(noise=0.2, seconds=20)).run().ended == "noise"
     assert Machine(Limits(noise=0.002, seconds=20)).run().ended == "time"

@@ -41,11 +41,12 @@ class Choice:
 
 @dataclass(frozen=True)
 class Kept:
-    """A choice for frames to come that have the same `key`; `placed`: where lights and fields were; `dearer`: that of
-    :class:`mi_ntf.render.transport.estimate.Estimate`."""
+    """A choice for frames to come that have the same `key`; `placed`: where lights and fields were; `moved`: whether
+    they have been elsewhere; `dearer`: that of :class:`mi_ntf.render.transport.estimate.Estimate`."""
 
     key: tuple
     placed: tuple
+    moved: bool
     dearer: float
     settings: Settings
     trials: list[Trial]

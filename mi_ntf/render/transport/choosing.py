@@ -47,6 +47,7 @@ class Chooser(Trials):
         super().__init__(scene, settings, limits, sensor, spp, patches)
         self._gone, self._before, self._whole = gone, before, whole
         self._most = MARGIN * limits.error
+        self._moved = False
         self._bare: tuple[Probes, Look] | None = None
 
     def choose(self) -> Choice:
@@ -60,18 +61,20 @@ class Chooser(Trials):
             return Choice(self._composed(self.settings))
         before = self._before
         if before and before.key == self._key():
-            if not self._worth_again(before):
+            self._moved = before.moved or before.placed != self._placed()
+            again = self._worth_again(before)
+            if not again and not (before.settings.still and self._moved):
                 self.trials = before.trials
                 return Choice(self._composed(before.settings), self.trials, before.predicted)
-            self.settings = self.settings.but(still=True)
+            self.settings = self.settings.but(still=again)
         return self._by_error() if self.limits.error else self._by_time()
 
     def kept(self, choice: Choice) -> Kept | None:
         """For the next frame: where it is one of the same scene with as many lights, the choice is made once."""
         if not choice.trials:
             return None
-        return Kept(self._key(), self._placed(), self.estimate.dearer, choice.composition.settings, choice.trials,
-                    choice.predicted)
+        return Kept(self._key(), self._placed(), self._moved, self.estimate.dearer, choice.composition.settings,
+                    choice.trials, choice.predicted)
 
     def _key(self) -> tuple:
         lights = self.estimate.lights
@@ -84,10 +87,9 @@ class Chooser(Trials):
         return rows.where.tobytes(), *(m.frame.placement() for m in self.estimate.media)
 
     def _worth_again(self, before: Kept) -> bool:
-        """Whether lights that stand where they stood may make a map for each worth its price, which further frames
-        share; before, they might have moved."""
-        if (before.settings.still or before.placed != self._placed() or self.settings.visibility != "auto"
-                or not self.limits.error):
+        """Whether lights that have not moved so far may make a map for each worth its price, which further frames
+        share; of one frame nobody knows."""
+        if before.settings.still or self._moved or self.settings.visibility != "auto" or not self.limits.error:
             return False
         self.estimate.dearer = before.dearer
         off = {t.name for t in before.trials if t.why == TOO_FAR}
