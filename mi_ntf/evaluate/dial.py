@@ -7,8 +7,9 @@
     python -m mi_ntf.evaluate.dial stock  …
 
 ``error``  `max_error` 2 % with ``auto`` beside every fixed choice: methods, and of environments the number of lights.
-           Seconds of one picture and of twenty (the first and 19 times the second), maps and atlases made in the first,
-           kernels compiled; error is to `raymarch` with the same seeds, or bias alone where light is drawn at random.
+           Seconds of one picture and of twenty (the first, the second and 18 times a further one), maps and atlases
+           made in the first, kernels compiled; error is to `raymarch` with the same seeds, or bias alone where light is
+           drawn at random.
 ``noise``  `noise_threshold` beside the noise of the picture against one of `TRUTH` samples a pixel.
 ``time``   `time_budget` beside the seconds that it took, and the error, noise included, beside that of the best fixed
            method in the same time.
@@ -107,15 +108,15 @@ def relative(image: np.ndarray, truth: np.ndarray) -> float:
 
 
 def frames(loaded, options: dict[str, Any]) -> tuple[np.ndarray, list[float], Any]:
-    """Two pictures (2, h, w, 3), seconds of the first and of a further one, maps made anew in the first and kernels
-    compiled before, and the integrator."""
+    """Two pictures (2, h, w, 3), seconds of the first, the second and a further one, maps made anew in the first and
+    kernels compiled before, and the integrator."""
     with maps_in_memory():
         picture(loaded, integrator(**options), 9, 0 if "max_error" in options else 1)
         map_cache.forget()
         nrf = integrator(**options)
         images, seconds = zip(*(picture(loaded, nrf, seed) for seed in (0, 1)), strict=True)
-        further = [seconds[1], *(picture(loaded, nrf, seed)[1] for seed in range(2, MORE if seconds[1] < 1 else 2))]
-    return np.stack(images), [seconds[0], float(np.median(further))], nrf
+        further = [picture(loaded, nrf, seed)[1] for seed in range(2, MORE if seconds[1] < 1 else 3)]
+    return np.stack(images), [*seconds, float(np.median(further))], nrf
 
 
 def off(images: np.ndarray, truth: np.ndarray, drawn: bool) -> float:
@@ -149,7 +150,8 @@ def error_case(name: str, light: str, size: int, spp: int) -> list[dict[str, Any
 
 def total(seconds: list[float], number: int) -> float:
     """Of so many pictures."""
-    return seconds[0] + (number - 1) * seconds[1]
+    first, second, further = seconds
+    return first if number == 1 else first + second + (number - 2) * further
 
 
 def noise_case(name: str, light: str, size: int, spp: int) -> list[dict[str, Any]]:

@@ -25,7 +25,9 @@ class Texels:
             padded = np.zeros(lines * COLUMNS * channels, self.dtype)
             padded[: count * channels] = numbers
             numbers = padded
-        values = tensor(array(numbers), shape=(lines, COLUMNS, channels))
+        numbers = array(numbers)
+        dr.eval(numbers)  # or the first picture would round them
+        values = tensor(numbers, shape=(lines, COLUMNS, channels))
         self.texture = texture(values, filter_mode=dr.FilterMode.Nearest, wrap_mode=dr.WrapMode.Clamp)
         self._line = dr.opaque(dj.Float, 1 / lines)
 

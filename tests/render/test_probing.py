@@ -1,5 +1,6 @@
 """Pixels rendered beforehand: where they are, and what they tell of error and noise."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import mitsuba as mi
@@ -41,13 +42,18 @@ def looks(rng, probes, bias, noise, drawn):
     truth = np.ones(shape) + noise * rng.normal(size=shape)
     found = np.full(shape, 1 + bias) + noise * rng.normal(size=shape)
     lights = SimpleNamespace(lights=SimpleNamespace(sampled=[0] if drawn else []))
-    return (probing.Look(lights, radiance, 0.0, 0.0) for radiance in (found, truth))
+    seen = np.full(probes.count, True)
+    return (probing.Look(lights, radiance, seen, 0.0, 0.0) for radiance in (found, truth))
+
+
+def of_camera(pixels):
+    film = {**scenes.film(256), "rfilter": {"type": "box"}}
+    return probing.Probes(mi.load_dict({"type": "perspective", "fov": 30.0, "film": film}), [], pixels)
 
 
 @pytest.fixture
 def probes():
-    film = {**scenes.film(256), "rfilter": {"type": "box"}}
-    return probing.Probes(mi.load_dict({"type": "perspective", "fov": 30.0, "film": film}), [], probing.MOST)
+    return of_camera(1024)
 
 
 def test_noise_of_drawn_lights_is_no_error(rng, probes):
@@ -66,3 +72,51 @@ def test_noise_of_one_sample(rng, probes):
     _, truth = looks(rng, probes, 0.0, 0.3, False)
     power = 1 + 0.3**2 / probing.SAMPLES
     assert probes.noise(truth) == pytest.approx(0.3 / np.sqrt(power), rel=0.05)
+
+
+@pytest.fixture
+def everywhere():
+    return of_camera(16384)
+
+
+@pytest.fixture
+def shown(everywhere):
+    """A disc a quarter as large as the picture, dark at the rim and sixteen times brighter in the middle."""
+    place = np.array(everywhere._ray.d)[:2].T.reshape(everywhere.count, probing.SAMPLES, 2).mean(1)
+    apart = np.linalg.norm(place / np.tan(np.radians(15)), axis=1) * np.sqrt(np.pi)  # of a square of side 2
+    light = np.where(apart < 1, 4 - 3 * apart, 0.0)
+    radiance = np.broadcast_to(light[:, None, None], (everywhere.count, probing.SAMPLES, 3))
+    return probing.Look(SimpleNamespace(), radiance, light > 0, 0.0, 0.0)
+
+
+def test_some_pixels_tell_of_all(everywhere, shown):
+    """As many of them see something as of the picture, most where there is light; their weights sum to what they would
+    be of all. Twice as many hold these, in the same order first."""
+    some = everywhere.some(shown, everywhere.count // 4)
+    others, both = some.more()
+    assert both.count == some.count + others.count == pytest.approx(2 * some.count, rel=0.03)
+    np.testing.assert_array_equal(both._index[: len(some._index)], some._index)
+    for part, rel in ((some, 0.1), (both, 0.07)):  # 1.5/√groups that see something
+        pixels = (part._index[:, None] * probing.GROUP + np.arange(probing.GROUP)).ravel()
+        light = shown.radiance[pixels, 0, 0]
+        square = everywhere.weight @ shown.radiance[:, 0, 0] ** 2
+        assert part.weight @ light**2 == pytest.approx(square, rel=rel)
+        assert part.weight.sum() == pytest.approx(1, rel=rel)
+        assert (light > 0).mean() == pytest.approx(0.25, rel=0.1)
+        assert light[light > 0].mean() > 1.15 * shown.radiance[shown.seen].mean()
+        assert part.samples == pytest.approx(part.count * probing.SAMPLES / 256**2, rel=0.1)
+
+
+def test_rays_of_some_pixels_are_theirs(everywhere, shown):
+    some = everywhere.some(shown, 64)
+    d = np.array(everywhere._ray.d).T.reshape(-1, probing.GROUP * probing.SAMPLES, 3)
+    np.testing.assert_array_equal(np.array(some._ray.d).T.reshape(-1, *d.shape[1:]), d[some._index])
+
+
+@pytest.mark.parametrize("bright", [True, False])
+def test_nothing_seen(everywhere, shown, bright):
+    """Where nothing or everything is black, any pixels do."""
+    black = replace(shown, radiance=np.zeros_like(shown.radiance), seen=shown.seen & bright)
+    some = everywhere.some(black, probing.LEAST)
+    assert some.weight.sum() == pytest.approx(1, rel=0.1)
+    assert some.count == pytest.approx(probing.LEAST * (1.75 if bright else 1), rel=0.1)

@@ -1,8 +1,9 @@
 """Some pixels of a picture, rendered beforehand: what they show, how noisy a sample is, and what a picture takes."""
 
+import copy
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -12,29 +13,38 @@ from ..cost import measurement
 from ..scene import effects
 from . import camera_light
 from .composition import Composition
+from .ranking import Ranking
 
 SHARE = 0.04
 """Of the pixels, those rendered beforehand, at most `MOST` and at least `LEAST`; `SAMPLES` of each."""
-MOST, LEAST, SAMPLES = 1024, 256, 4
+MOST, LEAST, SAMPLES = 512, 256, 2
 GROUP = 4
 """Pixels side by side that are rendered together, as pictures are: rays of scattered ones that march in one packet wait
 for each other, which made probes look four times as dear."""
 CAUTION = 0.5
 """Standard errors that are added to a mean square. A few pixels at thin parts have much of it, so it spreads widely:
 whole ones refused what keeps to a limit by a quarter (`globe` by an atlas)."""
+MIN_OPACITY = 1e-3
+"""Less, and nothing of a field is seen."""
 SMALL, WITHIN = 0.01, 96
 """A field whose bounds take less than this share of the picture gets as many pixels of its own."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """`radiance` (pixels, samples, 3) of the probes; seconds, compilation left out: `built` of what does not grow with
-    the picture, `each` of one sample for every pixel of it."""
+    """`radiance` (pixels, samples, 3) of the probes, and whether anything is `seen` (pixels,) there; seconds,
+    compilation left out: `built` of what does not grow with the picture, `each` of one sample for every pixel of it."""
 
     composition: Composition
     radiance: np.ndarray
+    seen: np.ndarray
     built: float
     each: float
+
+    def and_more(self, other: "Look", share: float) -> "Look":
+        """This and the `other` of further probes, which are `share` of the samples of both."""
+        return replace(self, radiance=np.concatenate([self.radiance, other.radiance]),
+                       seen=np.concatenate([self.seen, other.seen]), each=self.each + share * (other.each - self.each))
 
 
 def probed(pixels: int) -> float:
@@ -46,16 +56,22 @@ class Probes:
     """Camera rays through pixels here and there; through those of fields that are small in the picture, all the more.
 
     weight  (probes,): share of the picture that each stands for
+    chance  (groups,): that of each group of `GROUP` probes side by side to be one
     pixels  how many, where so many are there
     """
+
+    _ranking: Ranking
 
     def __init__(self, sensor, media: list, pixels: int):
         width, height = (int(n) for n in sensor.film().crop_size())
         self._pixels = width * height
         rng = np.random.default_rng(0)
         groups = max(1, round(min(pixels, self._pixels) / GROUP))
+        self._evenly = groups  # the others are those of small fields
         places, self.weight = _places(rng, groups, _small(sensor, media), 1 / width)
-        self.count = len(self.weight)
+        self.count, self._like_picture = len(self.weight), 1.0
+        self._whole, self._index = self, np.arange(0)
+        self.chance = np.zeros(self.count // GROUP)
         self._sharpness = _pixels_of(sensor.film().rfilter())
         place = np.repeat(places, SAMPLES, 1)
         n = place.shape[1]
@@ -70,23 +86,60 @@ class Probes:
         self._quadrature = tuple(mi.Float(v) for v in rng.random((2, n)))
         dr.eval(self._ray, self._weight, self._quadrature)
 
+    def some(self, shown: Look, pixels: int) -> "Probes":
+        """About so many of them, those that tell most by what is `shown` of all, without shadows."""
+        light = (shown.radiance**2).mean((1, 2)).reshape(-1, GROUP).mean(1)
+        seen = np.any(shown.seen.reshape(-1, GROUP), axis=1)
+        small = np.arange(len(seen)) >= self._evenly
+        ranking = Ranking(self.weight.reshape(-1, GROUP).sum(1), seen, light, small, LEAST // GROUP)
+        return self._of(ranking, *ranking.first(pixels // GROUP))
+
+    def more(self) -> tuple["Probes", "Probes"]:
+        """Of what these are some of: others, about as many, and all of them, these first."""
+        index, chance = self._ranking.first(2 * self.count // GROUP)
+        chances = np.zeros(self._whole.count // GROUP)
+        chances[index] = chance
+        others = np.setdiff1d(index, self._index)
+        both = np.concatenate([self._index, others])
+        new, all_ = (self._whole._of(self._ranking, groups, chances[groups]) for groups in (others, both))
+        return new, all_
+
+    def _of(self, ranking: Ranking, index: np.ndarray, chance: np.ndarray) -> "Probes":
+        """Those of these groups, which had these chances."""
+        part = copy.copy(self)
+        part._whole, part._ranking, part._index = self, ranking, index
+        part.chance, part.count = chance, len(index) * GROUP
+        part._like_picture = ranking.share / max(float(ranking.seen[index].mean()), 1e-9) or 1.0
+        part.weight = (self.weight.reshape(-1, GROUP)[index] / chance[:, None]).ravel()
+        rays = mi.UInt32((index[:, None] * GROUP * SAMPLES + np.arange(GROUP * SAMPLES)).ravel())
+        part._ray = dr.gather(mi.Ray3f, self._ray, rays)
+        part._weight = self._weight if dr.width(self._weight) == 1 else dr.gather(mi.Color3f, self._weight, rays)
+        part._quadrature = tuple(dr.gather(mi.Float, v, rays) for v in self._quadrature)
+        dr.eval(part._ray, part._weight, part._quadrature)
+        return part
+
+    @property
+    def samples(self) -> float:
+        """Samples for every pixel that take as long as the probes. Rays that meet nothing take next to no time."""
+        return self.count * SAMPLES / (self._pixels * self._like_picture)
+
     def look(self, compose: Callable[[], Composition]) -> Look:
         """What `compose` makes, seen through the probes."""
-        (composition, radiance), stages = measurement.watch(lambda: self._trace(compose()))
+        (composition, radiance, seen), stages = measurement.watch(lambda: self._trace(compose()))
         built = sum(stages.get(name, 0.0) for name in measurement.BUILT)
-        # Probes of small fields are more than their share: the time is that of a picture with as many.
-        each = (sum(stages.values()) - built) * self._pixels / (self.count * SAMPLES)
-        return Look(composition, radiance, built, each)
+        return Look(composition, radiance, seen, built, (sum(stages.values()) - built) / self.samples)
 
     def _trace(self, composition: Composition):
-        total = mi.Color3f(0)
+        total, seen = mi.Color3f(0), mi.Bool(False)
         for run in range(len(composition.runs)):
             composition.select(run)
             with composition.lights.bare():
-                light, _ = camera_light.trace(composition, self._ray, self._quadrature, dr.opaque(mi.UInt32, 7))
+                light, opacity = camera_light.trace(composition, self._ray, self._quadrature, dr.opaque(mi.UInt32, 7))
             total += light * self._weight
-            dr.eval(total)
-        return composition, np.array(total).T.reshape(self.count, SAMPLES, 3)
+            seen |= opacity > MIN_OPACITY
+            dr.eval(total, seen)
+        shape = self.count, SAMPLES
+        return composition, np.array(total).T.reshape(*shape, 3), np.array(seen).reshape(shape).any(1)
 
     def error(self, found: Look, truth: Look, spp: float, caution: float = CAUTION) -> float:
         """Relative RMSE of a picture of `spp` samples, with `caution` standard errors for so few pixels; 0 for a black
@@ -97,8 +150,8 @@ class Probes:
         share = 0.0 if truth.composition.lights.sampled else SAMPLES / spp
         squares = (one * other + share * (both * both - one * other)).mean(1)
         mean = float(self.weight @ squares)
-        groups = (self.weight * (squares - mean)).reshape(-1, GROUP).sum(1)  # neighbours are alike
-        spread = math.sqrt(float((groups**2).sum()))
+        groups = (self.weight * squares).reshape(-1, GROUP).sum(1)  # neighbours are alike
+        spread = math.sqrt(float((1 - self.chance) @ (groups - groups.mean()) ** 2))
         power = float(self.weight @ (truth.radiance.mean(1) ** 2).mean(1))
         return math.sqrt(max(mean + caution * spread, 0.0) / power) if power > 0 else 0.0
 

@@ -8,13 +8,23 @@ from ..scene.settings import Limits, Settings
 from .choice import Trial
 from .composition import Composition
 from .estimate import Estimate
-from .probing import CAUTION, SAMPLES, Look, Probes, probed
+from .probing import CAUTION, Look, Probes, probed
 
+MARGIN = 0.95
+"""Of `max_error`, what the probes may show: what is taken is what they happen to find good."""
+RISKED = 0.4
+"""Of what a trial may save, what it may take; `CHEAP`: of all frames by what it is for, what it may take in any case.
+Of the lights that `statue` may do without under an environment, 500 pixels find too many."""
+CHEAP = 0.03
 CLOSER = 4
-"""Times as many pixels are looked at where that costs nothing or chance may have refused a method: of `globe` by an
-atlas, which errs by 1.70 %, 1000 pixels tell 1.74 ± 0.25, 4000 of others 1.80 ± 0.26."""
+"""Times as many pixels are looked at where that costs nothing."""
 BRIEF = 0.05
 """Seconds, less than which a look takes as long as its kernels need to begin, not what they compute."""
+EVERYWHERE, FEW = 16384, 32
+"""Pixels and lights of an environment in which is looked for what the picture shows, without shadows; the probes are
+some of them."""
+CROWDED = 0.25
+"""Of those pixels: more probes would tell little more."""
 UNTOLD = 32
 """Samples a pixel that a render is taken to have if a limit of noise says how many."""
 
@@ -24,7 +34,8 @@ class Trials:
 
     trials    what was tried, in order
     estimate  of seconds, before anything is tried
-    probes    the pixels that are looked at, from :meth:`_marched` on; `truth`: by the march, what they show
+    probes    the pixels that are looked at, from :meth:`_marched` on; `truth`: by the march, what they show; `known`:
+              its composition says so of any pixel
     """
 
     estimate: Estimate
@@ -36,7 +47,9 @@ class Trials:
         self._spp = UNTOLD if limits.noise > 0 else spp
         self._size = tuple(int(n) for n in sensor.film().crop_size())
         self.trials: list[Trial] = []
+        self._most = MARGIN * limits.error
         self._errors: dict[Settings, float] = {}
+        self.known = True
 
     def _composed(self, settings: Settings) -> Composition:
         return Composition(self.scene, settings, self.sensor, self._spp, self.patches)
@@ -46,22 +59,42 @@ class Trials:
         self.patches = look.composition.patches  # where light bounces between is the same for all of them
         return look
 
-    def _more_pixels(self) -> None:
-        """From now on, and of the truth."""
-        self.probes = Probes(self.sensor, self.estimate.media, CLOSER * self.probes.count)
-        self.truth = self._again(self.truth)
+    def _closer(self, look: Look, dearer: float) -> Look:
+        """`look`, in place of what takes `dearer` seconds; through more pixels, from then on, where that costs next to
+        nothing, or where it is chance that refuses what would save much."""
+        frames, price = self.settings.frames, self._price(look)
+        while self.known and 2 * self.probes.count <= CROWDED * self._everywhere.count:
+            seconds = self.probes.samples * (self.truth.each + look.each)
+            chance = self._error(look, -CAUTION) <= self._most < self._error(look)
+            if seconds > frames * max(CHEAP * price, RISKED * (dearer - price) if chance else 0.0):
+                break
+            look = self._through_more(look)
+        return look
 
-    def _again(self, look: Look) -> Look:
-        """What `look` is of through the probes of today."""
-        return replace(self.probes.look(lambda: look.composition), built=look.built)
+    def _through_more(self, look: Look) -> Look:
+        """`look` through twice as many pixels, as the truth is from then on."""
+        more, both = self.probes.more()
+        share = more.samples / both.samples
+
+        def joined(look: Look) -> Look:
+            return look.and_more(more.look(lambda: look.composition), share)
+
+        self.truth, look = joined(self.truth), joined(look)
+        self.probes = both
+        return look
 
     def _marched(self, march: Settings) -> None:
         """The probes by the march, which also tell how far off the prices are."""
         pixels = math.prod(self._size)
-        self.probes = Probes(self.sensor, self.estimate.media, round(probed(pixels) * pixels))
+        self._everywhere = Probes(self.sensor, self.estimate.media, EVERYWHERE)
+        self._shown = self._everywhere.look(lambda: self._composed(march.but(
+            visibility="none", max_depth=2, hide_emitters=True,
+            environment_lights=min(FEW, march.environment_lights))))
+        self.probes = self._everywhere.some(self._shown, round(probed(pixels) * pixels))
         self.truth = self._looked(march)
-        if self.truth.each * self.probes.count * SAMPLES / pixels < BRIEF:
-            self._more_pixels()
+        if self.truth.each * self.probes.samples < BRIEF:
+            self.probes = self._everywhere.some(self._shown, CLOSER * self.probes.count)
+            self.truth = replace(self.probes.look(lambda: self.truth.composition), built=self.truth.built)
         self.estimate.dearer = self._price(self.truth) / max(self.estimate.seconds(march), 1e-9)
 
     def _price(self, look: Look) -> float:
