@@ -15,7 +15,7 @@ MARGIN = 0.95
 RISKED = 0.4
 """Of what a trial may save, what it may take; `CHEAP`: of all frames by what it is for, what it may take in any case.
 Of the lights that `statue` may do without under an environment, 500 pixels find too many."""
-CHEAP = 0.03
+CHEAP = 0.02
 CLOSER = 4
 """Times as many pixels are looked at where that costs nothing."""
 BRIEF = 0.05
