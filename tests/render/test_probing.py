@@ -120,3 +120,12 @@ def test_nothing_seen(everywhere, shown, bright):
     some = everywhere.some(black, probing.LEAST)
     assert some.weight.sum() == pytest.approx(1, rel=0.1)
     assert some.count == pytest.approx(probing.LEAST * (1.75 if bright else 1), rel=0.1)
+
+
+def test_more_of_something_small(everywhere, shown):
+    """Of what takes a thirtieth of the picture, more pixels are looked at than its share, and then twice as many."""
+    few = shown.seen & (np.arange(everywhere.count) < everywhere.count // 8)
+    some = everywhere.some(replace(shown, seen=few), 512)
+    of_groups = few.reshape(-1, probing.GROUP).any(1)
+    hits = [of_groups[part._index].sum() for part in (some, *some.more())]
+    assert hits == [probing.LEAST // probing.GROUP] * 2 + [2 * probing.LEAST // probing.GROUP]

@@ -61,6 +61,7 @@ class Probes:
     """
 
     _ranking: Ranking
+    _times: int
 
     def __init__(self, sensor, media: list, pixels: int):
         width, height = (int(n) for n in sensor.film().crop_size())
@@ -91,23 +92,25 @@ class Probes:
         light = (shown.radiance**2).mean((1, 2)).reshape(-1, GROUP).mean(1)
         seen = np.any(shown.seen.reshape(-1, GROUP), axis=1)
         small = np.arange(len(seen)) >= self._evenly
-        ranking = Ranking(self.weight.reshape(-1, GROUP).sum(1), seen, light, small, LEAST // GROUP)
-        return self._of(ranking, *ranking.first(pixels // GROUP))
+        weight = self.weight.reshape(-1, GROUP).sum(1)
+        ranking = Ranking(weight, seen, light, small, pixels // GROUP, LEAST // GROUP)
+        return self._of(ranking, 1, *ranking.first(1))
 
     def more(self) -> tuple["Probes", "Probes"]:
         """Of what these are some of: others, about as many, and all of them, these first."""
-        index, chance = self._ranking.first(2 * self.count // GROUP)
+        times = 2 * self._times
+        index, chance = self._ranking.first(times)
         chances = np.zeros(self._whole.count // GROUP)
         chances[index] = chance
         others = np.setdiff1d(index, self._index)
         both = np.concatenate([self._index, others])
-        new, all_ = (self._whole._of(self._ranking, groups, chances[groups]) for groups in (others, both))
+        new, all_ = (self._whole._of(self._ranking, times, groups, chances[groups]) for groups in (others, both))
         return new, all_
 
-    def _of(self, ranking: Ranking, index: np.ndarray, chance: np.ndarray) -> "Probes":
-        """Those of these groups, which had these chances."""
+    def _of(self, ranking: Ranking, times: int, index: np.ndarray, chance: np.ndarray) -> "Probes":
+        """Those of these groups, which had these chances to be among the first so many `times`."""
         part = copy.copy(self)
-        part._whole, part._ranking, part._index = self, ranking, index
+        part._whole, part._ranking, part._times, part._index = self, ranking, times, index
         part.chance, part.count = chance, len(index) * GROUP
         part._like_picture = ranking.share / max(float(ranking.seen[index].mean()), 1e-9) or 1.0
         part.weight = (self.weight.reshape(-1, GROUP)[index] / chance[:, None]).ravel()

@@ -16,23 +16,25 @@ class Ranking:
     seen    (groups,): whether it sees anything
     light   (groups,): mean square of what it sees, without shadows, which could only dim it
     small   (groups,): whether it is there for a small field: all that see one are looked at
-    least   of the others that see something are looked at, at least
+    count   about how many are looked at first; of those that see something, at least `least`
 
     `share`: of the picture that sees something. As large a one of the groups does, chosen by their light, as errors are
     large where there is light: chosen evenly, `globe` needs twice as many for as sure a mean square, `knot` four times.
     """
 
-    def __init__(self, weight: np.ndarray, seen: np.ndarray, light: np.ndarray, small: np.ndarray, least: int):
-        self.share, self.seen, self._least, self._small = float(weight @ seen), seen, least, int((small & seen).sum())
+    def __init__(self, weight: np.ndarray, seen: np.ndarray, light: np.ndarray, small: np.ndarray, count: int,
+                 least: int):
+        self.share, self.seen, self._small = float(weight @ seen), seen, int((small & seen).sum())
+        self._count = max(count * self.share, min(count, least)), count * (1 - self.share)
         mean = float((weight * seen) @ light) / max(self.share, 1e-9)
         self._seen = _Priority(np.where(small & seen, np.inf, seen * weight * (light + FAINT * (mean or 1.0))))
         self._other = _Priority(~seen * weight)
 
-    def first(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """About `count` groups: ``(index, chance)``, their chances to be among them. Those of a lesser count are among
-        those of a greater."""
-        seen = self._seen.first(self._small + round(max(count * self.share, min(count, self._least))))
-        other = self._other.first(round(count * (1 - self.share)))
+    def first(self, times: int) -> tuple[np.ndarray, np.ndarray]:
+        """So many times the groups that are looked at first: ``(index, chance)``, their chances to be among them. Those
+        of fewer times are among those of more."""
+        seen = self._seen.first(self._small + round(times * self._count[0]))
+        other = self._other.first(round(times * self._count[1]))
         index, chance = (np.concatenate(pair) for pair in zip(seen, other, strict=True))
         return index, chance
 
