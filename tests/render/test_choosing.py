@@ -137,6 +137,20 @@ def test_frames_share_what_is_built_and_the_choice(blobs, monkeypatch, frames, v
     assert loaded.integrator().achieved["trials"] == first["trials"]
 
 
+@pytest.mark.parametrize(("of_all", "taken"), [(True, "transmittance_map"), (False, "raymarch")])
+def test_what_may_keep_to_a_small_limit_is_tried(blobs, trials_are_free, monkeypatch, of_all, taken):
+    """Whatever is usual of other scenes; but for maps of one logistic, which are far off on nearly all."""
+    monkeypatch.setattr(probing.Probes, "error", lambda *_: 0.0)
+    changed = replace(REGISTRY["transmittance_map"], per_field=of_all)
+    monkeypatch.setattr(choosing, "REGISTRY", {"raymarch": REGISTRY["raymarch"], "transmittance_map": changed})
+    monkeypatch.setattr(choosing, "FINER", {})
+    prices(monkeypatch, lambda s: 2.0 if s.visibility == "raymarch" else 1.0)
+    monkeypatch.setattr(estimate.Estimate, "seconds", lambda self, s: 2.0 if s.visibility == "raymarch" else 1.0)
+    loaded = scenes.scene(blobs, nrf(max_error=0.005), {"light": scenes.light("point")}, size=16, spp=1)
+    mi.render(loaded)
+    assert loaded.integrator().achieved["visibility"] == taken
+
+
 @pytest.mark.parametrize(("gain", "spp", "more", "taken"), [
     (0.2, 1, 2, "transmittance_map"), (0.97, 1, 1, "raymarch"), (0.97, 64, 4, "transmittance_map")])
 def test_chance_is_asked_again_where_much_is_at_stake(blobs, trials_are_free, monkeypatch, gain, spp, more, taken):

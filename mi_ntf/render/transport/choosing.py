@@ -34,8 +34,9 @@ SPARED, WORTH = 0.2, 0.7
 can be foreseen, is below `WORTH` of the least so far: a march of two samples is far off, an atlas takes a second."""
 ONE_LOGISTIC, USUAL, HOPELESS = 0.035, 0.017, 1.5
 """Relative RMSE, as far as it can be foreseen: of maps with one logistic, and of atlases and maps with two (medians of
-the shipped scenes under points, environments and skies: 1.7 to 12.8 %, 0.9 to 9.7 %). What is so many times over
-`max_error` is not tried."""
+the shipped scenes under points, environments and skies: 1.7 to 12.8 %, 0.6 to 9.7 %). Maps of one logistic are not
+tried where that is so many times `max_error`.
+"""
 
 
 class Chooser(Trials):
@@ -179,7 +180,7 @@ class Chooser(Trials):
         return built if REGISTRY[settings.visibility].per_field else 2 * built
 
     def _hopeless(self, settings: Settings) -> bool:
-        return _usual(settings) > HOPELESS * self._most
+        return _one_logistic(settings) and ONE_LOGISTIC > HOPELESS * self._most
 
     def _closely(self, settings: Settings) -> Look:
         return self._closer(self._looked(settings), self._price(self.truth))
@@ -288,5 +289,9 @@ class Chooser(Trials):
                 f"{each:.3g} s by {settings.visibility}; that will be rendered")
 
 
+def _one_logistic(settings: Settings) -> bool:
+    return not REGISTRY[settings.visibility].per_field and settings.map_components == 1
+
+
 def _usual(settings: Settings) -> float:
-    return USUAL if REGISTRY[settings.visibility].per_field or settings.map_components > 1 else ONE_LOGISTIC
+    return ONE_LOGISTIC if _one_logistic(settings) else USUAL

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-GOLDEN = 0.618034
-"""Its multiples fill [0, 1) most evenly."""
+from ...infer.march import GOLDEN
+
 FAINT = 0.3
 """Of what is seen of fields, in mean squares of light, that all have a chance by: it is the light of a few lights
 alone, and further bounces are not in it."""

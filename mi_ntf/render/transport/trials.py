@@ -13,9 +13,10 @@ from .probing import CAUTION, Look, Probes, probed
 MARGIN = 0.95
 """Of `max_error`, what the probes may show: what is taken is what they happen to find good."""
 RISKED = 0.4
-"""Of what a trial may save, what it may take; `CHEAP`: of all frames by what it is for, what it may take in any case.
-Of the lights that `statue` may do without under an environment, 500 pixels find too many."""
+"""Of what a trial may save, what it may take."""
 CHEAP = 0.02
+"""Of the seconds of all frames, what more pixels may take in any case: of the lights that `statue` may do without under
+an environment, 500 pixels find too many."""
 CLOSER = 4
 """Times as many pixels are looked at where that costs nothing."""
 BRIEF = 0.05
