@@ -189,7 +189,8 @@ def test_a_scene_without_our_integrator(tmp_path):
 
 
 def test_under_a_limit_the_trials_are_told(monkeypatch, capsys):
-    monkeypatch.setattr("mi_ntf.render.transport.choosing.TRIAL", 0.0)
+    for least in ("LOOK", "TRIAL"):
+        monkeypatch.setattr(f"mi_ntf.render.transport.choosing.{least}", 0.0)
     report = explain(SCENE, {"error": "0.1", "res": "24", "spp": "4"})
     trials = report["choice"]["trials"]
     taken = [trial for trial in trials if trial["taken"]]

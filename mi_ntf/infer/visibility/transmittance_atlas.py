@@ -200,4 +200,5 @@ METHOD = Method(
     candidates=2,
     dials=("map_source", "map_file"),
     automatic=True,
+    trial=(128, 256),  # of few lights, what is found once for a point is much of it
 )

@@ -157,7 +157,7 @@ def per_ray(work, prices) -> float:
     """ns of one ray of a map: q of research/transmittance.md, section 5."""
     if work.source == "network":
         return prices.ray
-    return work.samples * (prices.texel + queries(work, prices))
+    return work.samples * (work.components * prices.texel + queries(work, prices))
 
 
 METHOD = Method(
@@ -165,7 +165,7 @@ METHOD = Method(
     summary="per light, a table of the logistics of its rays",
     build=build,
     pair=lambda work, prices: prices.lookup * work.components,
-    prices={"lookup": 5.0, "texel": 1.0},
+    prices={"lookup": 15.0, "texel": 1.0},  # in a picture under many lights, 0.6 of an atlas's
     making=lambda work, prices: FILLED * work.texels * per_ray(work, prices),
     numbers=width,
     dials=("map_resolution", "map_source", "map_components", "map_memory", "map_file"),

@@ -19,8 +19,10 @@ from .omissions import LIGHTS, OMISSIONS
 from .probing import SAMPLES, Look, Probes, probed
 from .trials import RISKED, Trials
 
-TRIAL = 0.5
-"""Seconds that a trial takes: what saves less is not tried."""
+LOOK, TRIAL, LEFT_OUT = 0.5, 0.2, 0.5
+"""Seconds of all frames: what takes less is rendered by the march without a look at it; what another method must save
+to be tried, as much as that takes; and what leaving something out must: each trial may find by chance that an error is
+small enough, so there are few."""
 TOO_FAR = "off by more than max_error allows"
 SAVING = 0.1
 """Of the predicted time, what leaving something out must save at least."""
@@ -96,17 +98,17 @@ class Chooser(Trials):
         found = [self.estimate.seconds(self._whole_of(s))
                  for s in self._candidates(self._plain(self.settings.but(still=True)), False)
                  if self._name(s) not in off and not self._hopeless(s)]
-        return bool(found) and self._pays(before.predicted["seconds"] - min(found), TRIAL)
+        return bool(found) and self._pays(before.predicted["seconds"] - min(found), LOOK + TRIAL)
 
-    def _pays(self, saved: float, lost: float = 0.0) -> bool:
-        """Whether so many seconds less a picture are worth a trial, which loses `lost` seconds of building."""
-        return saved * self.settings.frames >= TRIAL + lost
+    def _pays(self, saved: float, lost: float) -> bool:
+        """Whether so many seconds less a picture are worth `lost` seconds of a trial and of building."""
+        return saved * self.settings.frames >= lost
 
     def _by_error(self) -> Choice:
         named = self.settings.visibility != "auto"
         first = self.settings if named else self.settings.but(visibility="raymarch")
         seconds = self.estimate.seconds(first)
-        if not self._pays(seconds):
+        if seconds * self.settings.frames < LOOK:
             error, why = (math.nan, "named") if named else (0.0, "all else saves less than a trial takes")
             best = self._tried(first, seconds, error, True, why)
             return Choice(self._composed(first), self.trials, {"seconds": best.seconds, "error": best.error})
@@ -162,7 +164,7 @@ class Chooser(Trials):
         `more`: seconds of what is not looked at."""
         found = [(self.estimate.seconds(s) + more(s), s) for s in candidates]
         for seconds, candidate in sorted(found, key=lambda pair: pair[0]):
-            if self._hopeless(candidate) or not self._pays(best.seconds - seconds, self._in_vain(candidate)):
+            if self._hopeless(candidate) or not self._pays(best.seconds - seconds, TRIAL + self._in_vain(candidate)):
                 self._tried(candidate, seconds, why="usually off by more than max_error allows"
                             if self._hopeless(candidate) else "saves less than a trial takes")
                 continue
@@ -203,7 +205,7 @@ class Chooser(Trials):
             while (settings := of(look.composition.settings, look.composition)) is not None:
                 share = self.estimate.seconds(settings) / self.estimate.seconds(look.composition.settings)
                 anew = 0.0 if REGISTRY[settings.visibility].per_field else self.estimate.built(settings)
-                if (share > 1 - SAVING or not self._pays(best.seconds * (1 - share), anew)
+                if (share > 1 - SAVING or not self._pays(best.seconds * (1 - share), LEFT_OUT + anew)
                         or self._errors.get(settings, 0.0) > limit):
                     break
                 if name in LIGHTS and (error := self._glints(settings)) > limit:
@@ -236,7 +238,7 @@ class Chooser(Trials):
         """The smallest error when the time is over: samples that a march cannot have may be worth a bias."""
         march = self.settings.but(visibility="raymarch")
         samples = SAMPLES * probed(self._size[0] * self._size[1])
-        if max(self.estimate.each(march) * samples, TRIAL) > SPARED * self._left():
+        if max(self.estimate.each(march) * samples, LOOK) > SPARED * self._left():
             return self._untried(march)
         self._marched(march)
         best, least = self.truth, self._ends_at(self.truth)
@@ -244,7 +246,7 @@ class Chooser(Trials):
         # What is built fast goes first: what it finds spares the others.
         both = [s for of_all in (True, False) for s in self._candidates(self.settings, of_all)]
         for settings in sorted(both, key=self.estimate.built):
-            left, taken = self._left(), self.estimate.built(settings) + TRIAL
+            left, taken = self._left(), self.estimate.built(settings) + LOOK
             samples = (left - taken) / max(self.estimate.each(settings), 1e-9)
             hoped = math.hypot(_usual(settings), self._noise(samples))
             late = best.each > left  # not even one sample of it fits: whatever is faster

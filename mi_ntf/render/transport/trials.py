@@ -23,7 +23,8 @@ BRIEF = 0.05
 """Seconds, less than which a look takes as long as its kernels need to begin, not what they compute."""
 EVERYWHERE, FEW = 16384, 32
 """Pixels and lights of an environment in which is looked for what the picture shows, without shadows; the probes are
-some of them."""
+some of them. Half of them where all frames take less than `SHORT` seconds."""
+SHORT = 2.0
 CROWDED = 0.25
 """Of those pixels: more probes would tell little more."""
 UNTOLD = 32
@@ -87,7 +88,8 @@ class Trials:
     def _marched(self, march: Settings) -> None:
         """The probes by the march, which also tell how far off the prices are."""
         pixels = math.prod(self._size)
-        self._everywhere = Probes(self.sensor, self.estimate.media, EVERYWHERE)
+        short = self.estimate.seconds(march) * self.settings.frames < SHORT
+        self._everywhere = Probes(self.sensor, self.estimate.media, EVERYWHERE // 2 if short else EVERYWHERE)
         self._shown = self._everywhere.look(lambda: self._composed(march.but(
             visibility="none", max_depth=2, hide_emitters=True,
             environment_lights=min(FEW, march.environment_lights))))
