@@ -58,7 +58,6 @@ OF_DRAWN: list[dict[str, Any]] = [{"visibility": "transmittance_atlas", "light_s
 """Where many samples are taken in any case."""
 
 
-
 def emitter(light: str, name: str, center: np.ndarray, radius: float) -> dict[str, Any]:
     """Mitsuba dict of one of `LIGHTS`, as bright and where the scene's own point light is; `sky`: a sun of half a
     degree. The world of ``skull`` is upside down."""

@@ -46,6 +46,14 @@ def test_what_methods_spend_by_hand():
     assert spent(WORK, "transmittance_atlas") == pytest.approx(atlas + pairs * ATLAS, rel=1e-6)
 
 
+def test_two_logistics_are_fitted_and_read_as_two_but_a_network_is_asked_once():
+    two = replace(WORK, method="transmittance_map", components=2)
+    assert model.making(two, KNOT) == pytest.approx(50 * 2 * MAP, rel=1e-6)
+    assert model.per_pair(two, KNOT) == 2 * LOOKUP
+    asked = replace(two, source="network")
+    assert model.making(asked, KNOT) == model.making(replace(asked, components=1), KNOT)
+
+
 def test_what_no_map_serves_is_marched_beside_maps():
     more = replace(WORK, drawn=2, others=1e6)
     rest = 0.5 * (300_000 * 2 + 1e6)

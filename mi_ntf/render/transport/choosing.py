@@ -21,8 +21,9 @@ from .trials import RISKED, Trials
 
 LOOK, TRIAL, LEFT_OUT = 0.5, 0.2, 0.5
 """Seconds of all frames: what takes less is rendered by the march without a look at it; what another method must save
-to be tried, as much as that takes; and what leaving something out must: each trial may find by chance that an error is
-small enough, so there are few."""
+to be tried, twice what that takes with kernels compiled; and what leaving something out must: each trial may find by
+chance that an error is small enough, so there are few. Under a `time_budget` a trial counts as `LOOK`: it may compile.
+"""
 TOO_FAR = "off by more than max_error allows"
 SAVING = 0.1
 """Of the predicted time, what leaving something out must save at least."""
