@@ -242,6 +242,24 @@ def test_overlapping_fields_add(rng):
     assert np.array(march.camera_samples(strands, cut, u[0], u[1]).t).max() <= 1.0
 
 
+def test_rays_have_the_samples_of_the_finest_field_that_they_meet():
+    """Two balls side by side, one of smoke, which lose 1 − e⁻² of the light of rays through their middles."""
+    ball = GridField(NetworkField(*fields.uniform(1.0), mi), 64, mi)
+    o = np.tile([[0.0, 0.0, 3.0], [4.0, 0.0, 3.0], [8.0, 0.0, 3.0]], (500, 1))
+    d = arrays(np.tile([[0, 0, -1.0]], (1500, 1)))
+    strands = [Strand(ball.density, ball, arrays(o - [x, 0, 0]), d, mi.Float(0.01), mi.Float(1)) for x in (0, 4)]
+    u = [mi.Float((np.arange(1500) * g) % 1) for g in (0.618034, 0.7548777)]
+    lost = 1 - np.exp(-2)
+    for shares in ((1 / 8, 1 / 64), ()):
+        samples = march.camera_samples(strands, mi.Float(1e9), *u, shares=shares)
+        solid, smoke, none = np.array(samples.count).reshape(-1, 3).T
+        for count, share in zip((solid, smoke), shares or (march.SHARE,) * 2, strict=True):
+            assert count.min() >= np.floor(lost / share) and count.max() <= np.ceil(lost / share) + 1
+        assert not none.any()
+        for weight in samples.weights:
+            assert np.array(weight, np.float64).sum() / 500 == pytest.approx(lost, rel=0.01)  # voxels at the surface
+
+
 @pytest.mark.parametrize("distance", [3.0, 300.0, 2e4, 1e6])
 def test_rays_from_afar(slab, distance):
     """Light and view keep their digits however far they start: closed form along two chords, and both marches end."""

@@ -2,7 +2,7 @@
 
 A ray from x along ω is read in two parts. Close to x, where a map of another direction would see the wrong piece of the
 skin that x lies in, σ is summed at a few places, one drawn in each stratum of √t. The rest is one texel of one map: on
-the line along its direction d_k that crosses the ray at the pivot x + c ω, from `BEGIN` on:
+the line along its direction d_k that crosses the ray at the pivot x + c ω, from `BEGIN` on, all of it in smoke:
 
     τ(x, ω) ≈ exp(−Σ w_i σ(x + t_i ω)) · τ_k(x + c ω − (c − BEGIN) d_k)
 
@@ -40,7 +40,8 @@ BEGIN = 0.08
 """Where the map of an opaque thing is read from on: what lies between is neither's, or the skin of x would count
 twice."""
 REACH = 0.064
-"""Where the sum ends, and the map of smoke begins."""
+"""Where the sum ends. Smoke has no skin, and its map is read from x on: with the sum, pictures of `cloud` err by 1.7 %,
+without by 1.0 %, by logistics of its own (:data:`two_logistics.SMOKE`) by 0.7 %."""
 DARK = 3e-4
 """Where the map lets no more through than this, nobody looks how much of that the sum close to x would take."""
 NEAREST_PIVOT, PIVOT = 0.16, 0.7
@@ -57,13 +58,13 @@ SMOKE_STEP = 1 / 32
 
 class TransmittanceAtlas:
     """`density`: σ at a point; `maps`: the :class:`TransmittanceMap` of the directions, read from the distance `begin`
-    on; `march`: a :class:`mi_ntf.infer.visibility.raymarch.RayMarch` for what lies inside the sphere, which any drawn
-    light may; `options`: of the maps. `stream`: a seed of the sampler, for the numbers that lookups draw, opaque, or
-    each would be compiled."""
+    on, 0 in smoke; `march`: a :class:`mi_ntf.infer.visibility.raymarch.RayMarch` for what lies inside the sphere, which
+    any drawn light may; `options`: of the maps. `stream`: a seed of the sampler, for the numbers that lookups draw,
+    opaque, or each would be compiled."""
 
     def __init__(self, density, maps: TransmittanceMap, begin: float, march, options: Options, dj: ModuleType):
         self.density, self.maps, self.march, self.options, self.dj = density, maps, march, options, dj
-        self._begin = dr.opaque(dj.Float, begin)
+        self._begin, self._skin = dr.opaque(dj.Float, begin), begin > 0
         self._side = dr.opaque(dj.Float, maps.count**0.5)
         self.stream = dr.opaque(dj.UInt32, 0)
 
@@ -97,6 +98,8 @@ class TransmittanceAtlas:
         outside = dr.squared_norm(self.dj.Array3f(*x)) > OUTSIDE
         *u, v = _uniforms(self.dj, self.stream, x, wi)
         far = self._far(x, wi, here, outside, u)
+        if not self._skin:
+            return far
 
         def near(far, x, wi, v):
             return far * close_by(self.density, x, wi, v)
@@ -159,11 +162,12 @@ def build(medium, lights, options: Options, dj, keep) -> TransmittanceAtlas:
     """See :class:`mi_ntf.infer.visibility.method.Method`."""
     network = options.map_source == "network"
     step = options.step * COARSE * (profile.FOR_NETWORKS if network else profile.FOR_MAPS)
+    begin, effort = BEGIN, two_logistics.ROUGH
     if not medium.field.softness.opaque:
-        step = max(step, SMOKE_STEP)
+        step, begin, effort = max(step, SMOKE_STEP), 0.0, two_logistics.SMOKE
     reader = profile.of(medium, step, dj)
     source = (map_source.network_source(medium.field.network, reader, False) if network
-              else map_source.field_source(medium.source, reader, LOGISTICS, two_logistics.ROUGH))
+              else map_source.field_source(medium.source, reader, LOGISTICS, effort))
     directions = table(dj)
     own = replace(options, map_resolution=RESOLUTION, map_components=LOGISTICS, half=True)
 
@@ -172,7 +176,6 @@ def build(medium, lights, options: Options, dj, keep) -> TransmittanceAtlas:
 
     maps = keep(channels(source.components, source.weights), step, make, directions, own)
     march = raymarch.build(medium, lights, options, dj, keep)
-    begin = BEGIN if medium.field.softness.opaque else REACH
     # Voxels will do, also for a field that is its networks.
     return TransmittanceAtlas(medium.field.grid.density, maps, begin, march, own, dj)
 

@@ -14,6 +14,7 @@ from ...core import radiosity
 from ...infer import march, shade
 from ...infer.bundle import Strand
 from ...infer.lights import LightTable
+from ...infer.samples import Samples
 from ...infer.visibility import REGISTRY
 from ...infer.visibility.method import Options
 from ..cost import model
@@ -115,7 +116,7 @@ def seen_points(medium) -> shade.Points:
     return points
 
 
-def _camera(grid) -> march.Samples:
+def _camera(grid) -> Samples:
     o, d = _rays(grid)
     middle = dr.full(mi.Float, 0.5, WIDTH)
     strand = Strand(grid.density, grid, o, d, dr.opaque(mi.Float, 2 / SAMPLES))

@@ -17,6 +17,7 @@ from ..scene import effects
 from ..scene.media import find_media, ordinary_shapes
 from ..scene.settings import Limits, Settings
 from ..transport import choosing
+from ..transport.composition import IN_SMOKE
 from ..transport.rendering import CHUNK
 from . import calibration
 
@@ -90,7 +91,8 @@ def works(integrator, media: list, found, rays: int, count: int, drawn: int) -> 
 
 
 def _memory(works: list[model.Work]) -> dict[str, int]:
-    return _sum(model.memory(replace(w, rays=max(w.rays, 1)), CHUNK) for w in works)
+    chunk = CHUNK if all(w.opaque for w in works) else CHUNK // IN_SMOKE
+    return _sum(model.memory(replace(w, rays=max(w.rays, 1)), chunk) for w in works)
 
 
 def _held(integrator, media: list, found, light) -> int:

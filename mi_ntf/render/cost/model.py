@@ -17,8 +17,8 @@ import numpy as np
 
 from ... import __version__
 from ...core import radiosity
+from ...infer import march
 from ...infer.grid import CELLS
-from ...infer.march import SMOKE_SHARE
 from ...infer.visibility import REGISTRY
 from .. import user_cache
 
@@ -30,8 +30,10 @@ FACING = 0.5
 COVERAGE = 0.35
 """Share of the camera rays that hit the object."""
 POINTS_A_HIT = 6.5
-"""Shading points of a camera ray that hits, from 384 samples across the diameter on (5.7 to 7.1 on four objects, 8.4 in
-smoke); of fewer samples 0.6 of it at 96."""
+"""Shading points of a camera ray that hits, from 384 samples across the diameter on (5.7 to 7.1 on four objects); of
+fewer samples 0.6 of it at 96."""
+POINTS_IN_SMOKE = 33.0
+"""The same in smoke (`cloud`)."""
 NOT_SKIPPED = 0.05
 """Share of the samples across the diameter at which a camera ray's march asks the field."""
 
@@ -63,6 +65,7 @@ class Work:
     samples       cells across the unit sphere's diameter
     source        of maps: ``field`` or ``network``
     network       the field is its networks, not its grid, of `voxels`³
+    opaque        the field is no smoke
     patches       that light bounces between, 0 where it does not by radiosity
     frames        pictures that share what is built for a field; `still`: and for each light
     """
@@ -77,6 +80,7 @@ class Work:
     components: int = 1
     network: bool = False
     voxels: int = 192
+    opaque: bool = True
     patches: int = 0
     drawn: int = 0
     others: float = 0.0
@@ -134,14 +138,14 @@ def choose(work: Work, c: Constants | None = None) -> tuple[str, str]:
 def work(integrator, medium, method: str, rays: int, lights: int = 1, drawn: int = 0, others: float = 0.0) -> Work:
     """What it comes to that an ``nrf`` integrator traces `rays` camera rays through `medium` under `lights` lights and
     as many `drawn` ones, with as many rays of `others`. Shading points are guessed: an opaque object in the picture."""
-    network = integrator.map_source == "network"
-    points = rays * COVERAGE * POINTS_A_HIT * min(integrator.samples / 384, 1) ** 0.35
+    network, opaque = integrator.map_source == "network", medium.field.softness.opaque
+    points = rays * COVERAGE * (POINTS_A_HIT if opaque else POINTS_IN_SMOKE) * min(integrator.samples / 384, 1) ** 0.35
     return Work(
         rays=rays, points=points, lights=lights, method=method,
         texels=integrator.map_resolution**2, samples=integrator.samples, source=integrator.map_source,
         components=medium.field.network.components if network else integrator.map_components,
         network=medium.representation == "network", voxels=medium.field.grid.resolution, drawn=drawn, others=others,
-        frames=integrator.frames,
+        opaque=opaque, frames=integrator.frames,
     )
 
 
@@ -182,7 +186,7 @@ def memory(work: Work, chunk: int) -> dict[str, int]:
         "field grid": 4 * work.voxels**3 + 32 * min(work.voxels, 128) ** 3,
         # Some 24 floats a shading point, 12 a ray between patches, in arrays that Dr.Jit rounds up to powers of two;
         # and two for each point that a camera ray may have.
-        "rays in flight": round(max(camera * (max(share, 1) * 128 + 8 / SMOKE_SHARE), between * 72)),
+        "rays in flight": round(max(camera * (max(share, 1) * 128 + 8 / march.share(work.opaque)), between * 72)),
     }
 
 

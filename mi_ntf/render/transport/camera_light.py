@@ -64,10 +64,9 @@ class _CameraLight:
         strands, unit = self.scene.strands(ray, self.scene.in_view)
         maxt = (dr.minimum(ray.maxt, self.hit.t) if self.hit is not None else ray.maxt) / unit
         wanted = found.lit or bool(sums and sums.needs_points)
-        opaque = all(part.medium.field.softness.opaque for part in self.scene.in_view)
         samples = self.seen.samples(wanted, found.collocated, lambda: march.camera_samples(
             strands, maxt, self.offset, self.depth, shade=wanted, view=found.collocated,
-            share=march.SHARE if opaque else march.SMOKE_SHARE))
+            shares=tuple(march.share(part.medium.field.softness.opaque) for part in self.scene.in_view)))
         self.met = samples, unit
         light = [dr.zeros(mi.Float, dr.width(samples.t)) for _ in range(3)]
         for i, part in enumerate(self.scene.in_view):

@@ -22,6 +22,9 @@ from .bounced import Bounced, Patches
 from .shadow import Known, Shadow, between
 from .surfaces import Surfaces
 
+IN_SMOKE = 4
+"""Times as many samples have rays that meet smoke: so many times fewer are in flight, and are looked at beforehand."""
+
 
 @dataclass(frozen=True)
 class Part:
@@ -56,6 +59,7 @@ class Composition:
         self.effects = effects.describe(scene, settings, sensor, spp, media, self.lights)
         self._media = [m for m in media if m.field.grid.majorant > 0]
         self._seen = [m for m, visible in zip(media, self.effects.in_view, strict=True) if visible]
+        self.smoke = not all(m.field.softness.opaque for m in self._seen)
         self.runs, self.run = self._runs(), -1  # none yet
         self.own = self._own()
         self.select(self.own[0] if self.own else 0)

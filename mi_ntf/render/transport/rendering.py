@@ -12,6 +12,7 @@ from ..scene.camera import Camera, Reconstruction
 from ..scene.settings import Limits, Settings
 from . import aovs, camera_light, choosing, passes
 from .choice import Choice
+from .composition import IN_SMOKE
 
 CHUNK = 1 << 18
 """Camera rays in flight: bounds the memory at about half a GiB whatever the image and the number of lights."""
@@ -123,7 +124,8 @@ def _trace(integrator, composition, pixels: Reconstruction, picture, seed, count
     it was told to stop."""
     camera = pixels.camera
     alpha = mi.has_flag(camera.film.flags(), mi.FilmFlags.Alpha)
-    chunks = range(0, camera.count, max(1, getattr(integrator, "chunk", CHUNK) // camera.spp))
+    rays = getattr(integrator, "chunk", CHUNK) // (IN_SMOKE if composition.smoke else 1)
+    chunks = range(0, camera.count, max(1, rays // camera.spp))
     seen = getattr(integrator, "seen", None)
     for run, first in itertools.product(composition.own, chunks):
         if integrator.should_stop() or counted.overtime(integrator.timeout):

@@ -4,7 +4,7 @@ preview's time."""
 from collections.abc import Callable
 from typing import Any
 
-from ...infer.march import Samples
+from ...infer.samples import Samples
 from ...infer.shade import Points
 
 

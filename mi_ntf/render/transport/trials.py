@@ -6,7 +6,7 @@ from dataclasses import replace
 from ...infer.visibility import REGISTRY
 from ..scene.settings import Limits, Settings
 from .choice import Trial
-from .composition import Composition
+from .composition import IN_SMOKE, Composition
 from .estimate import Estimate
 from .probing import CAUTION, Look, Probes, probed
 
@@ -93,7 +93,8 @@ class Trials:
         self._shown = self._everywhere.look(lambda: self._composed(march.but(
             visibility="none", max_depth=2, hide_emitters=True,
             environment_lights=min(FEW, march.environment_lights))))
-        self.probes = self._everywhere.some(self._shown, round(probed(pixels) * pixels))
+        fewer = IN_SMOKE if self._shown.composition.smoke else 1  # of more points each
+        self.probes = self._everywhere.some(self._shown, round(probed(pixels) * pixels / fewer))
         self.truth = self._looked(march)
         if self.truth.each * self.probes.samples < BRIEF:
             self.probes = self._everywhere.some(self._shown, CLOSER * self.probes.count)
