@@ -89,9 +89,9 @@ def field_source(field, profile, components: int = 1, effort=two_logistics.FINE)
         return ((1.0, dr.select(clear, 1, a), dr.select(clear, CLEAR, b)),)
 
     def two(o, d, end):
-        hit, _m, _h = spheres.chord(ops, o, d)
+        hit, _m, h = spheres.chord(ops, o, d)
         places, depth, last = profile.with_end(o, d, effort.depths, end)
-        return two_logistics.fit(places, depth, last, hit & (depth > effort.depths[0]), effort)
+        return two_logistics.fit(places, depth, last, -h, hit & (depth > effort.depths[0]), effort)
 
     return Source(one if components == 1 else two, components, components > 1)
 

@@ -41,7 +41,7 @@ BEGIN = 0.08
 twice."""
 REACH = 0.064
 """Where the sum ends. Smoke has no skin, and its map is read from x on: with the sum, pictures of `cloud` err by 1.7 %,
-without by 1.0 %, by logistics of its own (:data:`two_logistics.SMOKE`) by 0.7 %."""
+without by 1.0 %, with :data:`mi_ntf.infer.visibility.two_logistics.SMOKE` by 0.9 %."""
 DARK = 3e-4
 """Where the map lets no more through than this, nobody looks how much of that the sum close to x would take."""
 NEAREST_PIVOT, PIVOT = 0.16, 0.7

@@ -16,7 +16,7 @@ import numpy as np
 from .. import profile
 from ..lights import LightTable
 from ..texels import Texels, blank
-from . import map_source, two_logistics
+from . import map_source
 from .light_rays import LightRays
 from .map_source import Source
 from .method import FILLED, Method, Options, queries
@@ -141,8 +141,7 @@ def build(medium, table, options: Options, dj, keep) -> TransmittanceMap:
     if network:
         source = map_source.network_source(medium.field.network, reader, _inside(table))
     else:
-        effort = two_logistics.FINE if medium.field.softness.opaque else two_logistics.SMOKE
-        source = map_source.field_source(medium.source, reader, options.map_components, effort)
+        source = map_source.field_source(medium.source, reader, options.map_components)
 
     def make(values=None):
         return TransmittanceMap(table, options.map_resolution, medium.field.grid.hull, source, dj, values)

@@ -16,12 +16,12 @@ from .. import ops
 
 
 class Effort(NamedTuple):
-    """`levels`: of τ, seen from the light; `steps` of least squares; `floor`: a ray that keeps some light begins them
-    with one logistic that is 1 throughout, and which they leave so."""
+    """`levels`: of τ, seen from the light; `steps` of least squares; `sloping`: as many from another start as well, for
+    rays that keep some light, whose second logistic is 1 throughout otherwise, which steps leave so."""
 
     levels: tuple[float, ...]
     steps: int
-    floor: bool = True
+    sloping: int = 0
 
     @property
     def depths(self) -> tuple[float, ...]:
@@ -33,9 +33,9 @@ FINE = Effort((0.999, 0.97, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1, 0.03), 
 ROUGH = Effort((0.999, 0.9, 0.7, 0.5, 0.3, 0.1), 1)
 """Where texels are so large that their blur hides more: pictures of `statue`, `globe` and `skull` by an atlas err alike
 with two steps."""
-SMOKE = Effort(FINE.levels, 10, floor=False)
-"""Smoke dims light all along a ray, which one logistic above a floor follows badly: in a ball of even smoke τ is 1.6 %
-too low, RMS 0.035, and by this 0.1 %, 0.022; of `cloud` 0.5 % too low, 0.023, and 0.5 % too high, 0.021."""
+SMOKE = Effort(FINE.levels, FINE.steps, 10)
+"""Smoke dims light all along a ray, which one logistic above a floor follows badly: even smoke that fills the sphere by
+0.031 (RMS of τ), and by the other start by 0.021."""
 END, LEFT = 3.0, 0.9
 """Slope of the second logistic there, field units, and its value where smoke ends, both to begin with."""
 CLEAR = -100.0
@@ -44,17 +44,21 @@ PLATEAU = 0.05
 _SLOPE = 2.1972245773362196  # logit(3/4) − logit(1/4)
 
 
-def fit(places, depth, last, hit, effort: Effort = FINE):
+def fit(places, depth, last, far, hit, effort: Effort = FINE):
     """The mixture of rays whose τ passes the levels of `effort` at `places` (arbitrary where it does not), ends at
-    e^−`depth` (exact up to the last level) and meets no matter below t' = `last`; rays without `hit` are clear."""
+    e^−`depth` (exact up to the last level), meets no matter below t' = `last` and leaves the sphere at `far`; rays
+    without `hit` are clear."""
     rest = dr.select(depth >= effort.depths[-1], 0, dr.exp(-depth))
     reached = [depth >= d for d in effort.depths]
     t = [dr.select(r, p, last) for r, p in zip(reached, places, strict=True)]
     tau = [dr.select(r, level, rest) for r, level in zip(reached, effort.levels, strict=True)]
     start = _start(t, tau, reached, rest, effort.levels)
-    if not effort.floor:
-        start = _sloping(start, t[-1], rest)
     state = _least_squares(t, tau, start, effort.steps)
+    if effort.sloping:
+        t, tau = [*t, far], [*tau, rest]  # what falls goes on falling
+        other = _least_squares(t, tau, _sloping(start, t[-1], rest), effort.sloping)
+        better = _cost(_residuals(other, t, tau)[0]) < _cost(_residuals(state, t, tau)[0])
+        state = tuple(dr.select(better, a, b) for a, b in zip(other, state, strict=True))
     w, a1, b1, a2, b2 = _parameters(state)
     return tuple(
         (dr.select(hit, w, 0.5), dr.select(hit, a, 1), dr.select(hit, b, CLEAR))
