@@ -23,7 +23,7 @@ from .shadow import Known, Shadow, between
 from .surfaces import Surfaces
 
 IN_SMOKE = 4
-"""Times as many samples have rays that meet smoke: so many times fewer are in flight, and are looked at beforehand."""
+"""Times as many samples have rays that meet smoke: so many times fewer are in flight."""
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from dataclasses import replace
 from ...infer.visibility import REGISTRY
 from ..scene.settings import Limits, Settings
 from .choice import Trial
-from .composition import IN_SMOKE, Composition
+from .composition import Composition
 from .estimate import Estimate
 from .probing import CAUTION, Look, Probes, probed
 
@@ -27,6 +27,9 @@ some of them. Half of them where all frames take less than `SHORT` seconds."""
 SHORT = 2.0
 CROWDED = 0.25
 """Of those pixels: more probes would tell little more."""
+FEWER = 2
+"""Times fewer probes are in smoke, where each has more points. A fourth would be marched in half a second less, and be
+too few to tell what half of the lights save."""
 UNTOLD = 32
 """Samples a pixel that a render is taken to have if a limit of noise says how many."""
 
@@ -93,7 +96,7 @@ class Trials:
         self._shown = self._everywhere.look(lambda: self._composed(march.but(
             visibility="none", max_depth=2, hide_emitters=True,
             environment_lights=min(FEW, march.environment_lights))))
-        fewer = IN_SMOKE if self._shown.composition.smoke else 1  # of more points each
+        fewer = FEWER if self._shown.composition.smoke else 1
         self.probes = self._everywhere.some(self._shown, round(probed(pixels) * pixels / fewer))
         self.truth = self._looked(march)
         if self.truth.each * self.probes.samples < BRIEF:
