@@ -69,12 +69,9 @@ def camera_samples(strands, maxt, offset, depth, shade=True, view=False, shares=
 
 def _sizes(bundle, shares):
     """Of the light that a ray could lose, what a sample stands for."""
-    size, *others = (dr.opaque(type(bundle.base), share) for share in shares)
-    if len(set(shares)) == 1:
-        return size
-    size = dr.select(dr.isfinite(bundle.intervals[0][0]), size, 1)
-    for other, (begin, _) in zip(others, bundle.intervals[1:], strict=True):
-        size = dr.minimum(size, dr.select(dr.isfinite(begin), other, 1))
+    size = 1
+    for share, (begin, _) in zip(shares, bundle.intervals, strict=True):
+        size = dr.minimum(size, dr.select(dr.isfinite(begin), dr.opaque(type(bundle.base), share), 1))
     return size
 
 

@@ -37,7 +37,7 @@ SMOKE = Effort(FINE.levels, FINE.steps, 10)
 """Smoke dims light all along a ray, which one logistic above a floor follows badly: even smoke that fills the sphere by
 0.031 (RMS of τ), and by the other start by 0.021."""
 END, LEFT = 3.0, 0.9
-"""Slope of the second logistic there, field units, and its value where smoke ends, both to begin with."""
+"""Of the second logistic there, to begin with: slope, field units, and value where the ray leaves the sphere."""
 CLEAR = -100.0
 PLATEAU = 0.05
 """Light that a ray keeps for good, at least."""
@@ -56,7 +56,7 @@ def fit(places, depth, last, far, hit, effort: Effort = FINE):
     state = _least_squares(t, tau, start, effort.steps)
     if effort.sloping:
         t, tau = [*t, far], [*tau, rest]  # what falls goes on falling
-        other = _least_squares(t, tau, _sloping(start, t[-1], rest), effort.sloping)
+        other = _least_squares(t, tau, _sloping(start, far, rest), effort.sloping)
         better = _cost(_residuals(other, t, tau)[0]) < _cost(_residuals(state, t, tau)[0])
         state = tuple(dr.select(better, a, b) for a, b in zip(other, state, strict=True))
     w, a1, b1, a2, b2 = _parameters(state)
@@ -84,10 +84,10 @@ def _start(t, tau, reached, rest, levels):
     return odds, log_a1, begin[1], dr.select(plateau, 0, log_a2), dr.select(plateau, CLEAR, end[1])
 
 
-def _sloping(start, last, rest):
-    """`start` with a second logistic that falls to `LEFT` at `last` where a ray keeps some light."""
+def _sloping(start, far, rest):
+    """`start` with a second logistic that falls to `LEFT` at `far` where a ray keeps some light."""
     plateau, weight = rest > PLATEAU, dr.minimum(rest / LEFT, 0.95)
-    end = dr.log(1 - weight) - dr.log(weight), math.log(END), last - math.log(LEFT / (1 - LEFT)) / END
+    end = dr.log(1 - weight) - dr.log(weight), math.log(END), far - math.log(LEFT / (1 - LEFT)) / END
     odds, log_a1, b1, *second = start
     odds, *second = (dr.select(plateau, a, b) for a, b in zip(end, (odds, *second), strict=True))
     return odds, log_a1, b1, *second

@@ -28,8 +28,8 @@ SHORT = 2.0
 CROWDED = 0.25
 """Of those pixels: more probes would tell little more."""
 FEWER = 2
-"""Times fewer probes are in smoke, where each has more points. A fourth would be marched in half a second less, and be
-too few to tell what half of the lights save."""
+"""Times fewer probes are in smoke, where each has more points. A fourth would take a second less under many lights, and
+be too few to tell what half of them save."""
 UNTOLD = 32
 """Samples a pixel that a render is taken to have if a limit of noise says how many."""
 
