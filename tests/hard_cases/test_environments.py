@@ -190,6 +190,28 @@ def test_lights_that_are_kept_are_of_the_same_map(rng):
     assert environment.cells(image, 32) is not brighter
 
 
+def test_skies_that_are_kept_are_of_the_same_parameters():
+    """Another haze, another place of the sun: other skies; a few later they are let go."""
+    emitter = mi.load_dict({"type": "sunsky", "sun_direction": [0.3, 0.2, 0.9]})
+    parameters = mi.traverse(emitter)
+    clear = sun.sky(emitter)
+    assert sun.sky(mi.load_dict({"type": "sunsky", "sun_direction": [0.3, 0.2, 0.9]})) is clear
+    parameters["turbidity"] = 8.0
+    parameters.update()
+    hazy = sun.sky(emitter)
+    assert hazy.power.sum() < 0.9 * clear.power.sum() and (hazy.axis == clear.axis).all()
+    parameters["turbidity"] = 3.0
+    parameters["sun_direction"] = [-0.3, 0.2, 0.9]
+    parameters.update()
+    moved = sun.sky(emitter)
+    assert moved.axis[0] == pytest.approx(-clear.axis[0])
+    assert np.abs(moved.image - clear.image).max() > 0.1 * clear.image.max()
+    for turbidity in np.linspace(2, 9, sun.KEPT + 1):
+        sun.sky(mi.load_dict({"type": "sunsky", "turbidity": float(turbidity)}))
+    assert len(sun._kept) == sun.KEPT
+    assert sun.sky(emitter) is not moved
+
+
 @pytest.mark.parametrize("place", ["texel", "sun"])
 def test_range_of_half_the_floats(place):
     """A sun 10³⁰ times the sky, and a sky of 10³⁷: nothing overflows, nothing else is lost."""

@@ -24,8 +24,6 @@ ROWS = 512
 """Rows of blocks that a map is summed to at most, and twice as many columns; more only where more lights are wanted."""
 FLOOR = 1e-2
 """Share of an even sky that cells are cut by: dark regions too get a few, whose texels then have useful gradients."""
-SKY = 256, 512
-"""Texels of the map that a ``sunsky`` without its sun is looked up in. The horizon lies between two rows."""
 KEPT = 8
 """Results of :func:`cells` that are kept."""
 _kept: dict[tuple, Any] = {}
@@ -239,21 +237,13 @@ def _halves(light: np.ndarray, cell: tuple) -> list:
     return found
 
 
-def image(emitter, kind: str, sun=None) -> np.ndarray:
-    """(height, width, 3) texels of an ``envmap``, ``constant`` or ``sunsky`` in its own axes; `sun`: that of a
-    ``sunsky`` (:class:`mi_ntf.render.lights.sun.Sun`), which is left out."""
-    if kind == "envmap":
-        parameters = mi.traverse(emitter)
-        data = np.array(dr.detach(parameters["data"]))[:, 1:-1]  # Mitsuba repeats a column on either side
-        return data * np.float32(np.ravel(parameters["scale"])[0])
+def image(emitter, kind: str) -> np.ndarray:
+    """(height, width, 3) texels of an ``envmap`` or ``constant`` in its own axes."""
     if kind == "constant":
         return np.tile(radiance(emitter, np.array([[0.0, 1.0, 0.0]])), (3, 2, 1))
-    height, width = SKY
-    theta, phi = np.arange(height) * np.pi / (height - 1), (np.arange(width) + 0.5) * 2 * np.pi / width
-    theta, phi = np.meshgrid(theta, phi, indexing="ij")
-    towards = np.stack([np.sin(phi) * np.sin(theta), np.cos(theta), -np.cos(phi) * np.sin(theta)], axis=-1)
-    rotation, _ = placement(emitter, kind)
-    return sun.sky(towards.reshape(-1, 3) @ rotation.T).reshape(height, width, 3)
+    parameters = mi.traverse(emitter)
+    data = np.array(dr.detach(parameters["data"]))[:, 1:-1]  # Mitsuba repeats a column on either side
+    return data * np.float32(np.ravel(parameters["scale"])[0])
 
 
 def radiance(emitter, towards: np.ndarray) -> np.ndarray:

@@ -10,8 +10,7 @@ import numpy as np
 
 from ...infer.lights import LightTable
 from ..scene.frame import Frame
-from . import environment
-from .sun import Sun
+from . import environment, sun
 
 NO_CONE = (0.0, 0.0, 1.0, 8.0, 9.0)
 
@@ -101,12 +100,13 @@ def _look(emitter, p: np.ndarray):
 def sky(emitter, kind: str, limit: int) -> tuple[Rows, environment.Cells]:
     """At most `limit` directional lights for an ``envmap``, ``constant`` or ``sunsky``, and the cells that they are of;
     the sun of a ``sunsky`` comes last, a light of its own."""
-    sun = Sun(emitter) if kind == "sunsky" else None
-    cells = environment.cells(environment.image(emitter, kind, sun), max(1, limit - bool(sun)))
+    found = sun.sky(emitter) if kind == "sunsky" else None
+    image = found.image if found else environment.image(emitter, kind)
+    cells = environment.cells(image, max(1, limit - bool(found)))
     rotation, _ = environment.placement(emitter, kind)
     where, power = cells.direction @ rotation.T, cells.power
-    if sun:
-        where, power = np.concatenate([where, sun.axis[None]]), np.concatenate([power, sun.power[None]])
+    if found:
+        where, power = np.concatenate([where, found.axis[None]]), np.concatenate([power, found.power[None]])
     return Rows(where, power, np.zeros(len(power), bool)), cells
 
 

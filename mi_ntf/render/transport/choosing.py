@@ -15,8 +15,9 @@ from ...infer.visibility import REGISTRY
 from ..scene.settings import Limits, Settings
 from .choice import Choice, Kept, Trial
 from .estimate import Estimate
+from .glints import Glints
 from .omissions import LIGHTS, OMISSIONS
-from .probing import SAMPLES, Look, Probes, probed
+from .probing import SAMPLES, Look, probed
 from .trials import RISKED, Trials
 
 LOOK, TRIAL, LEFT_OUT = 0.5, 0.2, 0.5
@@ -29,9 +30,6 @@ SAVING = 0.1
 """Of the predicted time, what leaving something out must save at least."""
 FINER = {"map_resolution": 256, "map_components": 2}
 """Dials of a map for smaller errors."""
-GLINTS = 4096
-"""Pixels in which few lights are looked for glints: a lobe sees one light where it should see a patch of the sky, in a
-thousandth of the pixels, which had half of the squared error of `skull`."""
 SPARED, WORTH = 0.2, 0.7
 """Of the time that is left, what a trial may take under a `time_budget`; `RISKED` of it where its error, as far as it
 can be foreseen, is below `WORTH` of the least so far: a march of two samples is far off, an atlas takes a second."""
@@ -51,7 +49,6 @@ class Chooser(Trials):
         super().__init__(scene, settings, limits, sensor, spp, patches)
         self._gone, self._before, self._whole = gone, before, whole
         self._moved = False
-        self._bare: tuple[Probes, Look] | None = None
 
     def choose(self) -> Choice:
         """As the limits say. A method that the user named stays, whatever its error."""
@@ -59,6 +56,7 @@ class Chooser(Trials):
         if not self.limits.error and not by_time:
             return Choice(self._composed(self.settings))
         self.estimate = Estimate(self.scene, self.settings, self.sensor, self._size[0] * self._size[1], self._spp)
+        self._glints = Glints(self._composed, self.estimate, self.sensor, self.settings)
         found = self.estimate.effects
         if found.gradients or not found.needs_visibility or found.visibility == "none":
             return Choice(self._composed(self.settings))
@@ -114,9 +112,10 @@ class Chooser(Trials):
             best = self._tried(first, seconds, error, True, why)
             return Choice(self._composed(first), self.trials, {"seconds": best.seconds, "error": best.error})
         plain = self._plain(self.settings)
-        self._marched(plain.but(visibility="raymarch"))
+        march = plain.but(visibility="raymarch")
+        self._marched(march, all_lights=named and not REGISTRY[plain.visibility].per_field)
         if named:
-            look = self._looked(plain)
+            look = self._looked_at(plain)
             best = self._judged(look, True, "named")
         else:
             best, look = self._for_all_lights(plain)
@@ -154,10 +153,15 @@ class Chooser(Trials):
     def _for_all_lights(self, plain: Settings) -> tuple[Trial, Look]:
         """The cheapest that keeps to the error, of what no light needs for itself: fewer lights may do for any method,
         are looked for afterwards, and want fewer maps."""
-        full = self._price(self.truth) + self._bouncing(self.truth.composition.settings)
+        march = plain.but(visibility="raymarch")
+        full = self.estimate.seconds(self._whole_of(march))
         found = self._cheaper(Trial("raymarch", full), self._candidates(plain, True), self._closely, self._bouncing)
-        return found or (self._tried(self.truth.composition.settings, full, 0.0, True,
-                                     "nothing that serves all lights is cheaper and keeps to max_error"), self.truth)
+        if found:
+            return found
+        if self.truth.composition.settings != march:
+            self.truth, self._others = self._looked(march), None
+        why = "nothing that serves all lights is cheaper and keeps to max_error"
+        return self._tried(march, self._price(self.truth) + self._bouncing(march), 0.0, True, why), self.truth
 
     def _cheaper(self, best: Trial, candidates: list[Settings], looked: Callable[[Settings], Look],
                  more: Callable[[Settings], float]) -> tuple[Trial, Look] | None:
@@ -186,7 +190,14 @@ class Chooser(Trials):
         return _one_logistic(settings) and ONE_LOGISTIC > HOPELESS * self._most
 
     def _closely(self, settings: Settings) -> Look:
-        return self._closer(self._looked(settings), self._price(self.truth))
+        march = settings.but(visibility="raymarch")
+        return self._closer(self._looked_at(settings), self.estimate.seconds(march))
+
+    def _looked_at(self, settings: Settings) -> Look:
+        """By a method of which a look costs little: the truth has all lights from then on."""
+        look = self._looked(settings)
+        self._with_all_lights(look)
+        return look
 
     @staticmethod
     def _candidates(settings: Settings, of_all: bool) -> list[Settings]:
@@ -209,7 +220,7 @@ class Chooser(Trials):
                 if (share > 1 - SAVING or not self._pays(best.seconds * (1 - share), LEFT_OUT + anew)
                         or self._errors.get(settings, 0.0) > limit):
                     break
-                if name in LIGHTS and (error := self._glints(settings)) > limit:
+                if name in LIGHTS and (error := self._glints.error(settings, self._spp)) > limit:
                     self._errors[settings] = error
                     self._tried(settings, best.seconds * share, error, False, "kept: fewer lights would glint", name)
                     break
@@ -223,17 +234,6 @@ class Chooser(Trials):
                     break
                 best, look = trial, tried
         return best, look
-
-    def _glints(self, settings: Settings) -> float:
-        """Error of `settings` in a picture without shadows, which is cheap enough for many pixels."""
-        def bare(probes: Probes, settings: Settings) -> Look:
-            return probes.look(lambda: self._composed(settings.but(visibility="none", max_depth=2)))
-
-        if self._bare is None:
-            probes = Probes(self.sensor, self.estimate.media, GLINTS)
-            self._bare = probes, bare(probes, self.settings)
-        probes, truth = self._bare
-        return probes.error(bare(probes, settings), truth, self._spp)
 
     def _by_time(self) -> Choice:
         """The smallest error when the time is over: samples that a march cannot have may be worth a bias."""

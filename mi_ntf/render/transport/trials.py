@@ -28,8 +28,12 @@ SHORT = 2.0
 CROWDED = 0.25
 """Of those pixels: more probes would tell little more."""
 FEWER = 2
-"""Times fewer probes are in smoke, where each has more points. A fourth would take a second less under many lights, and
-be too few to tell what half of them save."""
+"""Times fewer probes are in smoke, where each has more points. With a fourth they would be too few to tell what half of
+the lights save."""
+MARCHED = 128
+"""Lights of an environment that the probes march to in smoke, where a method that costs little adds what all change:
+512 took a third of the time of a picture of `cloud`. Skins need all: what an atlas errs by is each light's own there,
+and of fewer lights half as much again."""
 UNTOLD = 32
 """Samples a pixel that a render is taken to have if a limit of noise says how many."""
 
@@ -39,8 +43,8 @@ class Trials:
 
     trials    what was tried, in order
     estimate  of seconds, before anything is tried
-    probes    the pixels that are looked at, from :meth:`_marched` on; `truth`: by the march, what they show; `known`:
-              its composition says so of any pixel
+    probes    the pixels that are looked at, from :meth:`_marched` on; `truth`: by the march, what they show, of fewer
+              lights until :meth:`_with_all_lights`; `known`: it can be found of any pixel
     """
 
     estimate: Estimate
@@ -54,6 +58,7 @@ class Trials:
         self.trials: list[Trial] = []
         self._most = MARGIN * limits.error
         self._errors: dict[Settings, float] = {}
+        self._others: tuple[Composition, Composition] | None = None  # their difference: the lights that truth lacks
         self.known = True
 
     def _composed(self, settings: Settings) -> Composition:
@@ -80,16 +85,36 @@ class Trials:
         """`look` through twice as many pixels, as the truth is from then on."""
         more, both = self.probes.more()
         share = more.samples / both.samples
-
-        def joined(look: Look) -> Look:
-            return look.and_more(more.look(lambda: look.composition), share)
-
-        self.truth, look = joined(self.truth), joined(look)
+        march = more.look(lambda: self.truth.composition)
+        self.truth = self.truth.and_more(self._and_others(more, march), share)
+        look = look.and_more(more.look(lambda: look.composition), share)
         self.probes = both
         return look
 
-    def _marched(self, march: Settings) -> None:
-        """The probes by the march, which also tell how far off the prices are."""
+    def _and_others(self, probes: Probes, march: Look, whole: Look | None = None) -> Look:
+        """`march` of `probes` with the lights that it lacks; `whole`: what a method shows of all, if that is known."""
+        if self._others is None:
+            return march
+        of_all, of_few = self._others
+        whole, fewer = whole or probes.look(lambda: of_all), probes.look(lambda: of_few)
+        return replace(march, radiance=march.radiance + whole.radiance - fewer.radiance)
+
+    def _with_all_lights(self, look: Look) -> None:
+        """The truth with those that were not marched to, as a method shows them whose `look` has all."""
+        settings, fewer = look.composition.settings, self.truth.composition.settings.environment_lights
+        if self._others is None and fewer != settings.environment_lights:
+            self._others = look.composition, self._composed(settings.but(environment_lights=fewer))
+            self.truth = self._and_others(self.probes, self.truth, look)
+
+    def _fewer_lights(self, march: Settings) -> Settings:
+        """With as few as the probes march to."""
+        lights, smoke = self.estimate.lights, self._shown.composition.smoke
+        many = any(d.shining > MARCHED for d in lights.discrete)
+        drawn = march.light_samples or lights.sampled or self.estimate.effects.bounces
+        return march.but(environment_lights=MARCHED) if smoke and many and not drawn else march
+
+    def _marched(self, march: Settings, all_lights: bool = True) -> None:
+        """The probes by the march, which also tell how far off the prices are; `all_lights`: whatever that takes."""
         pixels = math.prod(self._size)
         short = self.estimate.seconds(march) * self.settings.frames < SHORT
         self._everywhere = Probes(self.sensor, self.estimate.media, EVERYWHERE // 2 if short else EVERYWHERE)
@@ -98,6 +123,7 @@ class Trials:
             environment_lights=min(FEW, march.environment_lights))))
         fewer = FEWER if self._shown.composition.smoke else 1
         self.probes = self._everywhere.some(self._shown, round(probed(pixels) * pixels / fewer))
+        march = march if all_lights else self._fewer_lights(march)
         self.truth = self._looked(march)
         if self.truth.each * self.probes.samples < BRIEF:
             self.probes = self._everywhere.some(self._shown, CLOSER * self.probes.count)
