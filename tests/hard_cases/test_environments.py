@@ -11,7 +11,7 @@ from helpers.variants import VARIANT
 
 import mi_ntf.render
 from mi_ntf.core.errors import MiNtfError
-from mi_ntf.render.lights import environment, light_rows, scene_lights, sun
+from mi_ntf.render.lights import environment, light_rows, recent, scene_lights, sun
 
 
 @pytest.fixture(autouse=True)
@@ -184,9 +184,9 @@ def test_lights_that_are_kept_are_of_the_same_map(rng):
     image[3, 4] += 1
     brighter = environment.cells(image, 32)
     assert brighter.power.sum() > first.power.sum()
-    for limit in range(1, environment.KEPT + 4):
+    for limit in range(1, recent.KEPT + 4):
         environment.cells(image, limit)
-    assert len(environment._kept) == environment.KEPT
+    assert len(environment._kept) == recent.KEPT
     assert environment.cells(image, 32) is not brighter
 
 
@@ -206,9 +206,9 @@ def test_skies_that_are_kept_are_of_the_same_parameters():
     moved = sun.sky(emitter)
     assert moved.axis[0] == pytest.approx(-clear.axis[0])
     assert np.abs(moved.image - clear.image).max() > 0.1 * clear.image.max()
-    for turbidity in np.linspace(2, 9, sun.KEPT + 1):
+    for turbidity in np.linspace(2, 9, recent.KEPT + 1):
         sun.sky(mi.load_dict({"type": "sunsky", "turbidity": float(turbidity)}))
-    assert len(sun._kept) == sun.KEPT
+    assert len(sun._kept) == recent.KEPT
     assert sun.sky(emitter) is not moved
 
 

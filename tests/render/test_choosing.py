@@ -89,7 +89,8 @@ def test_a_faint_lobe_is_left_out(tmp_path, trials_are_free, monkeypatch):
 
 @pytest.mark.parametrize("roughness, looked", [(0.3, True), (0.75, False)], ids=["sharp lobe", "faint lobe"])
 def test_glints_are_looked_for_in_sharp_lobes(tmp_path, trials_are_free, monkeypatch, roughness, looked):
-    """Few lights make 29 % of error there without any shadow, and 1 % in a lobe below a third of a white surface."""
+    """Half of the lights make 4.9 % of error there without any shadow; a lobe below a third of a white surface is taken
+    to make none."""
     path = scenes.write_blobs(tmp_path, log_density=3.0, specular=0.3, roughness=roughness)
     prices(monkeypatch, lambda s: s.environment_lights / 512)
     loaded = scenes.scene(path, nrf(max_error=0.1), {"light": scenes.light("env")}, size=32, spp=2)

@@ -11,7 +11,6 @@ import hashlib
 import heapq
 import itertools
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -19,14 +18,13 @@ import numpy as np
 
 from ...core import spheres
 from ...core.errors import MiNtfError
+from .recent import Recent
 
 ROWS = 512
 """Rows of blocks that a map is summed to at most, and twice as many columns; more only where more lights are wanted."""
 FLOOR = 1e-2
 """Share of an even sky that cells are cut by: dark regions too get a few, whose texels then have useful gradients."""
-KEPT = 8
-"""Results of :func:`cells` that are kept."""
-_kept: dict[tuple, Any] = {}
+_kept = Recent()
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(6)
 
 
@@ -142,14 +140,10 @@ class Cells:
 
 def cells(image: np.ndarray, limit: int) -> Cells:
     """At most `limit` cells of a map (height, width, 3); they cover the sphere, those without light included. The last
-    few are kept: every trial and every frame asks for them again."""
+    few are kept."""
     image = np.ascontiguousarray(image)
     key = hashlib.blake2b(image.data).digest(), image.shape, image.dtype.str, limit
-    found = _kept.pop(key, None) or _cells(image, limit)
-    while len(_kept) >= KEPT:
-        del _kept[next(iter(_kept))]
-    _kept[key] = found
-    return found
+    return _kept.of(key, lambda: _cells(image, limit))
 
 
 def _cells(image: np.ndarray, limit: int) -> Cells:

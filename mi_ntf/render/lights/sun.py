@@ -9,14 +9,13 @@ import numpy as np
 
 from ...core.errors import MiNtfError
 from . import environment
+from .recent import Recent
 
 RINGS = 16
 """Rings of the disc, of equal solid angle, that its radiance is averaged over."""
 TEXELS = 256, 512
 """Of the map that the sky is looked up in. The horizon lies between two rows."""
-KEPT = 8
-"""Results of :func:`sky` that are kept."""
-_kept: dict[tuple, "Sky"] = {}
+_kept = Recent()
 
 
 @dataclass(frozen=True)
@@ -30,15 +29,11 @@ class Sky:
 
 
 def sky(emitter) -> Sky:
-    """That of a ``sunsky``. The last few are kept: every trial and every frame asks for them again. Raises MiNtfError
-    where Mitsuba does not tell how large the sun is."""
+    """That of a ``sunsky``; the last few are kept. Raises MiNtfError where Mitsuba does not tell how large its sun
+    is."""
     parameters = mi.traverse(emitter)
     key = str(emitter), *(np.array(dr.detach(getattr(v, "matrix", v))).tobytes() for _, v in parameters.items())
-    found = _kept.pop(key, None) or _sky(emitter)
-    while len(_kept) >= KEPT:
-        del _kept[next(iter(_kept))]
-    _kept[key] = found
-    return found
+    return _kept.of(key, lambda: _sky(emitter))
 
 
 def _sky(emitter) -> Sky:
