@@ -102,6 +102,18 @@ def test_glints_are_looked_for_in_sharp_lobes(tmp_path, trials_are_free, monkeyp
     assert (max(found.values()) > 0.01) == looked and (min(found.values()) == 0) != looked
 
 
+def test_lights_whose_lack_would_glint_are_kept(blobs, trials_are_free, monkeypatch):
+    """Of what else keeps to the error, the fewest lights that do."""
+    prices(monkeypatch, lambda s: s.environment_lights / 512)
+    monkeypatch.setattr(glints.Glints, "error", lambda self, settings, spp: 1.0 * (settings.environment_lights < 200))
+    loaded = scenes.scene(blobs, nrf(visibility="raymarch", max_error=0.3), {"light": scenes.light("env")}, size=32,
+                          spp=2)
+    mi.render(loaded, seed=1)
+    halves = [t for t in loaded.integrator().achieved["trials"] if "half" in t["name"]]
+    assert [t["taken"] for t in halves] == [True] + [False] * (len(halves) - 1) and len(halves) > 1
+    assert {t["why"] for t in halves[1:]} == {"kept: fewer lights would glint"}
+
+
 @pytest.fixture
 def smoke(tmp_path, trials_are_free, monkeypatch):
     """``(frames, error)`` → a chooser under 512 lights, of the march and the atlas, that has chosen, and its choice."""
@@ -196,7 +208,8 @@ def test_what_may_keep_to_a_small_limit_is_tried(blobs, trials_are_free, monkeyp
     """Whatever is usual of other scenes; but for maps of one logistic, which are far off on nearly all."""
     monkeypatch.setattr(probing.Probes, "error", lambda *_: 0.0)
     changed = replace(REGISTRY["transmittance_map"], per_field=of_all)
-    monkeypatch.setattr(choosing, "REGISTRY", {"raymarch": REGISTRY["raymarch"], "transmittance_map": changed})
+    for module in (choosing, estimate):
+        monkeypatch.setattr(module, "REGISTRY", {"raymarch": REGISTRY["raymarch"], "transmittance_map": changed})
     monkeypatch.setattr(choosing, "FINER", {})
     prices(monkeypatch, lambda s: 2.0 if s.visibility == "raymarch" else 1.0)
     monkeypatch.setattr(estimate.Estimate, "seconds", lambda self, s: 2.0 if s.visibility == "raymarch" else 1.0)

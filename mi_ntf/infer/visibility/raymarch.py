@@ -92,6 +92,10 @@ def light_steps(samples: int) -> int:
     return count
 
 
+IN_SKIN = 0.15
+"""Share of steps at which the field is asked on the way from a point of its skin (`statue`: 0.14)."""
+
+
 def build(medium, table, options: Options, dj, keep) -> RayMarch:
     """See :class:`mi_ntf.infer.visibility.method.Method`."""
     steps = default_steps(options.step, gradients=table is not None and table.moving)
@@ -102,7 +106,7 @@ METHOD = Method(
     name="raymarch",
     summary="one march through the field per point and light: the reference",
     build=build,
-    pair=lambda work, prices: light_steps(work.samples) * (prices.march + queries(work, prices)),
+    pair=lambda work, prices: light_steps(work.samples) * (prices.march + queries(work, prices, IN_SKIN)),
     prices={"march": 2.0},
     derivatives=True,
     automatic=True,

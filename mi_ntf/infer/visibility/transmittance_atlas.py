@@ -52,6 +52,8 @@ OUTSIDE = 0.98
 COARSE = 7.0
 """Steps of the march that fills the maps of an opaque thing, in those of a transmittance map: what a texel blurs hides
 more (pictures of `statue`, `globe` and `knot` err alike by 5 and 7)."""
+IN_SMOKE = 1.8
+"""What a step of a transmittance map's march costs there, of such a map's price: all are fitted with more effort."""
 SMOKE_STEP = 1 / 32
 """The same of smoke, field units: on `cloud` τ is off by 0.0273 (RMS), as by steps of 1/400."""
 
@@ -187,8 +189,12 @@ def numbers(medium, lights, options: Options) -> int:
 
 
 def making(work, prices) -> float:
-    """ns of all maps: a ray costs half a texel of a light's map, a seventh of the steps and two logistics to fit."""
-    return FILLED * RAYS * 0.5 * work.samples * (prices.texel + queries(work, prices))
+    """ns of all maps: of an opaque thing a ray costs half a texel of a light's map, a seventh of the steps and two
+    logistics to fit. The network is asked once."""
+    if work.source == "network":
+        return FILLED * RAYS * prices.ray
+    per_step = 0.5 if work.opaque else IN_SMOKE
+    return FILLED * RAYS * per_step * work.samples * (prices.texel + queries(work, prices))
 
 
 METHOD = Method(

@@ -13,6 +13,7 @@ import mitsuba as mi
 
 from ...infer.visibility import REGISTRY
 from ..scene.settings import Limits, Settings
+from . import estimate
 from .choice import Choice, Kept, Trial
 from .estimate import Estimate
 from .glints import Glints
@@ -20,11 +21,10 @@ from .omissions import LIGHTS, OMISSIONS
 from .probing import SAMPLES, Look, probed
 from .trials import RISKED, Trials
 
-LOOK, TRIAL, LEFT_OUT = 0.5, 0.2, 0.5
+LOOK, TRIAL, LEFT_OUT = 0.5, 0.2, 0.15
 """Seconds of all frames: what takes less is rendered by the march without a look at it; what another method must save
-to be tried, twice what that takes with kernels compiled; and what leaving something out must: each trial may find by
-chance that an error is small enough, so there are few. Under a `time_budget` a trial counts as `LOOK`: it may compile.
-"""
+to be tried, twice what that takes with kernels compiled; and what leaving something out must. Under a `time_budget`
+a trial counts as `LOOK`: it may compile."""
 TOO_FAR = "off by more than max_error allows"
 SAVING = 0.1
 """Of the predicted time, what leaving something out must save at least."""
@@ -33,11 +33,8 @@ FINER = {"map_resolution": 256, "map_components": 2}
 SPARED, WORTH = 0.2, 0.7
 """Of the time that is left, what a trial may take under a `time_budget`; `RISKED` of it where its error, as far as it
 can be foreseen, is below `WORTH` of the least so far: a march of two samples is far off, an atlas takes a second."""
-ONE_LOGISTIC, USUAL, HOPELESS = 0.035, 0.017, 1.5
-"""Relative RMSE, as far as it can be foreseen: of maps with one logistic, and of atlases and maps with two (medians of
-the shipped scenes under points, environments and skies: 1.7 to 12.8 %, 0.6 to 9.7 %). Maps of one logistic are not
-tried where that is so many times `max_error`.
-"""
+HOPELESS = 1.5
+"""Maps of one logistic are not tried where their usual error is so many times `max_error`."""
 
 
 class Chooser(Trials):
@@ -187,7 +184,7 @@ class Chooser(Trials):
         return built if REGISTRY[settings.visibility].per_field else 2 * built
 
     def _hopeless(self, settings: Settings) -> bool:
-        return _one_logistic(settings) and ONE_LOGISTIC > HOPELESS * self._most
+        return estimate.one_logistic(settings) and estimate.usual_error(settings) > HOPELESS * self._most
 
     def _closely(self, settings: Settings) -> Look:
         march = settings.but(visibility="raymarch")
@@ -214,15 +211,11 @@ class Chooser(Trials):
     def _without(self, best: Trial, look: Look, omissions: dict, limit: float) -> tuple[Trial, Look]:
         """Like `best`, without what the picture hardly shows, by `limit`."""
         for name, of in omissions.items():
+            kept = [(best, look)]
             while (settings := of(look.composition.settings, look.composition)) is not None:
-                share = self.estimate.seconds(settings) / self.estimate.seconds(look.composition.settings)
-                anew = 0.0 if REGISTRY[settings.visibility].per_field else self.estimate.built(settings)
-                if (share > 1 - SAVING or not self._pays(best.seconds * (1 - share), LEFT_OUT + anew)
+                saved, anew = self._saved(settings, best, look)
+                if (saved < SAVING * best.seconds or not self._pays(saved, LEFT_OUT + anew)
                         or self._errors.get(settings, 0.0) > limit):
-                    break
-                if name in LIGHTS and (error := self._glints.error(settings, self._spp)) > limit:
-                    self._errors[settings] = error
-                    self._tried(settings, best.seconds * share, error, False, "kept: fewer lights would glint", name)
                     break
                 tried = self._closer(self._looked(settings), best.seconds)
                 good = self._error(tried) <= limit
@@ -233,7 +226,22 @@ class Chooser(Trials):
                 if not trial.taken:
                     break
                 best, look = trial, tried
+                kept.append((best, look))
+            if name in LIGHTS:
+                best, look = self._without_glints(kept, limit)
         return best, look
+
+    def _without_glints(self, kept: list[tuple[Trial, Look]], limit: float) -> tuple[Trial, Look]:
+        """The last of `kept`, each of fewer lights than the one before, that glints no more than `limit` allows."""
+        for best, look in reversed(kept[1:]):
+            settings = look.composition.settings
+            error = self._glints.error(settings, self._spp)
+            if error <= limit:
+                return best, look
+            self._errors[settings] = error
+            self.trials[self.trials.index(best)] = replace(
+                best, error=error, taken=False, why="kept: fewer lights would glint")
+        return kept[0]
 
     def _by_time(self) -> Choice:
         """The smallest error when the time is over: samples that a march cannot have may be worth a bias."""
@@ -249,7 +257,7 @@ class Chooser(Trials):
         for settings in sorted(both, key=self.estimate.built):
             left, taken = self._left(), self.estimate.built(settings) + LOOK
             samples = (left - taken) / max(self.estimate.each(settings), 1e-9)
-            hoped = math.hypot(_usual(settings), self._noise(samples))
+            hoped = math.hypot(estimate.usual_error(settings), self._noise(samples))
             late = best.each > left  # not even one sample of it fits: whatever is faster
             most = (RISKED if hoped < WORTH * least else SPARED) * left
             if self.estimate.each(settings) > best.each if late else hoped > least or taken > most:
@@ -290,11 +298,3 @@ class Chooser(Trials):
                 mi.LogLevel.Warn,
                 f"nrf integrator: time_budget is {self.limits.seconds:.3g} s, but one sample a pixel takes about "
                 f"{each:.3g} s by {settings.visibility}; that will be rendered")
-
-
-def _one_logistic(settings: Settings) -> bool:
-    return not REGISTRY[settings.visibility].per_field and settings.map_components == 1
-
-
-def _usual(settings: Settings) -> float:
-    return ONE_LOGISTIC if _one_logistic(settings) else USUAL

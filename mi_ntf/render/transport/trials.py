@@ -134,6 +134,15 @@ class Trials:
         """Seconds of a picture, what is built shared among the frames that it serves."""
         return look.built / self._served(look.composition.settings) + look.each * self._spp
 
+    def _saved(self, settings: Settings, best: Trial, look: Look) -> tuple[float, float]:
+        """Seconds that a picture by `settings` may take less than the `best`, and those of what is built anew for it:
+        what is built for a field is there."""
+        now = look.composition.settings
+        if REGISTRY[settings.visibility].per_field:
+            return self._spp * look.each * (1 - self.estimate.each(settings) / self.estimate.each(now)), 0.0
+        share = self.estimate.seconds(settings) / self.estimate.seconds(now)
+        return best.seconds * (1 - share), self.estimate.built(settings)
+
     def _served(self, settings: Settings) -> int:
         """Frames that share what is built."""
         return self.settings.frames if self.settings.still or REGISTRY[settings.visibility].per_field else 1
