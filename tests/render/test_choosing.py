@@ -1,5 +1,6 @@
 """What is chosen under limits of error and time."""
 
+import math
 from dataclasses import replace
 
 import mitsuba as mi
@@ -10,7 +11,7 @@ from helpers import scenes
 from mi_ntf.infer.visibility import REGISTRY
 from mi_ntf.render.cost import model
 from mi_ntf.render.scene.settings import Limits, Settings
-from mi_ntf.render.transport import choosing, estimate, glints, probing, trials
+from mi_ntf.render.transport import choosing, estimate, glints, omissions, probing, trials
 
 
 def nrf(**options) -> dict:
@@ -100,6 +101,23 @@ def test_glints_are_looked_for_in_sharp_lobes(tmp_path, trials_are_free, monkeyp
         settings.environment_lights, plain(self, settings, spp)))
     mi.render(loaded, seed=1)
     assert (max(found.values()) > 0.01) == looked and (min(found.values()) == 0) != looked
+
+
+def test_what_half_of_the_lights_would_err_by_is_foreseen():
+    """Errors of independent lights: a bias of 0.9 %, and 1 % · √(1024/n) of n lights; of one known nothing is."""
+    errors = [math.hypot(0.009, 0.01 * math.sqrt(1024 / n)) for n in (512, 256, 128)]
+    assert omissions.halved(errors[:2]) == pytest.approx(errors[2])
+    assert omissions.halved(errors[:1]) == 0.0
+
+
+def test_half_of_the_lights_is_not_tried_where_it_must_fail(blobs, trials_are_free, monkeypatch):
+    prices(monkeypatch, lambda s: s.environment_lights / 512)
+    monkeypatch.setattr(trials.Trials, "_error", lambda self, look, caution=0.0: {512: 0.0, 256: 0.1}.get(
+        look.composition.settings.environment_lights, 0.0))
+    loaded = scenes.scene(blobs, nrf(visibility="raymarch", max_error=0.15), {"light": scenes.light("env")}, size=32,
+                          spp=2)
+    mi.render(loaded, seed=1)  # 0.1·√3 > 0.15
+    assert [t["taken"] for t in loaded.integrator().achieved["trials"] if "half" in t["name"]] == [True]
 
 
 def test_lights_whose_lack_would_glint_are_kept(blobs, trials_are_free, monkeypatch):

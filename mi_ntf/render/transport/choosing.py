@@ -17,11 +17,11 @@ from . import estimate
 from .choice import Choice, Kept, Trial
 from .estimate import Estimate
 from .glints import Glints
-from .omissions import LIGHTS, OMISSIONS
+from .omissions import LIGHTS, OMISSIONS, halved
 from .probing import SAMPLES, Look, probed
 from .trials import RISKED, Trials
 
-LOOK, TRIAL, LEFT_OUT = 0.5, 0.2, 0.15
+LOOK, TRIAL, LEFT_OUT = 0.5, 0.2, 0.2
 """Seconds of all frames: what takes less is rendered by the march without a look at it; what another method must save
 to be tried, twice what that takes with kernels compiled; and what leaving something out must. Under a `time_budget`
 a trial counts as `LOOK`: it may compile."""
@@ -214,8 +214,8 @@ class Chooser(Trials):
             kept = [(best, look)]
             while (settings := of(look.composition.settings, look.composition)) is not None:
                 saved, anew = self._saved(settings, best, look)
-                if (saved < SAVING * best.seconds or not self._pays(saved, LEFT_OUT + anew)
-                        or self._errors.get(settings, 0.0) > limit):
+                foreseen = self._errors.get(settings, halved([t.error for t, _ in kept]) if name in LIGHTS else 0.0)
+                if saved < SAVING * best.seconds or not self._pays(saved, LEFT_OUT + anew) or foreseen > limit:
                     break
                 tried = self._closer(self._looked(settings), best.seconds)
                 good = self._error(tried) <= limit

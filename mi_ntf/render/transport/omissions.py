@@ -1,6 +1,7 @@
 """What a picture may do without, if it hardly shows: each in steps, from the next of which settings are returned, None
 where there is none."""
 
+import math
 from collections.abc import Callable
 
 from ..scene import effects
@@ -19,13 +20,11 @@ def _no_bounces(settings: Settings, composition: Composition) -> Settings | None
     return settings.but(max_depth=2) if composition.effects.bounces else None
 
 
-def _fewer_lights(share: float) -> "Omission":
-    """So many of them remain."""
-    def fewer(settings: Settings, composition: Composition) -> Settings | None:
-        most = max((d.shining for d in composition.lights.discrete), default=0)
-        return settings.but(environment_lights=int(share * most)) if most > FEWEST else None
-
-    return fewer
+def _half_of_the_lights(settings: Settings, composition: Composition) -> Settings | None:
+    """Not a quarter: what that saves is a sixth of the time, and by chance the probes may find it good (`knot`: 1.7 %
+    where it is 2.2 %)."""
+    most = max((d.shining for d in composition.lights.discrete), default=0)
+    return settings.but(environment_lights=most // 2) if most > FEWEST else None
 
 
 def _bright_lights(settings: Settings, composition: Composition) -> Settings | None:
@@ -52,10 +51,16 @@ def _no_lobes(settings: Settings, composition: Composition) -> Settings | None:
     return settings.but(specular=False) if composition.effects.specular else None
 
 
+def halved(errors: list[float]) -> float:
+    """The least error to expect of half the lights, after those of all, of half of them, and so on: what each step adds
+    to its square is twice what the one before added, where lights err independently of each other, more elsewhere
+    (environments: 2.8 to 4.5 times, `statue`, `knot`)."""
+    return math.sqrt(max(3 * errors[-1]**2 - 2 * errors[-2]**2, 0.0)) if len(errors) > 1 else 0.0
+
+
 Omission = Callable[[Settings, Composition], Settings | None]
 LIGHTS: dict[str, Omission] = {
-    "half of the environment's lights": _fewer_lights(1 / 2),
-    "a quarter of the environment's lights": _fewer_lights(3 / 4),
+    "half of the environment's lights": _half_of_the_lights,
     "dim lights": _bright_lights}
 OMISSIONS: dict[str, Omission] = {
     "further bounces": _no_bounces, "small fields": _no_small_field, **LIGHTS, "specular lobes": _no_lobes}
