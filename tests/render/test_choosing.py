@@ -148,7 +148,7 @@ def smoke(tmp_path, trials_are_free, monkeypatch):
     return chosen
 
 
-@pytest.mark.parametrize("frames, pixels", [(1, 204), (100, 816)])
+@pytest.mark.parametrize("frames, pixels", [(1, 204), (200, 816)])
 def test_probes_in_smoke_march_to_few_lights(smoke, monkeypatch, frames, pixels):
     """An atlas adds the others: the truth is off by 0.11 %, measured, and errors by 1 % of themselves; also where more
     pixels are looked at afterwards."""

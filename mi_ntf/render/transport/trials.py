@@ -14,7 +14,7 @@ MARGIN = 0.95
 """Of `max_error`, what the probes may show: what is taken is what they happen to find good."""
 RISKED = 0.4
 """Of what a trial may save, what it may take."""
-CHEAP = 0.02
+CHEAP = 0.01
 """Of the seconds of all frames, what more pixels may take in any case: of the lights that `statue` may do without under
 an environment, 500 pixels find too many."""
 CLOSER = 4
