@@ -20,7 +20,6 @@ from ...core import radiosity
 from ...infer import march
 from ...infer.grid import CELLS
 from ...infer.visibility import REGISTRY
-from ...infer.visibility.method import NOT_SKIPPED
 from .. import user_cache
 
 CACHE = "cost.json"
@@ -35,6 +34,8 @@ POINTS_A_HIT = 6.5
 fewer samples 0.6 of it at 96."""
 POINTS_IN_SMOKE = 33.0
 """The same in smoke (`cloud`)."""
+NOT_SKIPPED = 0.05
+"""Share of the samples across the diameter at which a camera ray's march asks the field."""
 
 
 _OWN = {"camera": 0.5, "reflect": 40.0, "shade": 2.0, "between": 1000.0, "density": 60.0}

@@ -42,8 +42,8 @@ class Estimate:
         return self.built(settings) + self.spp * self.each(settings)
 
     def built(self, settings: Settings) -> float:
-        """Of maps and atlases alone, which do not depend on the picture: smoke makes it 8 times as dear as the prices
-        tell, not them."""
+        """Of maps and atlases alone. They do not depend on the picture, so `dearer` says nothing of them: smoke makes
+        samples 8 times as dear as the prices tell."""
         prices = model.constants()
         return 1e-9 * sum(model.shared(work, prices) for work in self._works(settings))
 
