@@ -13,6 +13,7 @@ from mi_ntf.core import field_file
 from mi_ntf.infer import octahedral, texels
 from mi_ntf.infer.lights import LightTable
 from mi_ntf.infer.visibility import outside, raymarch, transmittance_atlas
+from mi_ntf.infer.visibility.marched_suns import MarchedSuns
 from mi_ntf.infer.visibility.method import Options
 from mi_ntf.render.maps import building
 
@@ -207,3 +208,17 @@ def test_filled_by_the_network(statue):
     assert abs(tau(learned, x, d).mean() - tau(march, x, d).mean()) < 0.02
     remembered = building.build("neural_transmittance", medium, None, Options(2 / 384))
     np.testing.assert_array_equal(tau(remembered, x, d), tau(learned, x, d))
+
+
+def test_suns_are_marched(statue):
+    """Lights that outshine the others, and no others; what no light shines on asks neither."""
+    medium, atlas = statue
+    march = building.build("raymarch", medium, None, Options(2 / 384))
+    both = MarchedSuns(atlas, march, np.array([False, True, False]), mi)
+    x, d = skin(medium, 3000, 11), unit(3000, 12)
+    d = d[:, : x.shape[1]]
+    for light, method in ((0, atlas), (1, march), (2, atlas)):
+        here = lanes(x), lanes(d), mi.Float(np.inf), mi.UInt32(light)
+        lit = mi.Bool(np.arange(x.shape[1]) % 3 > 0)
+        found, expected = (np.where(np.array(lit), np.array(m.tau(*here, lit)), 0) for m in (both, method))
+        np.testing.assert_array_equal(found, expected)

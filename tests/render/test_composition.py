@@ -7,6 +7,9 @@ from helpers import fields, scenes, ztest
 
 from mi_ntf.core import field_file, microfacet, ops
 from mi_ntf.core.architecture import Similarity
+from mi_ntf.evaluate import dial
+from mi_ntf.render.lights import scene_lights
+from mi_ntf.render.scene.media import find_media
 
 SEEDS = 4
 TURN = [-1.7, -0.75, 1.4]  # clear of the large sphere: where spheres overlap, volpath loses a medium
@@ -207,3 +210,32 @@ def test_a_bound_that_is_a_surface_is_refused(blobs, bsdf):
     with pytest.raises(Exception) as caught:
         scenes.render(loaded)
     assert "medium is no surface" in str(caught.value.__cause__ or caught.value)
+
+
+def test_a_sun_among_many_lights_is_marched_to(monkeypatch):
+    """Under a sky whose sun is most of its light, a picture by the atlas is the march's: 0.2 % off, without that 3 %,
+    all of it around the sun's shadow. A sun that dim lights are left out beside is one still."""
+    loaded = dial.scene("statue", "sky", 48, 4)
+
+    def picture(visibility):
+        return dial.picture(loaded, dial.integrator(visibility=visibility, environment_lights=128))[0]
+
+    truth = picture("raymarch")
+    assert dial.relative(picture("transmittance_atlas"), truth) < 0.004
+    light = scene_lights.Lights(loaded, find_media(loaded), dimmest=0.1)
+    assert light.suns().sum() == 1 and len(light.suns()) == len(light.rows.power) < 400  # of 470
+    assert light.rows.power[light.suns()].sum() > 0.5 * light.rows.power.sum()
+    monkeypatch.setattr(scene_lights.Lights, "suns", lambda self: np.zeros(1, bool))
+    assert dial.relative(picture("transmittance_atlas"), truth) > 0.015
+
+
+@pytest.mark.parametrize(("count", "bright", "expected"), [(64, 1, 1), (64, 6, 4), (15, 1, 0), (64, 0, 0)])
+def test_suns_are_few_of_many(count, bright, expected):
+    """Those that bring a tenth of all light each, the brightest where more than one in sixteen does."""
+    lights = {f"light_{i}": {"type": "directional", "direction": [0.0, np.sin(i), np.cos(i)],
+                             "irradiance": 50.0 + i if i < bright else 0.2} for i in range(count)}
+    found = scene_lights.Lights(mi.load_dict({"type": "scene", **lights})).suns()
+    assert found.sum() == expected and len(found) == count
+    if expected:
+        power = scene_lights.Lights(mi.load_dict({"type": "scene", **lights})).rows.power[:, 0]
+        assert power[found].min() >= np.sort(power)[-expected]

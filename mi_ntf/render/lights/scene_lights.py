@@ -12,6 +12,10 @@ from ..scene.frame import Frame
 from . import light_checks, light_gradients, light_rows
 from .emitter_samples import EmitterSamples
 
+SUN, AMONG = 0.1, 16
+"""Share of all light from which on a light is a sun; lights for each sun at least: a march costs as much as five to
+seven lookups in an atlas."""
+
 
 @dataclass(frozen=True)
 class Discrete:
@@ -71,6 +75,7 @@ class Lights:
         dark = light_gradients.attached([e for e, _ in discrete])
         every = light_rows.join([d.rows for d in self.discrete], dark)
         self._strength = every.strength([m.frame.origin for m in media])
+        self._dimmest = dimmest
         self.rows = every.part(self._bright(dimmest)) if dimmest else every
         pairs = [(e, w) for e, w in zip(emitters, outer, strict=True) if light_samples or not is_discrete(e)]
         self.sampled = [e for e, _ in pairs if _shines(e)]
@@ -82,6 +87,15 @@ class Lights:
         sums = np.empty(len(order))
         sums[order] = np.cumsum(self._strength[order])
         return sums > dimmest * self._strength.sum()
+
+    def suns(self) -> np.ndarray:
+        """(n,) which few of many rows bring a large share of all light each."""
+        strength = self._strength[self._bright(self._dimmest)] if self._dimmest else self._strength
+        most = len(strength) // AMONG
+        brightest = np.argsort(-strength, kind="stable")[:most]
+        found = np.zeros(len(strength), bool)
+        found[brightest] = strength[brightest] > SUN * strength.sum()
+        return found
 
     def brighter(self, dimmest: float) -> int:
         """How many rows there are without the dimmest."""

@@ -12,6 +12,7 @@ from ...core.errors import MiNtfError
 from ...infer import march, shade
 from ...infer.bundle import Strand
 from ...infer.visibility import REGISTRY
+from ...infer.visibility.marched_suns import MarchedSuns
 from ..cost import measurement
 from ..lights import scene_lights
 from ..maps import building
@@ -130,8 +131,15 @@ class Composition:
         method = found.visibility if table.count else drawn  # maps of no light are no maps
         mapped = building.build(method, medium, table, options)
         if drawn == method:
-            return Part(medium, whole, table, mapped, mapped)
+            return Part(medium, whole, table, self._with_suns(mapped, medium, table, options), mapped)
         return Part(medium, whole, table, mapped, building.build(drawn, medium, table, options))
+
+    def _with_suns(self, looked_up, medium, table, options):
+        """What `table` is served by, where a field's lookups, which blur, serve many lights and few outshine them."""
+        suns = self.lights.suns()
+        if not suns.any() or table.moving or not REGISTRY[self.effects.visibility].per_field:
+            return looked_up
+        return MarchedSuns(looked_up, building.build("raymarch", medium, table, options), suns, mi)
 
     def draw_from(self, stream) -> None:
         """Methods whose lookups draw numbers take them from `stream`, an opaque seed: one for each seed of the user's
