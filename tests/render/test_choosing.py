@@ -243,7 +243,7 @@ def test_chance_is_asked_again_where_much_is_at_stake(blobs, trials_are_free, mo
     looked at anyway."""
     counts = []
 
-    def error(self, found, truth, spp, caution=0.5):
+    def error(self, found, truth, spp, caution=0.5, off=None):
         counts.append(self.count)
         return 0.0 if found is truth else 0.08 + 0.04 * caution * (counts[0] / self.count) ** 3
 

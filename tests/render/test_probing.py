@@ -129,3 +129,24 @@ def test_more_of_something_small(everywhere, shown):
     of_groups = few.reshape(-1, probing.GROUP).any(1)
     hits = [of_groups[part._index].sum() for part in (some, *some.more())]
     assert hits == [probing.LEAST // probing.GROUP] * 2 + [2 * probing.LEAST // probing.GROUP]
+
+
+@pytest.mark.parametrize("share", [0.5, 1.0])
+def test_few_that_are_marched_tell_what_the_truth_errs_by(rng, everywhere, shown, share):
+    """√mean (a + l)², a known of a third of the probes and l of all: both by themselves are half as large, where they
+    are alike (`share` 1) their squares add up to four times, where they are of each pixel's own to twice that."""
+    few = everywhere.some(shown, 2048).first(1 / 3)
+    others, both = few.more(3)
+    assert few.count == pytest.approx(both.count / 3, rel=0.03) and others.count + few.count == both.count
+    shape = (both.count, 1, 1)
+    common, own_of_truth, own = (0.05 * rng.normal(size=shape) for _ in range(3))
+    a, off = (np.sqrt(share) * common + np.sqrt(1 - share) * each for each in (own_of_truth, own))
+    truth = np.ones((both.count, probing.SAMPLES, 3))
+    lights = SimpleNamespace(lights=SimpleNamespace(sampled=[]))
+    base, found = (probing.Look(lights, truth * (1 + by), shown.seen, 0.0, 0.0) for by in (a, a + off))
+    expected = 0.05 * np.sqrt(2 + 2 * share)
+    error = both.error(found, base, 4, 0.0, probing.Off(few, (truth * a)[: few.count]))
+    power = np.sqrt(float(both.weight @ (1 + a.ravel()) ** 2))
+    assert error * power == pytest.approx(expected * np.sqrt(both.weight.sum()), rel=0.12)  # 2/√(few groups)
+    assert both.error(base, base, 4, 0.0, probing.Off(few, (truth * a)[: few.count])) * power == pytest.approx(
+        0.05, rel=0.12)

@@ -110,12 +110,9 @@ class Chooser(Trials):
             return Choice(self._composed(first), self.trials, {"seconds": best.seconds, "error": best.error})
         plain = self._plain(self.settings)
         march = plain.but(visibility="raymarch")
-        self._marched(march, all_lights=named and not REGISTRY[plain.visibility].per_field)
-        if named:
-            look = self._looked_at(plain)
-            best = self._judged(look, True, "named")
-        else:
-            best, look = self._for_all_lights(plain)
+        self._marched(march, whole=named and not REGISTRY[plain.visibility].per_field)
+        best, look = self._as_named(plain) if named else self._for_all_lights(plain)
+        look = self._all_probes(look)
         if plain != self.settings:
             best, look = self._with_bounces(best, look)
         if not self._whole:
@@ -147,6 +144,9 @@ class Chooser(Trials):
         self.truth = replace(self.truth, radiance=self.truth.radiance + whole.radiance - look.radiance)
         return best, whole
 
+    def _as_named(self, plain: Settings) -> tuple[Trial, Look]:
+        return self._judged(look := self._looked_at(plain), True, "named"), look
+
     def _for_all_lights(self, plain: Settings) -> tuple[Trial, Look]:
         """The cheapest that keeps to the error, of what no light needs for itself: fewer lights may do for any method,
         are looked for afterwards, and want fewer maps."""
@@ -166,9 +166,10 @@ class Chooser(Trials):
         `more`: seconds of what is not looked at."""
         found = [(self.estimate.seconds(s) + more(s), s) for s in candidates]
         for seconds, candidate in sorted(found, key=lambda pair: pair[0]):
-            if self._hopeless(candidate) or not self._pays(best.seconds - seconds, TRIAL + self._in_vain(candidate)):
-                self._tried(candidate, seconds, why="usually off by more than max_error allows"
-                            if self._hopeless(candidate) else "saves less than a trial takes")
+            hopeless = self._hopeless(candidate)
+            if hopeless or not self._pays(best.seconds - seconds, TRIAL + self._in_vain(candidate)):
+                self._tried(candidate, seconds, why="usually off by more than max_error allows" if hopeless else
+                            "saves less than a trial takes")
                 continue
             tried = looked(candidate)
             good = self._error(tried) <= self._most

@@ -4,6 +4,7 @@ import copy
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -47,6 +48,13 @@ class Look:
                        seen=np.concatenate([self.seen, other.seen]), each=self.each + share * (other.each - self.each))
 
 
+class Off(NamedTuple):
+    """What a truth errs `by` (pixels, samples, 3) at the `probes` that the march has seen, the first of all."""
+
+    probes: "Probes"
+    by: np.ndarray
+
+
 def probed(pixels: int) -> float:
     """The share of so many pixels that is rendered beforehand."""
     return min(max(SHARE * pixels, LEAST), MOST, pixels) / pixels
@@ -61,7 +69,7 @@ class Probes:
     """
 
     _ranking: Ranking
-    _times: int
+    _times: float
 
     def __init__(self, sensor, media: list, pixels: int):
         width, height = (int(n) for n in sensor.film().crop_size())
@@ -96,9 +104,14 @@ class Probes:
         ranking = Ranking(weight, seen, light, small, pixels // GROUP, LEAST // GROUP)
         return self._of(ranking, 1, *ranking.first(1))
 
-    def more(self) -> tuple["Probes", "Probes"]:
-        """Of what these are some of: others, about as many, and all of them, these first."""
-        times = 2 * self._times
+    def first(self, share: float) -> "Probes":
+        """Those of them that tell most, about a `share`."""
+        times = share * self._times
+        return self._whole._of(self._ranking, times, *self._ranking.first(times))
+
+    def more(self, factor: float = 2) -> tuple["Probes", "Probes"]:
+        """Of what these are some of: others, so that all are about `factor` times as many, and all, these first."""
+        times = factor * self._times
         index, chance = self._ranking.first(times)
         chances = np.zeros(self._whole.count // GROUP)
         chances[index] = chance
@@ -107,7 +120,7 @@ class Probes:
         new, all_ = (self._whole._of(self._ranking, times, groups, chances[groups]) for groups in (others, both))
         return new, all_
 
-    def _of(self, ranking: Ranking, times: int, index: np.ndarray, chance: np.ndarray) -> "Probes":
+    def _of(self, ranking: Ranking, times: float, index: np.ndarray, chance: np.ndarray) -> "Probes":
         """Those of these groups, which had these chances to be among the first so many `times`."""
         part = copy.copy(self)
         part._whole, part._ranking, part._times, part._index = self, ranking, times, index
@@ -144,25 +157,38 @@ class Probes:
         shape = self.count, SAMPLES
         return composition, np.array(total).T.reshape(*shape, 3), np.array(seen).reshape(shape).any(1)
 
-    def error(self, found: Look, truth: Look, spp: float, caution: float = CAUTION) -> float:
+    def error(self, found: Look, truth: Look, spp: float, caution: float = CAUTION, off: Off | None = None) -> float:
         """Relative RMSE of a picture of `spp` samples, with `caution` standard errors for so few pixels; 0 for a black
         truth. Both are seen along the same rays. Two halves of the samples share a bias, not their noise, which their
-        product leaves out: more samples make that smaller, and where lights are drawn it is not a method's own."""
-        off, half = found.radiance - truth.radiance, SAMPLES // 2
-        both, one, other = off.mean(1), off[:, :half].mean(1), off[:, half:].mean(1)
+        product leaves out: more samples make that smaller, and where lights are drawn it is not a method's own. `off`:
+        what the truth errs by itself, as far as the first probes tell."""
         share = 0.0 if truth.composition.lights.sampled else SAMPLES / spp
-        squares = (one * other + share * (both * both - one * other)).mean(1)
-        mean = float(self.weight @ squares)
-        groups = (self.weight * squares).reshape(-1, GROUP).sum(1)  # neighbours are alike
-        spread = math.sqrt(float((1 - self.chance) @ (groups - groups.mean()) ** 2))
+        off_by = found.radiance - truth.radiance
+        mean, variance = self._sum(_squares(off_by, share))
+        if off is not None:
+            few = off_by[:off.probes.count]
+            more, spread = off.probes._sum(_squares(few + off.by, share) - _squares(few, share))
+            mean, variance = mean + more, variance + spread
         power = float(self.weight @ (truth.radiance.mean(1) ** 2).mean(1))
-        return math.sqrt(max(mean + caution * spread, 0.0) / power) if power > 0 else 0.0
+        return math.sqrt(max(mean + caution * math.sqrt(variance), 0.0) / power) if power > 0 else 0.0
+
+    def _sum(self, squares: np.ndarray) -> tuple[float, float]:
+        """Of the picture, of what each probe has, (probes,), and its variance: neighbours are alike."""
+        groups = (self.weight * squares).reshape(-1, GROUP).sum(1)
+        return float(groups.sum()), float((1 - self.chance) @ (groups - groups.mean()) ** 2)
 
     def noise(self, look: Look) -> float:
         """Relative RMS error of a picture of one sample a pixel, whose filter takes the mean of several."""
         power = float(self.weight @ (look.radiance.mean(1) ** 2).mean(1))
         variance = float(self.weight @ look.radiance.var(1, ddof=1).mean(1))
         return float(np.sqrt(variance / power / self._sharpness)) if power > 0 else 0.0
+
+
+def _squares(off: np.ndarray, share: float) -> np.ndarray:
+    """(probes,) mean squares of (probes, samples, 3): what all samples have in common, and a `share` of what not."""
+    half = SAMPLES // 2
+    both, one, other = off.mean(1), off[:, :half].mean(1), off[:, half:].mean(1)
+    return (one * other + share * (both * both - one * other)).mean(1)
 
 
 def _pixels_of(rfilter) -> float:

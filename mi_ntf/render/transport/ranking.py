@@ -30,7 +30,7 @@ class Ranking:
         self._seen = _Priority(np.where(small & seen, np.inf, seen * weight * (light + FAINT * (mean or 1.0))))
         self._other = _Priority(~seen * weight)
 
-    def first(self, times: int) -> tuple[np.ndarray, np.ndarray]:
+    def first(self, times: float) -> tuple[np.ndarray, np.ndarray]:
         """So many times the groups that are looked at first: ``(index, chance)``, their chances to be among them. Those
         of fewer times are among those of more."""
         seen = self._seen.first(self._small + round(times * self._count[0]))

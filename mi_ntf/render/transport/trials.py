@@ -8,7 +8,7 @@ from ..scene.settings import Limits, Settings
 from .choice import Trial
 from .composition import Composition
 from .estimate import Estimate
-from .probing import CAUTION, Look, Probes, probed
+from .probing import CAUTION, Look, Off, Probes, probed
 
 MARGIN = 0.95
 """Of `max_error`, what the probes may show: what is taken is what they happen to find good."""
@@ -30,6 +30,9 @@ CROWDED = 0.25
 FEWER = 2
 """Times fewer probes are in smoke, where each has more points. With a fourth they would be too few to tell what half of
 the lights save."""
+TOLD = 2
+"""Times fewer of them are marched to where a method that serves all lights is cheap: what that errs by is the smaller
+part of the error of fewer lights, and all of the probes tell the larger one by that method."""
 MARCHED = 128
 """Lights of an environment that the probes march to in smoke, where a method that costs little adds what all change:
 512 took a third of the time of a picture of `cloud`. Skins need all: what an atlas errs by is each light's own there,
@@ -59,6 +62,7 @@ class Trials:
         self._most = MARGIN * limits.error
         self._errors: dict[Settings, float] = {}
         self._others: tuple[Composition, Composition] | None = None  # their difference: the lights that truth lacks
+        self._off: Off | None = None
         self.known = True
 
     def _composed(self, settings: Settings) -> Composition:
@@ -74,7 +78,7 @@ class Trials:
         nothing, or where it is chance that refuses what would save much."""
         frames, price = self.settings.frames, self._price(look)
         while self.known and 2 * self.probes.count <= CROWDED * self._everywhere.count:
-            seconds = self.probes.samples * (self.truth.each + look.each)
+            seconds = (TOLD if self._few else 1) * self.probes.samples * (self.truth.each + look.each)
             chance = self._error(look, -CAUTION) <= self._most < self._error(look)
             if seconds > frames * max(CHEAP * price, RISKED * (dearer - price) if chance else 0.0):
                 break
@@ -113,22 +117,38 @@ class Trials:
         drawn = march.light_samples or lights.sampled or self.estimate.effects.bounces
         return march.but(environment_lights=MARCHED) if smoke and many and not drawn else march
 
-    def _marched(self, march: Settings, all_lights: bool = True) -> None:
-        """The probes by the march, which also tell how far off the prices are; `all_lights`: whatever that takes."""
+    def _marched(self, march: Settings, whole: bool = True) -> None:
+        """The probes by the march, which also tell how far off the prices are; `whole`: all of them, with all lights,
+        whatever that takes."""
         pixels = math.prod(self._size)
         short = self.estimate.seconds(march) * self.settings.frames < SHORT
         self._everywhere = Probes(self.sensor, self.estimate.media, EVERYWHERE // 2 if short else EVERYWHERE)
         self._shown = self._everywhere.look(lambda: self._composed(march.but(
             visibility="none", max_depth=2, hide_emitters=True,
             environment_lights=min(FEW, march.environment_lights))))
-        fewer = FEWER if self._shown.composition.smoke else 1
-        self.probes = self._everywhere.some(self._shown, round(probed(pixels) * pixels / fewer))
-        march = march if all_lights else self._fewer_lights(march)
+        smoke = self._shown.composition.smoke
+        self.probes = self._everywhere.some(self._shown, round(probed(pixels) * pixels / (FEWER if smoke else 1)))
+        few = self.probes.first(1 / TOLD)
+        self._few = not whole and not smoke and few.count < self.probes.count
+        self.probes = few if self._few else self.probes
+        march = march if whole else self._fewer_lights(march)
         self.truth = self._looked(march)
-        if self.truth.each * self.probes.samples < BRIEF:
+        if self.truth.each * self.probes.samples < BRIEF / (TOLD if self._few else 1):
             self.probes = self._everywhere.some(self._shown, CLOSER * self.probes.count)
             self.truth = replace(self.probes.look(lambda: self.truth.composition), built=self.truth.built)
         self.estimate.dearer = self._price(self.truth) / max(self.estimate.seconds(march), 1e-9)
+
+    def _all_probes(self, look: Look) -> Look:
+        """`look` through all of the probes, of which the march has seen few: as the truth, from then on, with what it
+        was off by there."""
+        if not self._few:
+            return look
+        more, both = self.probes.more(TOLD)
+        if look is not self.truth:
+            self._off = Off(self.probes, look.radiance - self.truth.radiance)
+        self.truth = look.and_more(more.look(lambda: look.composition), more.samples / both.samples)
+        self.probes, self._few = both, False
+        return self.truth
 
     def _price(self, look: Look) -> float:
         """Seconds of a picture, what is built shared among the frames that it serves."""
@@ -148,7 +168,7 @@ class Trials:
         return self.settings.frames if self.settings.still or REGISTRY[settings.visibility].per_field else 1
 
     def _error(self, look: Look, caution: float = CAUTION) -> float:
-        return self.probes.error(look, self.truth, self._spp, caution)
+        return self.probes.error(look, self.truth, self._spp, caution, self._off)
 
     def _judged(self, look: Look, taken: bool, why: str, what: str = "") -> Trial:
         error = self._error(look)
