@@ -17,7 +17,8 @@ def reflect(points, lights, visibility, specular=True, gradients=False, skin=Tru
     ω_o) of method.md, section 1.
 
     points      :class:`Points`
-    lights      has ``count`` and ``sample(index, x, active) → (wi, irradiance, distance)``
+    lights      has ``count`` and ``sample(index, x, active) → (wi, irradiance, distance)``, and the number that
+                `visibility` knows the light by, where that is not its index
     visibility  has ``tau`` (:mod:`mi_ntf.infer.visibility`); None: no shadow. The light then does not pass the skin
                 either, so a point reflects as a surface does, ρ ⟨n,ω_i⟩⁺
     specular    whether the field has a specular lobe; without, all its albedo is diffuse
@@ -33,9 +34,10 @@ def reflect(points, lights, visibility, specular=True, gradients=False, skin=Tru
     moving = getattr(lights, "moving", False)
 
     def body(i, r, g, b):
-        wi, irradiance, distance = lights.sample(i, points.x, True)
+        wi, irradiance, distance, *known = lights.sample(i, points.x, True)
+        number = known[0] if known else i
         lit, diffuse, gloss = _lobes(wi, points, skin and bool(visibility), specular)
-        tau = _tau(visibility, points.x, wi, distance, i, lit, gradients and not moving) if visibility else 1
+        tau = _tau(visibility, points.x, wi, distance, number, lit, gradients and not moving) if visibility else 1
         if moving and visibility:
             tau = tau * _edge(wi, points.normal)
         value = [k * diffuse + gloss for k in points.albedo] if specular else [k * diffuse for k in points.albedo]

@@ -115,6 +115,28 @@ def test_resampled_lights_are_unbiased_and_quieter(kinds, rng):
     assert spread[8] < 0.6 * spread[1] and spread[8] < spread[2] < spread[1]
 
 
+@pytest.mark.parametrize("candidates", [1, 4])
+def test_drawn_suns_are_told(candidates, rng):
+    """Directions on the disc of the sun are, no others; nor those of a sky without one; a directional light beside it
+    is, on its own it is not."""
+    plain, lamp = (mi.load_dict(emitter(kind)) for kind in ("envmap", "directional"))
+    sky = mi.load_dict({**emitter("sunsky"), "sky_scale": 1.0, "sun_aperture": 0.5358})
+    n, index, axis = 4096, dr.zeros(mi.UInt32, 4096), np.array([0.6, 0.5, 0.7]) / np.sqrt(1.1)
+    at = points(1, n, rng)
+
+    def told(emitters):
+        wi, _, _, sun = drawn(emitters, at, 1, candidates).sample(index, at.x, mi.Bool(True))
+        return np.array(wi), np.broadcast_to(np.array(sun), n) > 0
+
+    wi, sun = told([sky])
+    np.testing.assert_array_equal(sun, np.degrees(np.arccos(np.minimum(axis @ wi, 1))) < 0.27)
+    assert 0.2 < sun.mean() < 0.99
+    assert not told([plain])[1].any() and not told([lamp])[1].any()
+    wi, sun = told([plain, lamp])
+    way = np.array(drawn([lamp], at, 1, 1).sample(index, at.x, mi.Bool(True))[0])[:, :1]
+    np.testing.assert_array_equal(sun, np.abs(wi - way).max(0) < 1e-6)
+
+
 @pytest.mark.parametrize(("where", "far"), [((0, 0, 1.5), True), ((0, 0, 1.2), False), ((0, 0, 0.5), False)])
 def test_lamps_outside_of_a_field_are_known(where, far, rng):
     """A ball of radius 0.3 outside of the unit sphere, across it and inside: alone and beside an environment."""

@@ -6,6 +6,8 @@ import pytest
 from helpers import scenes, ztest
 
 from mi_ntf.core.errors import MiNtfError
+from mi_ntf.infer.visibility import transmittance_atlas
+from mi_ntf.render.lights import emitter_samples
 
 SEEDS = 4
 
@@ -125,6 +127,24 @@ def test_maps_of_one_light(blobs, kind, visibility, tolerance):
     size = np.sqrt((bare**2).mean())
     assert np.sqrt(((bare - march) ** 2).mean()) > 0.5 * size  # a shadow there is
     assert np.sqrt(((mapped - march) ** 2).mean()) < tolerance * size
+
+
+def test_the_shadow_of_a_sun_is_sharp_where_skies_are_looked_up(blobs, monkeypatch):
+    """An atlas of few directions, by the same samples as the march: 0.5 % off, without the march to the sun 6 %."""
+    monkeypatch.setitem(ABOVE, "sunsky", {**ABOVE["sunsky"], "sun_scale": 1.0})
+    monkeypatch.setattr(transmittance_atlas, "SIDE", 16)
+    monkeypatch.setattr(transmittance_atlas, "RESOLUTION", 32)
+
+    def picture(visibility):
+        loaded = floor_scene({"type": "direct"}, light("sunsky", blobs, visibility), {"type": "diffuse"}, 24)
+        return scenes.render(loaded, 0, 64)[..., :3]
+
+    march = picture("raymarch")
+    error = [np.sqrt(((picture("transmittance_atlas") - march) ** 2).mean() / (march**2).mean())]
+    monkeypatch.setattr(emitter_samples, "SHARP", np.inf)
+    error += [np.sqrt(((picture("transmittance_atlas") - march) ** 2).mean() / (march**2).mean())]
+    print("error of the floor with and without the march to the sun:", error)
+    assert error[0] < 0.01 and error[1] > 0.03
 
 
 @pytest.mark.parametrize(("kind", "visibility", "text"), [

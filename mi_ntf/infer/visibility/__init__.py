@@ -3,8 +3,9 @@
     tau(x, wi, distance, index, active) → τ in [0, 1]
 
 `x` shading point and `wi` unit vector towards the light (3-tuples, field coordinates); `distance` to the light, field
-units, infinite for directional lights; `index` the light's row in the table. `active` masks lanes whose result is
-unused. Construction does the work that depends on the lights alone.
+units, infinite for directional lights; `index` the light's row in the table, of one drawn at random 1 if it is a sun
+(:data:`mi_ntf.infer.visibility.marched_suns.DRAWN`), else 0. `active` masks lanes whose result is unused. Construction
+does the work that depends on the lights alone.
 """
 
 from . import (

@@ -5,6 +5,9 @@ from types import ModuleType
 import drjit as dr
 import numpy as np
 
+DRAWN = np.array([False, True])
+"""`suns` of lights drawn at random, which are known by the number 1 where they are one, else by 0."""
+
 
 class MarchedSuns:
     """A visibility method: `march` for those lights of a table that are `suns` (n,) bool, `looked_up` for the others.

@@ -23,6 +23,17 @@ NARROW = 0.25
 """Emitters whose radius is less than this times their distance light a point from about one side: resampling gains
 nothing (`statue`, `skull`: the variance of 1 to 6 candidates is the same to 0.5 %), and every candidate costs."""
 
+SHARP, CERTAIN = 1000.0, 0.1
+"""Density of a drawn direction, 1/sr, from which on its light is a sun, whose shadow lookups would blur: a disc of half
+a degree that has a tenth of all draws has 1500, a lamp of 10° that has all of them 42. Of a light of one direction or
+place beside others, its chance."""
+
+
+def sharp(ds, chance=1.0):
+    """Whether a direction sample of Mitsuba's, of an emitter that had this chance, is of such a light."""
+    density = ds.pdf * chance
+    return dr.select(ds.delta, density > CERTAIN, density > SHARP)
+
 
 class EmitterSamples:
     """Random lights with the interface of :class:`mi_ntf.infer.lights.LightTable`: any emitter, unbiased, noisy.
@@ -38,6 +49,7 @@ class EmitterSamples:
     gradients whether emitters or points are attached: what is kept of the candidates is then drawn once more
 
     far       whether all emitters lie outside of the field's sphere
+    alone     whether there is one emitter, of one place or direction, which every method is asked about as it is
 
     A light of a wide emitter is the one that resampling keeps of a few draws, with chances in proportion to the light
     that each would scatter to the viewer, were nothing in the way (Talbot et al. 2005): of the many that could, the few
@@ -58,6 +70,8 @@ class EmitterSamples:
             for _ in range(1 if mi.has_flag(e.flags(), mi.EmitterFlags.DeltaPosition) else max(SAMPLES, least))
         ]
         most = max(n for _, n in rows)
+        self.alone = len(emitters) == 1 and mi.has_flag(emitters[0].flags(), mi.EmitterFlags.Delta)
+        self._chance = mi.Float(weights) * (1 / max(sum(weights), 1e-30))
         self.count, self.far = len(rows), all(_outside(e, frame) for e in emitters)
         of_emitter = [sum(row[0] == i for row in rows) for i in range(len(emitters))]
         self._emitter, self._candidates, self._share = (
@@ -74,28 +88,28 @@ class EmitterSamples:
         dr.eval(self._lane, self._shift)
 
     def sample(self, index, x, active):
-        """As LightTable.sample; irradiance: the estimate's."""
+        """As LightTable.sample, and 1 for what is :func:`sharp`, else 0; irradiance: the estimate's."""
         it = dr.zeros(mi.Interaction3f, dr.width(x[0]))
         it.p = self.frame.point_to_world(x)
         kept, weight = mi.UInt32(0), dr.gather(mi.Float, self._share, index, active)
         if not self._single:
             with dr.suspend_grad():
-                kept, d, irradiance, distance, weight = self._resample(index, it, active)
+                kept, d, irradiance, distance, sun, weight = self._resample(index, it, active)
         if self._gradients or self._single:
-            ds, irradiance = self._draw(index, kept, it, active)
+            ds, irradiance, sun = self._draw(index, kept, it, active)
             d, distance = ds.d, ds.dist
         irradiance = irradiance * weight
-        return self.frame.direction_to_field(d), tuple(irradiance), distance / self.frame.length
+        return self.frame.direction_to_field(d), tuple(irradiance), distance / self.frame.length, mi.UInt32(sun)
 
     def _resample(self, index, it, active):
-        """The candidate kept for light `index`: its number, direction, irradiance over its density and distance; and
-        the weight of its irradiance in the estimate."""
+        """The candidate kept for light `index`: its number, direction, irradiance over its density, distance and
+        whether it is sharp; and the weight of its irradiance in the estimate."""
         candidates = dr.gather(mi.UInt32, self._candidates, index, active)
         share = dr.gather(mi.Float, self._share, index, active)
         p, fraction = self.points, dr.rcp(3 * mi.Float(candidates))
 
         def body(k, kept, of_kept, total):
-            ds, irradiance = self._draw(index, k, it, active)
+            ds, irradiance, sun = self._draw(index, k, it, active)
             value, _ = scatter.evaluate(self.frame.direction_to_field(ds.d), p.wo, p.reflectance)
             # Light may be negative. Scaled, so that the sum of the brightest that floats hold is still one.
             shows = dr.abs(sum(fraction * e * v for e, v in zip(irradiance, value, strict=True)))
@@ -104,13 +118,14 @@ class EmitterSamples:
             total = total + target
             u = mi.sample_tea_float32(self._lane ^ self._seed, index * self._most + k)
             keep = u * total < target
-            this = k, mi.Vector3f(ds.d), mi.Color3f(irradiance), mi.Float(ds.dist)
+            this = k, mi.Vector3f(ds.d), mi.Color3f(irradiance), mi.Float(ds.dist), sun
             kept = tuple(dr.select(keep, new, old) for new, old in zip(this, kept, strict=True))
             return k + 1, kept, dr.select(keep, target, of_kept), total
 
         n = dr.width(it.p)
         zero: Any = dr.zeros(mi.UInt32, n)
-        none = mi.UInt32(zero), dr.zeros(mi.Vector3f, n), dr.zeros(mi.Color3f, n), dr.ones(mi.Float, n)
+        none = (mi.UInt32(zero), dr.zeros(mi.Vector3f, n), dr.zeros(mi.Color3f, n), dr.ones(mi.Float, n),
+                dr.zeros(mi.Bool, n))
         _, kept, of_kept, total = dr.while_loop(
             state=(zero, none, dr.zeros(mi.Float, n), dr.zeros(mi.Float, n)),
             cond=lambda k, kept, of_kept, total: active & (k < candidates),
@@ -120,11 +135,11 @@ class EmitterSamples:
         return *kept, dr.select(of_kept > 0, share * total / (of_kept * candidates), 0)
 
     def _draw(self, index, k, it, active):
-        """Candidate `k` of light `index`: Mitsuba's sample, and its irradiance over its density."""
+        """Candidate `k` of light `index`: Mitsuba's sample, its irradiance over its density, whether it is sharp."""
         n = index * self._most + k
         # Evenly spread over a point's candidates, each uniform by itself: 24 bits of a float's mantissa.
         u = [mi.Float((shift + n * stride) >> 8) * 2**-24 for shift, stride in zip(self._shift, STRIDE, strict=True)]
-        emitter, weight = self._emitters, 1
+        emitter, weight, chosen = self._emitters, 1, mi.UInt32(0)
         if isinstance(emitter, mi.EmitterPtr):
             chosen = dr.gather(mi.UInt32, self._emitter, index, active)
             if self._choice is not None:
@@ -133,7 +148,8 @@ class EmitterSamples:
             emitter = dr.gather(mi.EmitterPtr, emitter, chosen, active)
         ds, irradiance = emitter.sample_direction(it, mi.Point2f(*u), active)
         ds.d = dr.normalize(ds.d)  # an environment's has the length of its to_world
-        return ds, dr.select(ds.pdf > 0, irradiance * weight, 0)
+        sun = mi.Bool(False) if self.alone else sharp(ds, dr.gather(mi.Float, self._chance, chosen, active))
+        return ds, dr.select(ds.pdf > 0, irradiance * weight, 0), sun
 
 
 def _outside(emitter, frame: Frame) -> bool:

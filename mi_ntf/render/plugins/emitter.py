@@ -5,8 +5,10 @@ import mitsuba as mi
 
 from ...core.errors import MiNtfError
 from ...infer.visibility import REGISTRY, names, outside
+from ...infer.visibility.marched_suns import DRAWN, MarchedSuns
 from ...infer.visibility.method import Options
 from ..lights import environment, light_checks, light_rows, scene_lights
+from ..lights.emitter_samples import sharp
 from ..maps.building import build
 from . import properties
 
@@ -81,7 +83,11 @@ def emitter_class() -> type:
                         "many places; choose raymarch or transmittance_atlas"
                     )
                 table = scene_lights.rows([(self.inner, kind)], 1).table(self.medium.frame)
-            self._method = build(method, self.medium, table, Options(STEP, cache=True))
+            options = Options(STEP, cache=True)
+            self._method = build(method, self.medium, table, options)
+            if REGISTRY[method].per_field and not one:
+                march = build("raymarch", self.medium, table, options)
+                self._method = MarchedSuns(self._method, march, DRAWN, mi)
 
         def sample_direction(self, it, sample, active=True):
             inner = self.attached()
@@ -96,16 +102,18 @@ def emitter_class() -> type:
             ds.emitter = mi.EmitterPtr(self)
             if self.bare:
                 return ds, weight
+            sun = sharp(ds)
             ds.delta = dr.ones(mi.Bool, dr.width(ds.pdf))
-            return ds, weight * self._tau(it, ds, active & (ds.pdf > 0))
+            return ds, weight * self._tau(it, ds, sun, active & (ds.pdf > 0))
 
-        def _tau(self, it, ds, active):
+        def _tau(self, it, ds, sun, active):
             if self._method is None:
                 return mi.Float(1)
             frame = self.medium.frame
             distance = mi.Float(dr.inf) if _is_far(self.inner) else ds.dist / frame.length
             x, d = frame.point_to_field(it.p), frame.direction_to_field(ds.d)
-            return outside.tau(self._method, x, d, distance, mi.UInt32(0), active)
+            number = sun if isinstance(self._method, MarchedSuns) else False  # of a map's one light
+            return outside.tau(self._method, x, d, distance, mi.UInt32(number), active)
 
         def attached(self):
             """The nested light; one with a surface shines from the shape that this emitter belongs to."""

@@ -12,7 +12,7 @@ from ...core.errors import MiNtfError
 from ...infer import march, shade
 from ...infer.bundle import Strand
 from ...infer.visibility import REGISTRY
-from ...infer.visibility.marched_suns import MarchedSuns
+from ...infer.visibility.marched_suns import DRAWN, MarchedSuns
 from ..cost import measurement
 from ..lights import scene_lights
 from ..maps import building
@@ -130,31 +130,31 @@ class Composition:
             drawn = "raymarch"
         method = found.visibility if table.count else drawn  # maps of no light are no maps
         mapped = building.build(method, medium, table, options)
-        if drawn == method:
-            return Part(medium, whole, table, self._with_suns(mapped, medium, table, options), mapped)
-        return Part(medium, whole, table, mapped, building.build(drawn, medium, table, options))
-
-    def _with_suns(self, looked_up, medium, table, options):
-        """What `table` is served by, where a field's lookups, which blur, serve many lights and few outshine them."""
+        if drawn != method:
+            return Part(medium, whole, table, mapped, building.build(drawn, medium, table, options))
+        if not REGISTRY[method].per_field:
+            return Part(medium, whole, table, mapped, mapped)
+        march = building.build("raymarch", medium, table, options)
         suns = self.lights.suns()
-        if not suns.any() or table.moving or not REGISTRY[self.effects.visibility].per_field:
-            return looked_up
-        return MarchedSuns(looked_up, building.build("raymarch", medium, table, options), suns, mi)
+        of_table = MarchedSuns(mapped, march, suns, mi) if suns.any() else mapped
+        return Part(medium, whole, table, of_table, MarchedSuns(mapped, march, DRAWN, mi))
 
     def draw_from(self, stream) -> None:
         """Methods whose lookups draw numbers take them from `stream`, an opaque seed: one for each seed of the user's
         and chunk of pixels."""
         for part in self.parts:
             for method in (part.mapped, part.drawn):
-                if hasattr(method, "stream"):
-                    method.stream = stream
+                looked_up = getattr(method, "looked_up", method)
+                if hasattr(looked_up, "stream"):
+                    looked_up.stream = stream
 
-    def transmittance(self, p, d, distance, active):
-        """What the fields let through from scene point `p` along `d`, as far as `distance`."""
+    def transmittance(self, p, d, distance, active, sun=False):
+        """What the fields let through from scene point `p` along `d`, as far as `distance`; `sun`: of a light that is
+        :func:`mi_ntf.render.lights.emitter_samples.sharp`."""
         tau = mi.Float(1)
         for part in self.parts:
             if part.drawn:
-                tau = tau * between(part.frame, part.drawn, p, d, distance, mi.UInt32(0), active)
+                tau = tau * between(part.frame, part.drawn, p, d, distance, mi.UInt32(sun), active)
         return tau
 
     def strands(self, ray, parts, steps=None):

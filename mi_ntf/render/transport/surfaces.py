@@ -4,6 +4,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..lights import environment
+from ..lights.emitter_samples import sharp
 
 
 class Surfaces:
@@ -11,7 +12,7 @@ class Surfaces:
 
     shapes         those shapes
     hide_emitters  whether shapes that shine are left out of what the camera sees
-    transmittance  callable ``(p, d, distance, active)``: what the fields let through, scene coordinates
+    transmittance  callable ``(p, d, distance, active, sun=False)``: what the fields let through, scene coordinates
 
     Direct light as stock ``path`` estimates it: emitter and BSDF sampling, weighted by the power heuristic (Veach
     1997), each dimmed by the fields on its way.
@@ -50,7 +51,7 @@ class Surfaces:
         value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active)
         active = active & ((dr.max(value) > 0) & ~self._all.ray_test(si.spawn_ray_to(ds.p), active))
         value = value * weight * dr.select(ds.delta, 1, _power(ds.pdf, pdf))
-        return dr.select(active, value * self.transmittance(si.p, ds.d, ds.dist, active), 0)
+        return dr.select(active, value * self.transmittance(si.p, ds.d, ds.dist, active, sharp(ds)), 0)
 
     def scatter(self, si, rng, active):
         """``(ray, weight, pdf)`` of a BSDF sample; pdf is −1 for specular reflection and refraction."""
