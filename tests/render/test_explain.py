@@ -1,6 +1,7 @@
 """`mi-ntf explain`: what is said is what is done."""
 
 import json
+import re
 from pathlib import Path
 
 import mitsuba as mi
@@ -48,6 +49,20 @@ def test_what_is_held_for_a_field():
     assert one["memory_bytes"]["maps or volumes"] == many["memory_bytes"]["maps or volumes"] == 2 * 36**2 * 51**2 * 8
     assert one["seconds"]["maps or volumes"] == many["seconds"]["maps or volumes"] > 0
     assert not many["effects"]["transmittance maps"]["on"]
+
+
+def test_a_sun_that_is_marched_to(tmp_path):
+    """A sky's, beside which an atlas is looked up; named methods of other kinds have none."""
+    sky = '<emitter type="sunsky"><vector name="sun_direction" x="0.4" y="0.5" z="0.7"/></emitter>'
+    text = re.sub(r'<include filename="light_\$light.xml"/>', sky, SCENE.read_text())
+    assert sky in text
+    for name in ("field.safetensors", "sensor.xml"):
+        text = text.replace(name, str(SCENE.parent / name))
+    (tmp_path / "scene.xml").write_text(text)
+    why = {v: explain(tmp_path / "scene.xml", {"visibility": v, "res": "16"})["effects"]["visibility"]["why"]
+           for v in ("transmittance_atlas", "raymarch")}
+    assert why["transmittance_atlas"].endswith("; marched to 1 that outshine the others")
+    assert why["raymarch"] == "raymarch: chosen by name"
 
 
 def test_auto_chooses_by_the_number_of_shading_points():

@@ -60,7 +60,7 @@ def explain(scene: Path, parameters: dict[str, str], measure: bool = False) -> d
         "lights": {"emitters": list(found.emitters), "count": count, "drawn": drawn},
         "environments": [_environment(each) for each in light.discrete if each.cells],
         "visibility": found.visibility,
-        "effects": _effects(loaded, found, settings, count),
+        "effects": _effects(loaded, found, settings, count, light.suns().sum()),
         "constants": "measured on this machine" if model.measured() else "built in; --measure measures this machine's",
         "points": sum(w.points for w in work),
         "seconds": _sum(model.seconds(w, model.constants()) for w in work),
@@ -113,13 +113,15 @@ def _sum(stages) -> dict:
     return total
 
 
-def _effects(scene, found, integrator, count: int) -> dict:
+def _effects(scene, found, integrator, count: int, suns: int) -> dict:
     """Each effect: whether it takes part, and the reason."""
+    marched = f"; marched to {suns} that outshine the others" if suns and REGISTRY[found.visibility].per_field else ""
     use_map = found.needs_visibility and bool(REGISTRY[found.visibility].drawn)
     others = len(ordinary_shapes(scene))
     unlit = "no emitter has power" if found.emitters else "there is no emitter"
     answers = {
-        "visibility": (found.needs_visibility and found.visibility != "none", f"{found.visibility}: {found.reason}"),
+        "visibility": (found.needs_visibility and found.visibility != "none",
+                       f"{found.visibility}: {found.reason}{marched}"),
         "every light at every point": (found.exhaustive, f"light_samples is {integrator.light_samples}"),
         "transmittance maps": (
             use_map,

@@ -1,5 +1,6 @@
 """Camera rays through a composition: radiance and opacity."""
 
+import itertools
 from dataclasses import replace
 from typing import Any
 
@@ -113,33 +114,42 @@ class _CameraLight:
 
     def _bounces(self, transmittance):
         """Adds the light of surfaces that the camera sees, and of paths of more than one bounce."""
-        ray, hit, surfaces = self.ray, self.hit, self.scene.surfaces
-        n = dr.width(ray.o)
+        surfaces, n = self.scene.surfaces, dr.width(self.ray.o)
         walk = Walk(self.scene, self.scene.settings.max_depth, self.total, self.stream)
-        # Neighbouring sequences of one start are alike.
-        start, sequence = mi.sample_tea_32(self.stream, dr.arange(mi.UInt32, n))
-        rng = mi.PCG32(n, mi.UInt64(start), mi.UInt64(sequence))
-        camera = Paths(mi.Ray3f(ray), mi.Color3f(transmittance), dr.arange(mi.UInt32, n), mi.Float(-1), rng)
-        if surfaces:
-            si = hit.compute_surface_interaction(mi.Ray3f(ray))
-            if surfaces.shining:
-                walk.add(camera, si.emitter(self.scene.scene).eval(si, hit.is_valid()))
-        reflected = walk.on_surface(camera, si) if surfaces and self.effects.lit else None
-        if not self.effects.bounces and not (surfaces and surfaces.lights_can_be_hit):
-            return
+        everyone = dr.arange(mi.UInt32, n)
+        camera = Paths(mi.Ray3f(self.ray), mi.Color3f(transmittance), everyone, mi.Float(-1), self._random(everyone))
         # A camera ray goes on from matter, from the surface behind it, or from both.
-        onward = camera.take(dr.arange(mi.UInt32, 2 * n) % n)
-        onward = replace(onward, weight=dr.zeros(mi.Color3f, 2 * n))
-        if reflected:
-            onward.put(reflected, dr.arange(mi.UInt32, n))
+        onward = []
+        met: Any = dr.compress(self.hit.is_valid()) if surfaces else ()
+        if surfaces and dr.width(met):
+            onward += self._surface_paths(walk, camera, met)
         if self.effects.bounces and self.scene.in_view:
-            for index, paths in self._field_paths(walk, camera):
-                onward.put(paths, index + n)
-        walk.run(onward.take(dr.compress(dr.max(onward.weight) > 0)))
+            onward += self._field_paths(walk, camera)
+        if not onward or not (self.effects.bounces or (surfaces and surfaces.lights_can_be_hit)):
+            return
+        ends = list(itertools.accumulate(dr.width(paths.pixel) for paths in onward))
+        whole = camera.take(dr.zeros(mi.UInt32, ends[-1]))
+        for paths, end in zip(onward, ends, strict=True):
+            count = dr.width(paths.pixel)
+            whole.put(paths, dr.arange(mi.UInt32, count) + (end - count))
+        walk.run(whole.take(dr.compress(dr.max(whole.weight) > 0)))
+
+    def _random(self, sequence):
+        """A stream for each; those of one seed and other sequences begin elsewhere, or neighbours would be alike."""
+        start, sequence = mi.sample_tea_32(self.stream, sequence)
+        return mi.PCG32(dr.width(sequence), mi.UInt64(start), mi.UInt64(sequence))
+
+    def _surface_paths(self, walk: Walk, camera: Paths, met) -> list[Paths]:
+        """What goes on from the surfaces that the camera rays `met` meet, whose light is added: nothing without any."""
+        paths = replace(camera.take(met), rng=self._random(met + dr.width(camera.pixel)))
+        hit = dr.gather(type(self.hit), self.hit, met)
+        si = hit.compute_surface_interaction(mi.Ray3f(paths.ray))
+        if self.scene.surfaces and self.scene.surfaces.shining:
+            walk.add(paths, si.emitter(self.scene.scene).eval(si))
+        return [walk.on_surface(paths, si)] if self.effects.lit else []
 
     def _field_paths(self, walk: Walk, camera: Paths):
-        """Pairs of indices of camera rays and paths that their matter scatters on: from one of a ray's shading points,
-        drawn by their weights."""
+        """What matter scatters on of camera rays: from one of a ray's shading points, drawn by their weights."""
         samples, unit = self.met
         t, strand, weight = samples.draw(camera.rng.next_float32())
         t = (samples.bundle.base + t) * unit
@@ -148,4 +158,4 @@ class _CameraLight:
         for i, part in enumerate(self.scene.in_view):
             index: Any = dr.compress((weight > 0) & (strand == i))
             if dr.width(index):
-                yield index, walk.in_field(part, camera.take(index), dr.gather(mi.Float, t, index), 2)
+                yield walk.in_field(part, camera.take(index), dr.gather(mi.Float, t, index), 2)

@@ -125,7 +125,8 @@ class Probes:
         part = copy.copy(self)
         part._whole, part._ranking, part._times, part._index = self, ranking, times, index
         part.chance, part.count = chance, len(index) * GROUP
-        part._like_picture = ranking.share / max(float(ranking.seen[index].mean()), 1e-9) or 1.0
+        hits = float(ranking.seen[index].sum()) / max(len(index), 1)
+        part._like_picture = ranking.share / max(hits, 1e-9) or 1.0
         part.weight = (self.weight.reshape(-1, GROUP)[index] / chance[:, None]).ravel()
         rays = mi.UInt32((index[:, None] * GROUP * SAMPLES + np.arange(GROUP * SAMPLES)).ravel())
         part._ray = dr.gather(mi.Ray3f, self._ray, rays)

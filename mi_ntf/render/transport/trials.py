@@ -8,7 +8,7 @@ from ..scene.settings import Limits, Settings
 from .choice import Trial
 from .composition import Composition
 from .estimate import Estimate
-from .probing import CAUTION, Look, Off, Probes, probed
+from .probing import CAUTION, LEAST, Look, Off, Probes, probed
 
 MARGIN = 0.95
 """Of `max_error`, what the probes may show: what is taken is what they happen to find good."""
@@ -128,9 +128,9 @@ class Trials:
             environment_lights=min(FEW, march.environment_lights))))
         smoke = self._shown.composition.smoke
         self.probes = self._everywhere.some(self._shown, round(probed(pixels) * pixels / (FEWER if smoke else 1)))
-        few = self.probes.first(1 / TOLD)
-        self._few = not whole and not smoke and few.count < self.probes.count
-        self.probes = few if self._few else self.probes
+        self._few = not whole and not smoke and self.probes.count >= LEAST
+        if self._few:
+            self.probes = self.probes.first(1 / TOLD)
         march = march if whole else self._fewer_lights(march)
         self.truth = self._looked(march)
         if self.truth.each * self.probes.samples < BRIEF / (TOLD if self._few else 1):
@@ -146,8 +146,9 @@ class Trials:
         more, both = self.probes.more(TOLD)
         if look is not self.truth:
             self._off = Off(self.probes, look.radiance - self.truth.radiance)
-        self.truth = look.and_more(more.look(lambda: look.composition), more.samples / both.samples)
-        self.probes, self._few = both, False
+        if more.count:  # small pictures have no others
+            look = look.and_more(more.look(lambda: look.composition), more.samples / both.samples)
+        self.truth, self.probes, self._few = look, both, False
         return self.truth
 
     def _price(self, look: Look) -> float:
