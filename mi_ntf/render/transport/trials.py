@@ -3,6 +3,8 @@
 import math
 from dataclasses import replace
 
+import numpy as np
+
 from ...infer.visibility import REGISTRY
 from ..scene.settings import Limits, Settings
 from .choice import Trial
@@ -53,6 +55,7 @@ class Trials:
     estimate: Estimate
     probes: Probes
     truth: Look
+    _march: Look
 
     def __init__(self, scene, settings: Settings, limits: Limits, sensor, spp: int, patches):
         self.scene, self.settings, self.limits, self.sensor, self.patches = scene, settings, limits, sensor, patches
@@ -63,6 +66,7 @@ class Trials:
         self._errors: dict[Settings, float] = {}
         self._others: tuple[Composition, Composition] | None = None  # their difference: the lights that truth lacks
         self._off: Off | None = None
+        self._rest: tuple[Probes, Probes] | None = None  # that the march has not seen, and all of them
         self.known = True
 
     def _composed(self, settings: Settings) -> Composition:
@@ -77,13 +81,24 @@ class Trials:
         """`look`, in place of what takes `dearer` seconds; through more pixels, from then on, where that costs next to
         nothing, or where it is chance that refuses what would save much."""
         frames, price = self.settings.frames, self._price(look)
-        while self.known and 2 * self.probes.count <= CROWDED * self._everywhere.count:
-            seconds = (TOLD if self._few else 1) * self.probes.samples * (self.truth.each + look.each)
+        while self.known:
             chance = self._error(look, -CAUTION) <= self._most < self._error(look)
-            if seconds > frames * max(CHEAP * price, RISKED * (dearer - price) if chance else 0.0):
+            worth = frames * max(CHEAP * price, RISKED * (dearer - price) if chance else 0.0)
+            if chance and self._rest and self._rest[0].samples * self._march.each <= worth:
+                self._march_rest(*self._rest)
+                continue
+            seconds = (TOLD if self._few else 1) * self.probes.samples * (self.truth.each + look.each)
+            if seconds > worth or 2 * self.probes.count > CROWDED * self._everywhere.count:
                 break
             look = self._through_more(look)
         return look
+
+    def _march_rest(self, rest: Probes, both: Probes) -> None:
+        """What the truth is off by at the `rest` of the probes as well."""
+        assert self._off is not None
+        march = rest.look(lambda: self._march.composition)
+        off = self.truth.radiance[self._off.probes.count:both.count] - march.radiance
+        self._off, self._rest = Off(both, np.concatenate([self._off.by, off])), None
 
     def _through_more(self, look: Look) -> Look:
         """`look` through twice as many pixels, as the truth is from then on."""
@@ -145,7 +160,8 @@ class Trials:
             return look
         more, both = self.probes.more(TOLD)
         if look is not self.truth:
-            self._off = Off(self.probes, look.radiance - self.truth.radiance)
+            self._off, self._march = Off(self.probes, look.radiance - self.truth.radiance), self.truth
+            self._rest = (more, both) if more.count else None
         if more.count:  # small pictures have no others
             look = look.and_more(more.look(lambda: look.composition), more.samples / both.samples)
         self.truth, self.probes, self._few = look, both, False
