@@ -67,7 +67,7 @@ class _CameraLight:
         wanted = found.lit or bool(sums and sums.needs_points)
         samples = self.seen.samples(wanted, found.collocated, lambda: march.camera_samples(
             strands, maxt, self.offset, self.depth, shade=wanted, view=found.collocated,
-            shares=tuple(march.share(part.medium.field.softness.opaque) for part in self.scene.in_view)))
+            shares=tuple(march.share(p.medium.field.softness.opaque, self.scene.rough) for p in self.scene.in_view)))
         self.met = samples, unit
         light = [dr.zeros(mi.Float, dr.width(samples.t)) for _ in range(3)]
         for i, part in enumerate(self.scene.in_view):

@@ -50,7 +50,8 @@ class Part:
 
 class Composition:
     """The scene prepared for one render. What it lacks is not built (:mod:`mi_ntf.render.scene.effects`). `patches`:
-    of an earlier render of the same fields, None unless they are needed."""
+    of an earlier render of the same fields, None unless they are needed. `smoke`: the camera sees what has no opaque
+    skin; `rough`: fewer points of that are shaded, for much noise in little time."""
 
     def __init__(self, scene, settings: Settings, sensor, spp: int, patches: Patches | None = None):
         self.scene, self.settings, self.sensor, self.patches = scene, settings, sensor, patches
@@ -60,7 +61,7 @@ class Composition:
         self.effects = effects.describe(scene, settings, sensor, spp, media, self.lights)
         self._media = [m for m in media if m.field.grid.majorant > 0]
         self._seen = [m for m, visible in zip(media, self.effects.in_view, strict=True) if visible]
-        self.smoke = not all(m.field.softness.opaque for m in self._seen)
+        self.smoke, self.rough = not all(m.field.softness.opaque for m in self._seen), False
         self.runs, self.run = self._runs(), -1  # none yet
         self.own = self._own()
         self.select(self.own[0] if self.own else 0)

@@ -45,13 +45,14 @@ def render(integrator, scene, sensor, seed, spp: int, develop: bool):
     film.prepare(picture.names if picture else [])
     halves = _Halves(film, len(picture.names) if picture else 0)
     samples = counted.first(camera.spp, len(composition.runs))
+    composition.rough = composition.smoke and samples == 1 and integrator.limits.noise >= passes.ROUGH and not picture
     while samples:
         if samples != camera.spp:
             camera = Camera(sensor, samples)
         block = halves.block()
         whole = _trace(integrator, composition, Reconstruction(block, camera), picture and picture.seen_by(camera),
                        _seed(seed, counted.passes), counted)  # fmt: skip
-        if whole or not counted.passes or len(composition.runs) == 1:
+        if whole or not counted.passes or (counted.count and len(composition.runs) == 1):
             halves.add(block, camera.spp, picture)
         if not whole:
             break
@@ -59,6 +60,8 @@ def render(integrator, scene, sensor, seed, spp: int, develop: bool):
             halves.wait()
         counted.done(camera.spp, halves.noise() if integrator.limits.noise > 0 else math.nan)
         samples = counted.next() if integrator.limits.of_samples else 0
+        if samples and composition.rough and counted.noise > integrator.limits.noise:
+            composition.rough, halves, samples = False, _Halves(film, 0), counted.again()
     integrator.achieved = _achieved(integrator.limits, choice, counted)
     if not develop:
         return mi.TensorXf()
@@ -90,8 +93,7 @@ class _Halves:
             self._blocks.append(block)
         if picture:
             picture.write_to(self._blocks[0], [self._weight(b) for b in self._blocks])
-        if sum(self._samples) > samples:
-            self._film.clear()
+        self._film.clear()
         for each in self._blocks:
             self._film.put_block(each)
 
