@@ -1,5 +1,6 @@
 """The ``ntf`` emitter: what it dims, what it must not add, and that no field shadows twice."""
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -7,7 +8,7 @@ from helpers import scenes, ztest
 
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.infer.visibility import transmittance_atlas
-from mi_ntf.render.lights import emitter_samples
+from mi_ntf.render.plugins import emitter
 
 SEEDS = 4
 
@@ -141,10 +142,32 @@ def test_the_shadow_of_a_sun_is_sharp_where_skies_are_looked_up(blobs, monkeypat
 
     march = picture("raymarch")
     error = [np.sqrt(((picture("transmittance_atlas") - march) ** 2).mean() / (march**2).mean())]
-    monkeypatch.setattr(emitter_samples, "SHARP", np.inf)
+    monkeypatch.setattr(emitter, "SHARP", np.inf)
     error += [np.sqrt(((picture("transmittance_atlas") - march) ** 2).mean() / (march**2).mean())]
     print("error of the floor with and without the march to the sun:", error)
     assert error[0] < 0.01 and error[1] > 0.03
+
+
+@pytest.mark.parametrize("kind", ["sunsky", "constant", "area"])
+def test_a_direction_is_worth_what_it_was_drawn_with(blobs, monkeypatch, kind):
+    """What integrators with derivatives ask for once more, by the same march or lookup."""
+    monkeypatch.setattr(transmittance_atlas, "SIDE", 8)
+    monkeypatch.setattr(transmittance_atlas, "RESOLUTION", 16)
+    monkeypatch.setitem(ABOVE, "sunsky", {**ABOVE["sunsky"], "sun_scale": 1.0})
+    n, u = 1024, np.random.default_rng(0).random((4, 1024)).astype(np.float32)
+    it = dr.zeros(mi.Interaction3f, n)
+    it.p = mi.Point3f(mi.Float(4 * u[0] - 2), -2, mi.Float(4 * u[1] - 2))
+    found = []
+    for lights in (light(kind, blobs, "transmittance_atlas"), light(kind)):
+        loaded = mi.load_dict({"type": "scene", **lights})
+        ds, drawn = loaded.sample_emitter_direction(it, mi.Point2f(u[2], u[3]), False, True)
+        again = loaded.emitters()[0].eval_direction(it, ds, ds.pdf > 0)
+        found.append([np.broadcast_to(np.array(v)[:1], (1, n)) for v in (drawn, again)])
+    # Beside the bare light: Mitsuba takes a few that it drew at the rim of a sun's disc for sky.
+    bare = np.array(found[1])
+    tau = np.where(bare > 0, np.array(found[0]) / np.where(bare > 0, bare, 1), 0)[:, (bare > 0).all(0)]
+    assert tau.size > n and 0.01 < tau.mean() < 0.99
+    np.testing.assert_allclose(tau[1], tau[0], rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize(("kind", "visibility", "text"), [

@@ -26,13 +26,13 @@ nothing (`statue`, `skull`: the variance of 1 to 6 candidates is the same to 0.5
 SHARP, CERTAIN = 1000.0, 0.1
 """Density of a drawn direction, 1/sr, from which on its light is a sun, whose shadow lookups would blur: a disc of half
 a degree that has a tenth of all draws has 1500, a lamp of 10° that has all of them 42. Of a light of one direction or
-place beside others, its chance."""
+place, its chance, unless it is alone: methods are asked about one light as they are."""
 
 
 def sharp(ds, chance=1.0):
     """Whether a direction sample of Mitsuba's, of an emitter that had this chance, is of such a light."""
     density = ds.pdf * chance
-    return dr.select(ds.delta, density > CERTAIN, density > SHARP)
+    return dr.select(ds.delta, (density > CERTAIN) & (density < 0.999), density > SHARP)
 
 
 class EmitterSamples:
@@ -49,7 +49,6 @@ class EmitterSamples:
     gradients whether emitters or points are attached: what is kept of the candidates is then drawn once more
 
     far       whether all emitters lie outside of the field's sphere
-    alone     whether there is one emitter, of one place or direction, which every method is asked about as it is
 
     A light of a wide emitter is the one that resampling keeps of a few draws, with chances in proportion to the light
     that each would scatter to the viewer, were nothing in the way (Talbot et al. 2005): of the many that could, the few
@@ -70,7 +69,6 @@ class EmitterSamples:
             for _ in range(1 if mi.has_flag(e.flags(), mi.EmitterFlags.DeltaPosition) else max(SAMPLES, least))
         ]
         most = max(n for _, n in rows)
-        self.alone = len(emitters) == 1 and mi.has_flag(emitters[0].flags(), mi.EmitterFlags.Delta)
         self._chance = mi.Float(weights) * (1 / max(sum(weights), 1e-30))
         self.count, self.far = len(rows), all(_outside(e, frame) for e in emitters)
         of_emitter = [sum(row[0] == i for row in rows) for i in range(len(emitters))]
@@ -148,7 +146,7 @@ class EmitterSamples:
             emitter = dr.gather(mi.EmitterPtr, emitter, chosen, active)
         ds, irradiance = emitter.sample_direction(it, mi.Point2f(*u), active)
         ds.d = dr.normalize(ds.d)  # an environment's has the length of its to_world
-        sun = mi.Bool(False) if self.alone else sharp(ds, dr.gather(mi.Float, self._chance, chosen, active))
+        sun = sharp(ds, dr.gather(mi.Float, self._chance, chosen, active))
         return ds, dr.select(ds.pdf > 0, irradiance * weight, 0), sun
 
 

@@ -8,6 +8,7 @@ import mitsuba as mi
 from ...core.errors import MiNtfError
 from ...infer.texels import DTYPES
 from ...infer.visibility import REGISTRY
+from ...infer.visibility.marched_suns import MarchedSuns
 from ...infer.visibility.method import Options
 from . import map_cache, map_file
 
@@ -73,3 +74,8 @@ def build(method: str, medium, table, options: Options):
                                 DTYPES[own.half])
 
     return REGISTRY[method].build(medium, table, options, mi, keep)
+
+
+def with_suns(looked_up, suns, medium, table, options: Options) -> MarchedSuns:
+    """`looked_up`, what :func:`build` made, with a march to those lights that are `suns`."""
+    return MarchedSuns(looked_up, build("raymarch", medium, table, options), suns, mi)

@@ -5,11 +5,11 @@ import mitsuba as mi
 
 from ...core.errors import MiNtfError
 from ...infer.visibility import REGISTRY, names, outside
-from ...infer.visibility.marched_suns import DRAWN, MarchedSuns
+from ...infer.visibility.marched_suns import DRAWN
 from ...infer.visibility.method import Options
 from ..lights import environment, light_checks, light_rows, scene_lights
-from ..lights.emitter_samples import sharp
-from ..maps.building import build
+from ..lights.emitter_samples import SHARP
+from ..maps import building
 from . import properties
 
 STEP = 2 / 384
@@ -71,23 +71,7 @@ def emitter_class() -> type:
         def _prepare(self):
             light_checks.check(self.inner, scene_lights.kind(self.inner), drawn=True)
             environment.check_unscaled(self.inner)
-            one, table = _is_one(self.inner), None
-            # The shadow of one light is sharp: its own map sees it better, and is made in a moment.
-            auto = "transmittance_map" if one else "transmittance_atlas"
-            method = auto if self.visibility == "auto" else self.visibility
-            if REGISTRY[method].drawn:
-                kind = scene_lights.kind(self.inner)
-                if not one:
-                    raise MiNtfError(
-                        f"ntf emitter: visibility is {method}, which is made for one light, but {kind} shines from "
-                        "many places; choose raymarch or transmittance_atlas"
-                    )
-                table = scene_lights.rows([(self.inner, kind)], 1).table(self.medium.frame)
-            options = Options(STEP, cache=True)
-            self._method = build(method, self.medium, table, options)
-            if REGISTRY[method].per_field and not one:
-                march = build("raymarch", self.medium, table, options)
-                self._method = MarchedSuns(self._method, march, DRAWN, mi)
+            self._method = _visibility(self.visibility, self.inner, self.medium)
 
         def sample_direction(self, it, sample, active=True):
             inner = self.attached()
@@ -102,18 +86,17 @@ def emitter_class() -> type:
             ds.emitter = mi.EmitterPtr(self)
             if self.bare:
                 return ds, weight
-            sun = sharp(ds)
             ds.delta = dr.ones(mi.Bool, dr.width(ds.pdf))
-            return ds, weight * self._tau(it, ds, sun, active & (ds.pdf > 0))
+            return ds, weight * self._tau(it, ds, active & (ds.pdf > 0))
 
-        def _tau(self, it, ds, sun, active):
+        def _tau(self, it, ds, active):
             if self._method is None:
                 return mi.Float(1)
             frame = self.medium.frame
             distance = mi.Float(dr.inf) if _is_far(self.inner) else ds.dist / frame.length
             x, d = frame.point_to_field(it.p), frame.direction_to_field(ds.d)
-            number = sun if isinstance(self._method, MarchedSuns) else False  # of a map's one light
-            return outside.tau(self._method, x, d, distance, mi.UInt32(number), active)
+            sun = ds.pdf > SHARP  # never that of one light, whose map has the number 0
+            return outside.tau(self._method, x, d, distance, mi.UInt32(sun), active)
 
         def attached(self):
             """The nested light; one with a surface shines from the shape that this emitter belongs to."""
@@ -150,6 +133,25 @@ def emitter_class() -> type:
             return f"NTFEmitter[\n  visibility = {self.visibility},\n  emitter = {self.inner}\n]"
 
     return NTFEmitter
+
+
+def _visibility(name: str, inner, medium):
+    """The method of this `name`, made for the light `inner` behind `medium`; None for ``none``."""
+    one, table = _is_one(inner), None
+    # The shadow of one light is sharp: its own map sees it better, and is made in a moment.
+    auto = "transmittance_map" if one else "transmittance_atlas"
+    method = auto if name == "auto" else name
+    if REGISTRY[method].drawn:
+        kind = scene_lights.kind(inner)
+        if not one:
+            raise MiNtfError(
+                f"ntf emitter: visibility is {method}, which is made for one light, but {kind} shines from many "
+                "places; choose raymarch or transmittance_atlas"
+            )
+        table = scene_lights.rows([(inner, kind)], 1).table(medium.frame)
+    options = Options(STEP, cache=True)
+    found = building.build(method, medium, table, options)
+    return building.with_suns(found, DRAWN, medium, table, options) if REGISTRY[method].per_field and not one else found
 
 
 def _is_one(inner) -> bool:

@@ -12,7 +12,7 @@ from ...core.errors import MiNtfError
 from ...infer import march, shade
 from ...infer.bundle import Strand
 from ...infer.visibility import REGISTRY
-from ...infer.visibility.marched_suns import DRAWN, MarchedSuns
+from ...infer.visibility.marched_suns import DRAWN
 from ..cost import measurement
 from ..lights import scene_lights
 from ..maps import building
@@ -135,10 +135,9 @@ class Composition:
             return Part(medium, whole, table, mapped, building.build(drawn, medium, table, options))
         if not REGISTRY[method].per_field:
             return Part(medium, whole, table, mapped, mapped)
-        march = building.build("raymarch", medium, table, options)
-        suns = self.lights.suns()
-        of_table = MarchedSuns(mapped, march, suns, mi) if suns.any() else mapped
-        return Part(medium, whole, table, of_table, MarchedSuns(mapped, march, DRAWN, mi))
+        suns, about = self.lights.suns(), (medium, table, options)
+        of_table = building.with_suns(mapped, suns, *about) if suns.any() else mapped
+        return Part(medium, whole, table, of_table, building.with_suns(mapped, DRAWN, *about))
 
     def draw_from(self, stream) -> None:
         """Methods whose lookups draw numbers take them from `stream`, an opaque seed: one for each seed of the user's

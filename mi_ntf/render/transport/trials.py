@@ -55,7 +55,6 @@ class Trials:
     estimate: Estimate
     probes: Probes
     truth: Look
-    _march: Look
 
     def __init__(self, scene, settings: Settings, limits: Limits, sensor, spp: int, patches):
         self.scene, self.settings, self.limits, self.sensor, self.patches = scene, settings, limits, sensor, patches
@@ -66,7 +65,7 @@ class Trials:
         self._errors: dict[Settings, float] = {}
         self._others: tuple[Composition, Composition] | None = None  # their difference: the lights that truth lacks
         self._off: Off | None = None
-        self._rest: tuple[Probes, Probes] | None = None  # that the march has not seen, and all of them
+        self._rest: tuple[Probes, Probes, Look] | None = None  # what the march has not seen, with what it has, its look
         self.known = True
 
     def _composed(self, settings: Settings) -> Composition:
@@ -84,7 +83,7 @@ class Trials:
         while self.known:
             chance = self._error(look, -CAUTION) <= self._most < self._error(look)
             worth = frames * max(CHEAP * price, RISKED * (dearer - price) if chance else 0.0)
-            if chance and self._rest and self._rest[0].samples * self._march.each <= worth:
+            if chance and self._rest and self._rest[0].samples * self._rest[2].each <= worth:
                 self._march_rest(*self._rest)
                 continue
             seconds = (TOLD if self._few else 1) * self.probes.samples * (self.truth.each + look.each)
@@ -93,10 +92,10 @@ class Trials:
             look = self._through_more(look)
         return look
 
-    def _march_rest(self, rest: Probes, both: Probes) -> None:
+    def _march_rest(self, rest: Probes, both: Probes, seen: Look) -> None:
         """What the truth is off by at the `rest` of the probes as well."""
         assert self._off is not None
-        march = rest.look(lambda: self._march.composition)
+        march = rest.look(lambda: seen.composition)
         off = self.truth.radiance[self._off.probes.count:both.count] - march.radiance
         self._off, self._rest = Off(both, np.concatenate([self._off.by, off])), None
 
@@ -160,8 +159,8 @@ class Trials:
             return look
         more, both = self.probes.more(TOLD)
         if look is not self.truth:
-            self._off, self._march = Off(self.probes, look.radiance - self.truth.radiance), self.truth
-            self._rest = (more, both) if more.count else None
+            self._off = Off(self.probes, look.radiance - self.truth.radiance)
+            self._rest = (more, both, self.truth) if more.count else None
         if more.count:  # small pictures have no others
             look = look.and_more(more.look(lambda: look.composition), more.samples / both.samples)
         self.truth, self.probes, self._few = look, both, False
