@@ -104,7 +104,8 @@ def test_some_pixels_tell_of_all(everywhere, shown):
         assert part.weight.sum() == pytest.approx(1, rel=rel)
         assert (light > 0).mean() == pytest.approx(0.25, rel=0.1)
         assert light[light > 0].mean() > 1.15 * shown.radiance[shown.seen].mean()
-        assert part.samples == pytest.approx(part.count * probing.SAMPLES / 256**2, rel=0.1)
+        assert part.samples == pytest.approx(
+            probing.SCATTERED * part.count * probing.SAMPLES / 256**2, rel=0.1)
 
 
 def test_rays_of_some_pixels_are_theirs(everywhere, shown):
@@ -124,7 +125,7 @@ def test_nothing_seen(everywhere, shown, bright):
 
 def test_more_of_something_small(everywhere, shown):
     """Of what takes a thirtieth of the picture, more pixels are looked at than its share, and then twice as many."""
-    few = shown.seen & (np.arange(everywhere.count) < everywhere.count // 8)
+    few = shown.seen & (np.arange(everywhere.count) // probing.GROUP % 8 == 0)
     some = everywhere.some(replace(shown, seen=few), 512)
     of_groups = few.reshape(-1, probing.GROUP).any(1)
     hits = [of_groups[part._index].sum() for part in (some, *some.more())]

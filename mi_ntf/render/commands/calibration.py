@@ -22,7 +22,9 @@ from ..maps import building
 from ..transport import bounced
 
 SAMPLES = 384
-WIDTH = 1 << 15
+WIDTH, RAYS = 1 << 15, 1 << 18
+"""Points that lights are looked up at; camera rays, as close together as a picture's: of a tenth as many each took
+twice as long, as those of one packet then wait for each other."""
 FEW = 4
 MANY = 256
 
@@ -30,11 +32,11 @@ MANY = 256
 def calibrate(medium) -> model.Constants:
     """Constants of this machine, by `medium`'s field; kept in the cache. Takes some seconds, compilation mostly."""
     grid, network = medium.field.grid, medium.field.network
-    points, many = seen_points(medium), _table(MANY)
+    points, close, many = seen_points(medium), seen_points(medium, RAYS), _table(MANY)
     skin = bounced.Skin(medium, np.random.default_rng(0))
     jobs = {
-        "camera": (lambda: _camera(grid).t, WIDTH * SAMPLES),
-        "reflect": (lambda: (grid.reflectance(points.x), medium.field.softness(points.x)), WIDTH),
+        "camera": (lambda: _camera(grid, RAYS).t, RAYS * SAMPLES * _covered(grid) / model.COVERAGE),
+        "reflect": (lambda: (grid.reflectance(close.x), medium.field.softness(close.x)), RAYS),
         "shade": (lambda: shade.reflect(points, many, None), WIDTH * MANY),
         "density": (lambda: network.density(points.x), WIDTH),
     }
@@ -104,11 +106,11 @@ def _timed(run: Callable[[], Any]) -> float:
     return time.perf_counter() - start
 
 
-def seen_points(medium) -> shade.Points:
-    """Where random camera rays meet the field, WIDTH points."""
-    grid = medium.field.grid
-    found = _camera(grid)
-    lane = dr.arange(mi.UInt32, WIDTH) % dr.opaque(mi.UInt32, max(dr.width(found.t), 1))
+def seen_points(medium, count: int | None = None) -> shade.Points:
+    """Where camera rays meet the field, `count` points, `WIDTH` unless told."""
+    grid, count = medium.field.grid, count or WIDTH
+    found = _camera(grid, count)
+    lane = dr.arange(mi.UInt32, count) % dr.opaque(mi.UInt32, max(dr.width(found.t), 1))
     ray, t = dr.gather(mi.UInt32, found.ray, lane), dr.gather(mi.Float, found.t, lane)
     x, along = found.place(0, ray, t)
     points = shade.Points(x, tuple(-c for c in along), medium.reflectance(x))
@@ -116,21 +118,26 @@ def seen_points(medium) -> shade.Points:
     return points
 
 
-def _camera(grid) -> Samples:
-    o, d = _rays(grid)
-    middle = dr.full(mi.Float, 0.5, WIDTH)
+def _covered(grid) -> float:
+    """The share of the camera rays that meet the field: the others cost next to nothing."""
+    return len(np.unique(np.array(_camera(grid, WIDTH).ray))) / WIDTH
+
+
+def _camera(grid, count: int) -> Samples:
+    o, d = _rays(grid, count)
+    middle = dr.full(mi.Float, 0.5, count)
     strand = Strand(grid.density, grid, o, d, dr.opaque(mi.Float, 2 / SAMPLES))
     return march.camera_samples([strand], mi.Float(dr.inf), middle, middle)
 
 
-def _rays(grid):
-    """WIDTH camera rays, neighbours side by side as pixels are: parallel through a square around the object."""
-    side = int(np.sqrt(WIDTH))
+def _rays(grid, count: int):
+    """`count` camera rays, neighbours side by side as pixels are: parallel through a square around the object."""
+    side = int(np.sqrt(count))
     low, high = grid.bounds
-    index = np.arange(WIDTH)
-    u, v = (index % side + 0.5) / side, (index // side + 0.5) / (WIDTH // side)
-    o = np.stack([low[0] + u * (high[0] - low[0]), low[1] + v * (high[1] - low[1]), np.full(WIDTH, 3.0)])
-    o, d = (tuple(mi.Float(c) for c in v.astype(np.float32)) for v in (o, np.tile([[0.0], [0.0], [-1.0]], WIDTH)))
+    index = np.arange(count)
+    u, v = (index % side + 0.5) / side, (index // side + 0.5) / (count // side)
+    o = np.stack([low[0] + u * (high[0] - low[0]), low[1] + v * (high[1] - low[1]), np.full(count, 3.0)])
+    o, d = (tuple(mi.Float(c) for c in v.astype(np.float32)) for v in (o, np.tile([[0.0], [0.0], [-1.0]], count)))
     dr.eval(o, d)
     return o, d
 

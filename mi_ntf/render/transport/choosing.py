@@ -21,7 +21,7 @@ from .omissions import LIGHTS, OMISSIONS, halved
 from .probing import SAMPLES, Look, probed
 from .trials import RISKED, Trials
 
-LOOK, TRIAL, LEFT_OUT = 0.5, 0.2, 0.2
+LOOK, TRIAL, LEFT_OUT = 0.5, 0.08, 0.12
 """Seconds of all frames: what takes less is rendered by the march without a look at it; what another method must save
 to be tried, twice what that takes with kernels compiled; and what leaving something out must. Under a `time_budget`
 a trial counts as `LOOK`: it may compile."""
@@ -180,9 +180,8 @@ class Chooser(Trials):
 
     def _in_vain(self, settings: Settings) -> float:
         """Seconds of what is built for a trial, which may come to nothing: maps of a sky with a sun take five and err
-        by 6 %. Those of lights keep to a limit half of the time."""
-        built = self._served(settings) * self.estimate.built(settings)
-        return built if REGISTRY[settings.visibility].per_field else 2 * built
+        by 6 %. Those of lights keep to a limit half of the time, so it counts once more."""
+        return self._served(settings) * self.estimate.built(settings)
 
     def _hopeless(self, settings: Settings) -> bool:
         return estimate.one_logistic(settings) and estimate.usual_error(settings) > HOPELESS * self._most

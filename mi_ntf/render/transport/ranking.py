@@ -36,7 +36,8 @@ class Ranking:
         seen = self._seen.first(self._small + round(times * self._count[0]))
         other = self._other.first(round(times * self._count[1]))
         index, chance = (np.concatenate(pair) for pair in zip(seen, other, strict=True))
-        return index, chance
+        order = np.argsort(index)  # those side by side are seen faster together
+        return index[order], chance[order]
 
 
 class _Priority:

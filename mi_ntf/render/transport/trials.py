@@ -25,7 +25,7 @@ BRIEF = 0.05
 """Seconds, less than which a look takes as long as its kernels need to begin, not what they compute."""
 EVERYWHERE, FEW = 16384, 32
 """Pixels and lights of an environment in which is looked for what the picture shows, without shadows; the probes are
-some of them. Half of them where all frames take less than `SHORT` seconds."""
+some of them. Half of them where all frames take less than `SHORT` seconds, a quarter where less than half of that."""
 SHORT = 2.0
 CROWDED = 0.25
 """Of those pixels: more probes would tell little more."""
@@ -135,8 +135,9 @@ class Trials:
         """The probes by the march, which also tell how far off the prices are; `whole`: all of them, with all lights,
         whatever that takes."""
         pixels = math.prod(self._size)
-        short = self.estimate.seconds(march) * self.settings.frames < SHORT
-        self._everywhere = Probes(self.sensor, self.estimate.media, EVERYWHERE // 2 if short else EVERYWHERE)
+        seconds = self.estimate.seconds(march) * self.settings.frames
+        share = 4 if seconds < SHORT / 2 else 2 if seconds < SHORT else 1
+        self._everywhere = Probes(self.sensor, self.estimate.media, EVERYWHERE // share)
         self._shown = self._everywhere.look(lambda: self._composed(march.but(
             visibility="none", max_depth=2, hide_emitters=True,
             environment_lights=min(FEW, march.environment_lights))))
@@ -156,6 +157,9 @@ class Trials:
         """`look` through all of the probes, of which the march has seen few: as the truth, from then on, with what it
         was off by there."""
         if not self._few:
+            return look
+        if look is self.truth and len(self.estimate.lights.rows.power) < FEW:
+            self._few = False  # fewer lights are not looked for
             return look
         more, both = self.probes.more(TOLD)
         if look is not self.truth:
