@@ -230,4 +230,5 @@ def test_rays_of_the_calibration_meet_the_object(tmp_path):
     scene = scenes.scene(scenes.write_blobs(tmp_path), {"type": "nrf"}, {"light": scenes.light("point")}, size=4)
     medium = next(s.interior_medium() for s in scene.shapes())
     points = calibration.seen_points(medium)
+    assert 0.3 < calibration._covered(medium.field.grid) < 1  # spheres side by side, in their square
     assert (mi.Float(medium.field.grid.density(points.x)) > 0.1).numpy().mean() > 0.99

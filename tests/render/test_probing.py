@@ -79,6 +79,13 @@ def everywhere():
     return of_camera(16384)
 
 
+def test_neighbours_are_traced_together(everywhere):
+    """From one group of pixels to the next it is a fiftieth of the side; in the order of the sequence, half."""
+    d = np.array(everywhere._ray.d)[:2].T.reshape(-1, probing.GROUP * probing.SAMPLES, 2).mean(1)
+    apart = np.linalg.norm(np.diff(d, axis=0), axis=1) / np.ptp(d, axis=0).max()
+    assert np.median(apart) < 0.03
+
+
 @pytest.fixture
 def shown(everywhere):
     """A disc a quarter as large as the picture, dark at the rim and sixteen times brighter in the middle."""

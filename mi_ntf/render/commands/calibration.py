@@ -136,8 +136,9 @@ def _rays(grid, count: int):
     low, high = grid.bounds
     index = np.arange(count)
     u, v = (index % side + 0.5) / side, (index // side + 0.5) / (count // side)
-    o = np.stack([low[0] + u * (high[0] - low[0]), low[1] + v * (high[1] - low[1]), np.full(count, 3.0)])
-    o, d = (tuple(mi.Float(c) for c in v.astype(np.float32)) for v in (o, np.tile([[0.0], [0.0], [-1.0]], count)))
+    place = np.stack([low[0] + u * (high[0] - low[0]), low[1] + v * (high[1] - low[1]), np.full(count, 3.0)])
+    along = np.tile([[0.0], [0.0], [-1.0]], count)
+    o, d = (tuple(mi.Float(c) for c in v.astype(np.float32)) for v in (place, along))
     dr.eval(o, d)
     return o, d
 

@@ -152,11 +152,12 @@ class Chooser(Trials):
         are looked for afterwards, and want fewer maps."""
         march = plain.but(visibility="raymarch")
         full = self.estimate.seconds(self._whole_of(march))
-        found = self._cheaper(Trial("raymarch", full), self._candidates(plain, True), self._closely, self._bouncing)
+        found = self._cheaper(Trial("raymarch", full), self._candidates(plain, True), self._looked_at, self._bouncing)
         if found:
             return found
         if self.truth.composition.settings != march:
             self.truth, self._others = self._looked(march), None
+        self._reckon()
         why = "nothing that serves all lights is cheaper and keeps to max_error"
         return self._tried(march, self._price(self.truth) + self._bouncing(march), 0.0, True, why), self.truth
 
@@ -171,7 +172,7 @@ class Chooser(Trials):
                 self._tried(candidate, seconds, why="usually off by more than max_error allows" if hopeless else
                             "saves less than a trial takes")
                 continue
-            tried = looked(candidate)
+            tried = self._closer(looked(candidate), best.seconds)
             good = self._error(tried) <= self._most
             if good and len(tried.composition.runs) == 1 and self._price(tried) + more(candidate) < best.seconds:
                 return self._judged(tried, True, "the cheapest that keeps to max_error"), tried
@@ -185,10 +186,6 @@ class Chooser(Trials):
 
     def _hopeless(self, settings: Settings) -> bool:
         return estimate.one_logistic(settings) and estimate.usual_error(settings) > HOPELESS * self._most
-
-    def _closely(self, settings: Settings) -> Look:
-        march = settings.but(visibility="raymarch")
-        return self._closer(self._looked_at(settings), self.estimate.seconds(march))
 
     def _looked_at(self, settings: Settings) -> Look:
         """By a method of which a look costs little: the truth has all lights from then on."""

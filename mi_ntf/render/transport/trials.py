@@ -27,8 +27,6 @@ EVERYWHERE, FEW = 16384, 32
 """Pixels and lights of an environment in which is looked for what the picture shows, without shadows; the probes are
 some of them. Half of them where all frames take less than `SHORT` seconds, a quarter where less than half of that."""
 SHORT = 2.0
-CROWDED = 0.25
-"""Of those pixels: more probes would tell little more."""
 FEWER = 2
 """Times fewer probes are in smoke, where each has more points. With a fourth they would be too few to tell what half of
 the lights save."""
@@ -87,7 +85,7 @@ class Trials:
                 self._march_rest(*self._rest)
                 continue
             seconds = (TOLD if self._few else 1) * self.probes.samples * (self.truth.each + look.each)
-            if seconds > worth or 2 * self.probes.count > CROWDED * self._everywhere.count:
+            if seconds > worth or 2 * self.probes.count > self._everywhere.count:
                 break
             look = self._through_more(look)
         return look
@@ -151,7 +149,12 @@ class Trials:
         if self.truth.each * self.probes.samples < BRIEF / (TOLD if self._few else 1):
             self.probes = self._everywhere.some(self._shown, CLOSER * self.probes.count)
             self.truth = replace(self.probes.look(lambda: self.truth.composition), built=self.truth.built)
-        self.estimate.dearer = self._price(self.truth) / max(self.estimate.seconds(march), 1e-9)
+        self._reckon()
+
+    def _reckon(self) -> None:
+        """Prices as the march has just shown."""
+        march = self.truth.composition.settings
+        self.estimate.dearer *= self._price(self.truth) / max(self.estimate.seconds(march), 1e-9)
 
     def _all_probes(self, look: Look) -> Look:
         """`look` through all of the probes, of which the march has seen few: as the truth, from then on, with what it
