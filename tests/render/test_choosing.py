@@ -148,7 +148,7 @@ def smoke(tmp_path, trials_are_free, monkeypatch):
     return chosen
 
 
-@pytest.mark.parametrize("frames, pixels", [(1, 204), (320, 820)])
+@pytest.mark.parametrize("frames, pixels", [(1, 204), (560, 820)])
 def test_probes_in_smoke_march_to_few_lights(smoke, monkeypatch, frames, pixels):
     """An atlas adds the others: the truth is off by 0.11 %, measured, and errors by 1 % of themselves; also where more
     pixels are looked at afterwards, as many where the march takes as long."""
@@ -238,7 +238,7 @@ def test_what_may_keep_to_a_small_limit_is_tried(blobs, trials_are_free, monkeyp
 
 
 @pytest.mark.parametrize(("gain", "spp", "more", "taken"), [
-    (0.2, 1, 2, "transmittance_map"), (0.97, 1, 1, "raymarch"), (0.97, 64, 4, "transmittance_map")])
+    (0.2, 1, 2, "transmittance_map"), (0.97, 1, 1, "raymarch"), (0.97, 128, 4, "transmittance_map")])
 def test_chance_is_asked_again_where_much_is_at_stake(blobs, trials_are_free, monkeypatch, gain, spp, more, taken):
     """A method that few pixels refuse by their margin alone, and twice as many do not; of many samples more pixels are
     looked at anyway."""

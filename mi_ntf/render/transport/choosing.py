@@ -172,7 +172,8 @@ class Chooser(Trials):
                 self._tried(candidate, seconds, why="usually off by more than max_error allows" if hopeless else
                             "saves less than a trial takes")
                 continue
-            tried = self._closer(looked(candidate), best.seconds)
+            tried = looked(candidate)
+            tried = self._closer(tried, best.seconds - self._price(tried))
             good = self._error(tried) <= self._most
             if good and len(tried.composition.runs) == 1 and self._price(tried) + more(candidate) < best.seconds:
                 return self._judged(tried, True, "the cheapest that keeps to max_error"), tried
@@ -214,7 +215,7 @@ class Chooser(Trials):
                 foreseen = self._errors.get(settings, halved([t.error for t, _ in kept]) if name in LIGHTS else 0.0)
                 if saved < SAVING * best.seconds or not self._pays(saved, LEFT_OUT + anew) or foreseen > limit:
                     break
-                tried = self._closer(self._looked(settings), best.seconds)
+                tried = self._closer(self._looked(settings), saved)
                 good = self._error(tried) <= limit
                 cheaper = self._price(tried) < best.seconds
                 why = (f"kept: it is off by more than {limit:.2%}" if not good else

@@ -14,8 +14,8 @@ from .probing import CAUTION, LEAST, Look, Off, Probes, probed
 
 MARGIN = 0.95
 """Of `max_error`, what the probes may show: what is taken is what they happen to find good."""
-RISKED = 0.4
-"""Of what a trial may save, what it may take."""
+RISKED, DOUBTED = 0.4, 0.1
+"""Of what a trial may save, what it may take; and what more pixels may where those so far rather tell that it fails."""
 CHEAP = 0.01
 """Of the seconds of all frames, what more pixels may take in any case: of the lights that `statue` may do without under
 an environment, 500 pixels find too many."""
@@ -74,19 +74,22 @@ class Trials:
         self.patches = look.composition.patches  # where light bounces between is the same for all of them
         return look
 
-    def _closer(self, look: Look, dearer: float) -> Look:
-        """`look`, in place of what takes `dearer` seconds; through more pixels, from then on, where that costs next to
-        nothing, or where it is chance that refuses what would save much."""
-        frames, price = self.settings.frames, self._price(look)
+    def _closer(self, look: Look, saved: float) -> Look:
+        """`look`, which would save so many seconds a picture; through more pixels, from then on, where that costs next
+        to nothing, or where it is chance that refuses what would save much."""
+        spent, frames = 0.0, self.settings.frames
         while self.known:
             chance = self._error(look, -CAUTION) <= self._most < self._error(look)
-            worth = frames * max(CHEAP * price, RISKED * (dearer - price) if chance else 0.0)
+            risked = RISKED if self._error(look, 0.0) <= self._most else DOUBTED
+            worth = frames * max(CHEAP * self._price(look), risked * saved if chance else 0.0) - spent
             if chance and self._rest and self._rest[0].samples * self._rest[2].each <= worth:
+                spent += self._rest[0].samples * self._rest[2].each
                 self._march_rest(*self._rest)
                 continue
             seconds = (TOLD if self._few else 1) * self.probes.samples * (self.truth.each + look.each)
             if seconds > worth or 2 * self.probes.count > self._everywhere.count:
                 break
+            spent += seconds
             look = self._through_more(look)
         return look
 
