@@ -153,8 +153,8 @@ def test_few_that_are_marched_tell_what_the_truth_errs_by(rng, everywhere, shown
     lights = SimpleNamespace(lights=SimpleNamespace(sampled=[]))
     base, found = (probing.Look(lights, truth * (1 + by), shown.seen, 0.0, 0.0) for by in (a, a + off))
     expected = 0.05 * np.sqrt(2 + 2 * share)
-    error = both.error(found, base, 4, 0.0, probing.Off(few, (truth * a)[: few.count]))
+    error = both.error(found, base, 4, 0.0, probing.Off(few, (truth * a)[: few.count], base))
     power = np.sqrt(float(both.weight @ (1 + a.ravel()) ** 2))
     assert error * power == pytest.approx(expected * np.sqrt(both.weight.sum()), rel=0.12)  # 2/√(few groups)
-    assert both.error(base, base, 4, 0.0, probing.Off(few, (truth * a)[: few.count])) * power == pytest.approx(
+    assert both.error(base, base, 4, 0.0, probing.Off(few, (truth * a)[: few.count], base)) * power == pytest.approx(
         0.05, rel=0.12)

@@ -52,10 +52,12 @@ class Look:
 
 
 class Off(NamedTuple):
-    """What a truth errs `by` (pixels, samples, 3) at the `probes` that the march has seen, the first of all."""
+    """What a truth errs `by` (pixels, samples, 3) at the `probes` that the march has seen, the first of all; `march`: a
+    look by it."""
 
     probes: "Probes"
     by: np.ndarray
+    march: Look
 
 
 def probed(pixels: int) -> float:

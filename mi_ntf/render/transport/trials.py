@@ -63,7 +63,7 @@ class Trials:
         self._errors: dict[Settings, float] = {}
         self._others: tuple[Composition, Composition] | None = None  # their difference: the lights that truth lacks
         self._off: Off | None = None
-        self._rest: tuple[Probes, Probes, Look] | None = None  # what the march has not seen, with what it has, its look
+        self._rest: tuple[Probes, Probes] | None = None  # what the march has not seen, and that with what it has
         self.known = True
 
     def _composed(self, settings: Settings) -> Composition:
@@ -82,10 +82,12 @@ class Trials:
             chance = self._error(look, -CAUTION) <= self._most < self._error(look)
             risked = RISKED if self._error(look, 0.0) <= self._most else DOUBTED
             worth = frames * max(CHEAP * self._price(look), risked * saved if chance else 0.0) - spent
-            if chance and self._rest and self._rest[0].samples * self._rest[2].each <= worth:
-                spent += self._rest[0].samples * self._rest[2].each
-                self._march_rest(*self._rest)
-                continue
+            if chance and self._off and self._rest:
+                seconds = self._rest[0].samples * self._off.march.each
+                if seconds <= worth:
+                    spent += seconds
+                    self._march_rest(self._off, *self._rest)
+                    continue
             seconds = (TOLD if self._few else 1) * self.probes.samples * (self.truth.each + look.each)
             if seconds > worth or 2 * self.probes.count > self._everywhere.count:
                 break
@@ -93,12 +95,11 @@ class Trials:
             look = self._through_more(look)
         return look
 
-    def _march_rest(self, rest: Probes, both: Probes, seen: Look) -> None:
+    def _march_rest(self, known: Off, rest: Probes, both: Probes) -> None:
         """What the truth is off by at the `rest` of the probes as well."""
-        assert self._off is not None
-        march = rest.look(lambda: seen.composition)
-        off = self.truth.radiance[self._off.probes.count:both.count] - march.radiance
-        self._off, self._rest = Off(both, np.concatenate([self._off.by, off])), None
+        march = rest.look(lambda: known.march.composition)
+        off = self.truth.radiance[known.probes.count:both.count] - march.radiance
+        self._off, self._rest = Off(both, np.concatenate([known.by, off]), march), None
 
     def _through_more(self, look: Look) -> Look:
         """`look` through twice as many pixels, as the truth is from then on."""
@@ -108,6 +109,8 @@ class Trials:
         self.truth = self.truth.and_more(self._and_others(more, march), share)
         look = look.and_more(more.look(lambda: look.composition), share)
         self.probes = both
+        if self._off and not self._rest:
+            self._rest = more, both
         return look
 
     def _and_others(self, probes: Probes, march: Look, whole: Look | None = None) -> Look:
@@ -169,8 +172,8 @@ class Trials:
             return look
         more, both = self.probes.more(TOLD)
         if look is not self.truth:
-            self._off = Off(self.probes, look.radiance - self.truth.radiance)
-            self._rest = (more, both, self.truth) if more.count else None
+            self._off = Off(self.probes, look.radiance - self.truth.radiance, self.truth)
+            self._rest = (more, both) if more.count else None
         if more.count:  # small pictures have no others
             look = look.and_more(more.look(lambda: look.composition), more.samples / both.samples)
         self.truth, self.probes, self._few = look, both, False
