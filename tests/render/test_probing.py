@@ -103,6 +103,9 @@ def test_some_pixels_tell_of_all(everywhere, shown):
     others, both = some.more()
     assert both.count == some.count + others.count == pytest.approx(2 * some.count, rel=0.03)
     np.testing.assert_array_equal(both._index[: len(some._index)], some._index)
+    rest = both.after(some)
+    np.testing.assert_array_equal(rest._index, others._index)
+    np.testing.assert_array_equal(rest.weight, both.weight[some.count :])
     for part, rel in ((some, 0.1), (both, 0.07)):  # 1.5/√groups that see something
         pixels = (part._index[:, None] * probing.GROUP + np.arange(probing.GROUP)).ravel()
         light = shown.radiance[pixels, 0, 0]

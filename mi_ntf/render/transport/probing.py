@@ -125,6 +125,11 @@ class Probes:
         new, all_ = (self._whole._of(self._ranking, times, groups, chances[groups]) for groups in (others, both))
         return new, all_
 
+    def after(self, first: "Probes") -> "Probes":
+        """Those of them that come after the `first`."""
+        n = len(first._index)
+        return self._whole._of(self._ranking, self._times, self._index[n:], self.chance[n:])
+
     def _of(self, ranking: Ranking, times: float, index: np.ndarray, chance: np.ndarray) -> "Probes":
         """Those of these groups, which had these chances to be among the first so many `times`."""
         part = copy.copy(self)

@@ -63,7 +63,6 @@ class Trials:
         self._errors: dict[Settings, float] = {}
         self._others: tuple[Composition, Composition] | None = None  # their difference: the lights that truth lacks
         self._off: Off | None = None
-        self._rest: tuple[Probes, Probes] | None = None  # what the march has not seen, and that with what it has
         self.known = True
 
     def _composed(self, settings: Settings) -> Composition:
@@ -82,11 +81,12 @@ class Trials:
             chance = self._error(look, -CAUTION) <= self._most < self._error(look)
             risked = RISKED if self._error(look, 0.0) <= self._most else DOUBTED
             worth = frames * max(CHEAP * self._price(look), risked * saved if chance else 0.0) - spent
-            if chance and self._off and self._rest:
-                seconds = self._rest[0].samples * self._off.march.each
+            if chance and self._off and self._off.probes.count < self.probes.count:
+                rest = self.probes.after(self._off.probes)
+                seconds = rest.samples * self._off.march.each
                 if seconds <= worth:
                     spent += seconds
-                    self._march_rest(self._off, *self._rest)
+                    self._march_rest(self._off, rest)
                     continue
             seconds = (TOLD if self._few else 1) * self.probes.samples * (self.truth.each + look.each)
             if seconds > worth or 2 * self.probes.count > self._everywhere.count:
@@ -95,11 +95,11 @@ class Trials:
             look = self._through_more(look)
         return look
 
-    def _march_rest(self, known: Off, rest: Probes, both: Probes) -> None:
+    def _march_rest(self, known: Off, rest: Probes) -> None:
         """What the truth is off by at the `rest` of the probes as well."""
         march = rest.look(lambda: known.march.composition)
-        off = self.truth.radiance[known.probes.count:both.count] - march.radiance
-        self._off, self._rest = Off(both, np.concatenate([known.by, off]), march), None
+        off = self.truth.radiance[known.probes.count:] - march.radiance
+        self._off = Off(self.probes, np.concatenate([known.by, off]), march)
 
     def _through_more(self, look: Look) -> Look:
         """`look` through twice as many pixels, as the truth is from then on."""
@@ -109,8 +109,6 @@ class Trials:
         self.truth = self.truth.and_more(self._and_others(more, march), share)
         look = look.and_more(more.look(lambda: look.composition), share)
         self.probes = both
-        if self._off and not self._rest:
-            self._rest = more, both
         return look
 
     def _and_others(self, probes: Probes, march: Look, whole: Look | None = None) -> Look:
@@ -173,7 +171,6 @@ class Trials:
         more, both = self.probes.more(TOLD)
         if look is not self.truth:
             self._off = Off(self.probes, look.radiance - self.truth.radiance, self.truth)
-            self._rest = (more, both) if more.count else None
         if more.count:  # small pictures have no others
             look = look.and_more(more.look(lambda: look.composition), more.samples / both.samples)
         self.truth, self.probes, self._few = look, both, False
