@@ -145,7 +145,7 @@ def test_constants_are_kept_for_the_machine(cache):
 @pytest.mark.parametrize("content", ["", "[1]", '{"%s": {"march": 1}}', '{"%s": 3}'])
 def test_a_damaged_cache_counts_as_none(cache, content):
     cache.parent.mkdir()
-    cache.write_text(content.replace("%s", model.machine()))
+    cache.write_text(content.replace("%s", model._name()))
     assert model.constants() == model.Constants()
 
 
@@ -155,7 +155,7 @@ def test_a_damaged_cache_counts_as_none(cache, content):
 def test_prices_that_make_no_sense_count_as_none(cache, prices):
     model.remember(model.Constants(march=3.0))
     assert model.constants().march == 3.0
-    cache.write_text(json.dumps({model.machine(): asdict(model.Constants()) | prices}))
+    cache.write_text(json.dumps({model._name(): asdict(model.Constants()) | prices}))
     assert model.measured() is None and model.constants() == model.Constants()
 
 
@@ -218,6 +218,15 @@ def test_rendering_does_not_calibrate(tmp_path, cache, monkeypatch):
     scene = scenes.scene(scenes.write_blobs(tmp_path), {"type": "nrf"}, {"light": scenes.light("point")}, size=4, spp=1)
     assert scenes.render(scene).max() > 0
     assert not cache.exists()
+
+
+def test_constants_do_not_outlive_what_measured_them(monkeypatch, tmp_path):
+    model.remember(KNOT)
+    assert model.measured() == KNOT
+    other = tmp_path / "another.py"
+    other.write_text("# another way to measure")
+    monkeypatch.setattr(model, "PROGRAM", other)
+    assert model.measured() is None and model.constants() == model.Constants()
 
 
 def test_medians_alternate_and_leave_the_first_run_out():

@@ -9,7 +9,7 @@ import pytest
 from helpers import scenes
 from helpers.variants import VARIANT
 
-from mi_ntf.render.transport import probing
+from mi_ntf.render.transport import probing, trials
 
 
 @pytest.fixture(autouse=True)
@@ -140,6 +140,23 @@ def test_more_of_something_small(everywhere, shown):
     of_groups = few.reshape(-1, probing.GROUP).any(1)
     hits = [of_groups[part._index].sum() for part in (some, *some.more())]
     assert hits == [probing.LEAST // probing.GROUP] * 2 + [2 * probing.LEAST // probing.GROUP]
+
+
+def test_the_march_sees_all_that_it_has_not(everywhere, shown, monkeypatch):
+    """Also what came in two steps: everywhere a method shows 1 more than the march, which shows a pixel's number."""
+    def look(self, _):
+        pixels = (self._index[:, None] * probing.GROUP + np.arange(probing.GROUP)).ravel()
+        light = np.broadcast_to(pixels[:, None, None], (self.count, probing.SAMPLES, 3))
+        return probing.Look(SimpleNamespace(), light, pixels > 0, 0.0, 0.0)
+
+    monkeypatch.setattr(probing.Probes, "look", look)
+    few = everywhere.some(shown, 512)
+    found, both = object.__new__(trials.Trials), few.more()[1].more()[1]
+    march, found.probes, whole = few.look(None), both, both.look(None)
+    found.truth = replace(whole, radiance=whole.radiance + 1)
+    found._march_rest(probing.Off(few, np.ones_like(march.radiance), march), both.after(few))
+    assert found._off.probes is both and both.count > 3 * few.count
+    np.testing.assert_array_equal(found._off.by, np.ones_like(whole.radiance))
 
 
 @pytest.mark.parametrize("share", [0.5, 1.0])

@@ -23,7 +23,7 @@ from ..transport import bounced
 
 SAMPLES = 384
 WIDTH, RAYS = 1 << 15, 1 << 18
-"""Points that lights are looked up at; camera rays, as close together as a picture's: of a tenth as many each took
+"""Points that lights are looked up at; camera rays, as close together as a picture's: of an eighth as many each took
 twice as long, as those of one packet then wait for each other."""
 FEW = 4
 MANY = 256

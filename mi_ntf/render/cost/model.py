@@ -5,6 +5,7 @@ bench` run; a render reads them from the user's cache, or takes those of two cor
 """
 
 import ctypes
+import hashlib
 import json
 import platform
 from dataclasses import asdict, dataclass, field, fields, make_dataclass, replace
@@ -24,6 +25,8 @@ from .. import user_cache
 
 CACHE = "cost.json"
 """Where constants are kept, in the user's cache."""
+PROGRAM = Path(__file__).parents[1] / "commands" / "calibration.py"
+"""What measures them."""
 
 FACING = 0.5
 """Share of (point, light) pairs whose light falls on the front, the others ask for no visibility."""
@@ -225,7 +228,7 @@ def constants() -> Constants:
 
 def measured() -> Constants | None:
     """This machine's constants, None where they are not in the cache."""
-    found = _read().get(machine())
+    found = _read().get(_name())
     if not isinstance(found, dict) or {f.name for f in fields(Constants)} != set(found):
         return None
     prices = all(type(v) in (int, float) and 0 < v < 1e12 for v in found.values())  # up to minutes
@@ -234,7 +237,12 @@ def measured() -> Constants | None:
 
 def remember(found: Constants) -> None:
     """Keep `found` for this machine. A cache that cannot be written is no fault of the caller's work."""
-    user_cache.write(CACHE, json.dumps(_read() | {machine(): asdict(found)}, indent=1))
+    user_cache.write(CACHE, json.dumps(_read() | {_name(): asdict(found)}, indent=1))
+
+
+def _name() -> str:
+    """What constants are called in the cache: none outlives a change of what measures them."""
+    return f"{machine()} · {hashlib.sha256(PROGRAM.read_bytes()).hexdigest()[:8]}"
 
 
 def _read() -> dict:

@@ -173,7 +173,7 @@ class Chooser(Trials):
                             "saves less than a trial takes")
                 continue
             tried = looked(candidate)
-            tried = self._closer(tried, best.seconds - self._price(tried))
+            tried = self._closer(tried, best.seconds - self._price(tried) - more(candidate))
             good = self._error(tried) <= self._most
             if good and len(tried.composition.runs) == 1 and self._price(tried) + more(candidate) < best.seconds:
                 return self._judged(tried, True, "the cheapest that keeps to max_error"), tried
