@@ -12,12 +12,10 @@ import mitsuba as mi
 
 from mi_ntf.core import errors
 from mi_ntf.core.errors import MiNtfError
+from mi_ntf.core.variants import VARIANTS
 
 OWN_PLUGINS = ("nrf", "ntf")
 """Plugins of this package; `nrf` is medium, phase function and integrator."""
-
-OWN_VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
-"""Variants in which `OWN_PLUGINS` work: fields hold linear RGB, and evaluation is vectorised."""
 
 STOCK_INTEGRATORS = {
     "prb": "PRBIntegrator",
@@ -81,7 +79,7 @@ def register_all(variant: str) -> None:
 def check_variant(name: str, variant: str) -> None:
     """Raise MiNtfError, with the remedy, unless plugin `name` can run in `variant`."""
     if name in OWN_PLUGINS:
-        fits, need = variant in OWN_VARIANTS, " and ".join(OWN_VARIANTS)
+        fits, need = variant in VARIANTS, " and ".join(VARIANTS)
     else:
         fits, need = not variant.startswith("scalar_"), "the vectorised variants (llvm_*, cuda_*)"
     if not fits:

@@ -19,12 +19,10 @@ import OpenEXR
 from mi_ntf import bridge
 from mi_ntf.core import files
 from mi_ntf.core.errors import MiNtfError
+from mi_ntf.core.variants import VARIANTS
 from mi_ntf.render.scene import scene_file
 from mi_ntf.render.scene.environment_option import Environment
 from mi_ntf.watch import TEV, Tev, printed, watch
-
-VARIANT_PRIORITY = ("cuda_ad_rgb", "llvm_ad_rgb")
-"""Without `-m`, the first of these that this machine can run, as in the stock program."""
 
 MTIME = 2.0
 """Seconds that a file system's clock may be behind."""
@@ -37,7 +35,7 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument("scenes", nargs="+", metavar="SCENE.xml")
     p.add_argument(
-        "-m", "--mode", metavar="VARIANT", help="default: the first available of " + ", ".join(VARIANT_PRIORITY)
+        "-m", "--mode", metavar="VARIANT", help="default: the first available of " + ", ".join(VARIANTS)
     )
     p.add_argument("-v", "--verbose", action="count", default=0, help="more messages; may be given twice")
     p.add_argument("-t", "--threads", type=int, metavar="COUNT", help="number of CPU threads (1 counts as 2)")
@@ -147,10 +145,10 @@ def _apply_settings(args: argparse.Namespace) -> None:
     if args.mode and args.mode not in mi.variants():
         raise MiNtfError(f"unknown variant {args.mode!r}; this Mitsuba has {', '.join(mi.variants())}")
     try:
-        mi.set_variant(*([args.mode] if args.mode else VARIANT_PRIORITY))
+        mi.set_variant(*([args.mode] if args.mode else VARIANTS))
     except ImportError as error:
         raise MiNtfError(
-            f"this machine cannot run {args.mode or 'any of ' + ', '.join(VARIANT_PRIORITY)}: "
+            f"this machine cannot run {args.mode or 'any of ' + ', '.join(VARIANTS)}: "
             f"`mi-ntf doctor` names the remedy ({error})"
         ) from error
     variant = str(mi.variant())

@@ -10,9 +10,9 @@ Source: Mitsuba 3, "Distributing Python plugins" in its documentation, and ``loa
 
 import mitsuba as mi
 
-from mi_ntf.bridge import OWN_VARIANTS
+from mi_ntf.core.variants import VARIANTS
 
-if mi.variant() in OWN_VARIANTS:
+if mi.variant() in VARIANTS:
     from mi_ntf.render import register
 
     register()

@@ -19,6 +19,7 @@ import numpy as np
 from mi_ntf import jobs
 from mi_ntf.core import files, spheres
 from mi_ntf.core.errors import MiNtfError
+from mi_ntf.core.variants import VARIANTS
 from mi_ntf.data import schema
 from mi_ntf.data.bounds import bounding_sphere
 
@@ -52,7 +53,7 @@ def _load(path: Path):
 
     variant = mi.variant()
     if variant is None:
-        mi.set_variant("llvm_ad_rgb")
+        mi.set_variant(*VARIANTS)
     elif "rgb" not in variant:
         raise MiNtfError(f"variant '{variant}' is active; photographs are linear RGB: set an rgb variant "
                          "such as llvm_ad_rgb")

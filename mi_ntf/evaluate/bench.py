@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ..core import files
+from ..core.variants import VARIANTS
 from ..infer.visibility import transmittance_atlas
 from ..render import register
 from ..render.commands import calibration
@@ -35,7 +36,7 @@ def bench(quick: bool = False, out: Path | None = None, say: Callable[[str], Non
     say    hears what is measured next
     """
     if mi.variant() is None:
-        mi.set_variant("llvm_ad_rgb")
+        mi.set_variant(*VARIANTS)
     register()
     sizes = QUICK if quick else FULL
     start = time.perf_counter()

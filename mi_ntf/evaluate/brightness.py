@@ -16,6 +16,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from ..core.variants import VARIANTS
 from . import metrics
 from .photographs import field_ball
 
@@ -77,7 +78,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=96)
     parser.add_argument("--depth", type=int, default=2)
     given = parser.parse_args()
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(*VARIANTS)
     from .. import render
 
     render.register()

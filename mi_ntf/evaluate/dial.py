@@ -34,6 +34,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core.variants import VARIANTS
 from ..render.maps import map_cache
 from .photographs import field_ball
 from .tradeoff.measure import maps_in_memory
@@ -249,7 +250,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=128)
     parser.add_argument("--spp", type=int, default=4)
     args = parser.parse_args()
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(*VARIANTS)
     from ..render import register
 
     register()

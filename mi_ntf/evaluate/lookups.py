@@ -28,6 +28,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core.variants import VARIANTS
 from ..infer.visibility.method import Options
 from ..render.commands import calibration
 from ..render.maps import building, map_cache
@@ -166,7 +167,7 @@ def main() -> None:
     parser.add_argument("--spp", type=int, default=8)
     args = parser.parse_args()
     os.environ.setdefault("MI_NTF_MAP_CACHE", "memory")
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(*VARIANTS)
     from ..render import register
 
     register()

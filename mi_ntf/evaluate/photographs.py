@@ -16,6 +16,7 @@ import numpy as np
 
 from ..core import field_file
 from ..core.errors import MiNtfError
+from ..core.variants import VARIANTS
 from ..data.images import linear
 from ..data.readers import load_dataset
 from . import metrics
@@ -96,7 +97,7 @@ def main() -> None:
     parser.add_argument("--spp", type=int, default=32)
     parser.add_argument("--depth", type=int, default=-1)
     given = parser.parse_args()
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(*VARIANTS)
     from .. import render
 
     render.register()

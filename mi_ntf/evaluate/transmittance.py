@@ -19,6 +19,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from ..core import variants
 from ..core.spheres import fibonacci
 from .metrics import relative_rmse
 
@@ -85,7 +86,7 @@ def main() -> None:
     parser.add_argument("--spp", type=int, default=4)
     parser.add_argument("--lights", type=int, default=50)
     options = parser.parse_args()
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(*variants.VARIANTS)
     from .. import render
 
     render.register()

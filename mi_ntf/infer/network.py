@@ -124,7 +124,7 @@ class _Network:
 
     def _pack(self, name: str, tensors: dict, count: int) -> None:
         # Cooperative vectors are float16 on CUDA; on LLVM float32 is the faster (and exact) one.
-        half = self.dj.__name__.startswith("drjit.cuda")
+        half = dr.backend_v(self.dj.Float) == dr.JitBackend.CUDA
         self.scalar = self.dj.Float16 if half else self.dj.Float
         tensor = self.dj.TensorXf16 if half else self.dj.TensorXf
         shapes = [tensors[f"{name}.layers.{i}.weight"].shape for i in range(count)]

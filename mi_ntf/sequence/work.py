@@ -17,7 +17,7 @@ import numpy as np
 
 from .. import __version__, bridge
 from ..core.errors import MiNtfError, sentence
-from ..launcher import VARIANT_PRIORITY
+from ..core.variants import VARIANTS
 from ..render.maps import map_cache
 from ..render.scene import changed, environment_option
 from ..render.scene.environment_option import Environment
@@ -88,7 +88,7 @@ def ready(variant: str = "") -> None:
     if variant and variant not in mi.variants():
         raise MiNtfError(f"unknown variant {variant!r}; this Mitsuba has {', '.join(mi.variants())}")
     if (variant and mi.variant() != variant) or mi.variant() is None:
-        mi.set_variant(*([variant] if variant else VARIANT_PRIORITY))
+        mi.set_variant(*([variant] if variant else VARIANTS))
     if mi.variant() not in _registered:
         _registered.add(str(mi.variant()))
         bridge.register_all(str(mi.variant()))

@@ -67,7 +67,7 @@ class Bounced:
         hits[ray] = table[radiosity.place(*there)]
         # All photographs at once, three columns each.
         views, count = len(self.power), len(x)
-        albedo = diffuse_albedo(networks.reflectance(_tensor(x)), networks.fresnel).numpy()
+        albedo = diffuse_albedo(networks.reflectance(_tensor(x)), networks.fresnel).cpu().numpy()
         direct = self._direct(marched, x, normal).transpose(1, 0, 2).reshape(count, -1)
         light = radiosity.solve(hits.reshape(count, -1), np.tile(albedo, (1, views)), direct, -1)
         light = np.pad(light, [(0, 1), (0, 0)]).reshape(count + 1, views, 3).transpose(1, 0, 2)
@@ -86,7 +86,7 @@ class Bounced:
             faces = (cos > 0).nonzero()[:, 0]
             _, depth = walk(marched, outside[faces], (away / distance[:, None])[faces], 6.0)
             lit[faces] = (cos[faces] / distance[faces] ** 2 * torch.exp(-depth))[:, None] * power
-        return result.double().numpy()
+        return result.double().cpu().numpy()
 
 
 def _rays(x: np.ndarray, normal: np.ndarray, side: int, rng: np.random.Generator) -> list[torch.Tensor]:
@@ -101,7 +101,7 @@ def _skin(networks: Networks, marched: TransmittanceTargets, o: torch.Tensor, d:
     x = torch.addcmul(o[ray], d[ray], t[ray, None])
     normal = torch.cat([networks.reflectance(part)[0] for part in x.split(65536)])
     faces = (normal * d[ray]).sum(1) < 0
-    return ray[faces].numpy(), x[faces].double().numpy(), normal[faces].double().numpy()
+    return ray[faces].cpu().numpy(), *(v[faces].double().cpu().numpy() for v in (x, normal))
 
 
 def _tensor(values: np.ndarray) -> torch.Tensor:

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 
+import numpy as np
 import torch
 
 SHARE = 0.05
@@ -27,7 +28,7 @@ class Live:
         image = (255 * picture()).round().to(torch.uint8).cpu().numpy()
         height, width = image.shape[:2]
         # The page stretches a background: room above and below keeps its shape.
-        framed = torch.zeros(max(height, round(width / 1.4)), width, 3, dtype=torch.uint8).numpy()
+        framed = np.zeros((max(height, round(width / 1.4)), width, 3), np.uint8)
         top = (framed.shape[0] - height) // 2
         framed[top : top + height] = image
         self._server.scene.set_background_image(framed, format="jpeg", jpeg_quality=90)

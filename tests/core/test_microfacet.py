@@ -254,7 +254,9 @@ def test_values_equal_mitsubas_blend_of_diffuse_and_rough_conductor(roughness):
     theirs = np.array(bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(*wi)))[0]
     ours = _rho_cos(tuple(c.astype(float) for c in wi), tuple(c.astype(float) for c in wo), N, k, s, roughness)
     # Mitsuba's float32 D loses up to 5e-4 at its peak for α = 0.0225 (see `ggx`), squared denominators double it.
-    np.testing.assert_allclose(theirs, ours, rtol=2e-3 if roughness < 0.2 else 1e-4, atol=1e-6)
+    # CUDA divides by approximate reciprocals: 5e-4 at any roughness.
+    least = 1e-3 if VARIANT.startswith("cuda") else 1e-4
+    np.testing.assert_allclose(theirs, ours, rtol=2e-3 if roughness < 0.2 else least, atol=1e-6)
 
 
 def test_peak_keeps_its_digits_in_float32():

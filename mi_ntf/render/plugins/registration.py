@@ -5,6 +5,7 @@ from pathlib import Path
 import mitsuba as mi
 
 from ...core.errors import MiNtfError
+from ...core.variants import VARIANTS
 from ...infer.backend import module
 from ..scene import scene_file
 from ..scene.environment_option import Environment
@@ -42,11 +43,11 @@ def register() -> None:
 
 
 def load_scene(path: Path, parameters: dict[str, str], environment: Environment | None = None):
-    """The scene of an XML file, `parameters` for its $names, whose integrator is ``nrf``; the variant is
-    ``llvm_ad_rgb`` where none is set. `environment` is laid over the scene's own. Raises MiNtfError if the integrator
-    is another, or the environment does not fit."""
+    """The scene of an XML file, `parameters` for its $names, whose integrator is ``nrf``; where no variant is set, in
+    the first of `VARIANTS` that this machine can run. `environment` is laid over the scene's own. Raises MiNtfError if
+    the integrator is another, or the environment does not fit."""
     if mi.variant() is None:
-        mi.set_variant("llvm_ad_rgb")
+        mi.set_variant(*VARIANTS)
     register()
     scene = scene_file.load(path, parameters, environment)
     integrator = scene.integrator()
@@ -57,5 +58,5 @@ def load_scene(path: Path, parameters: dict[str, str], environment: Environment 
 
 def _on_variant(_old: str, new: str) -> None:
     """Registrations hold for one variant: repeat them for the new one, where the plugins can run in it."""
-    if new in ("llvm_ad_rgb", "cuda_ad_rgb"):
+    if new in VARIANTS:
         register()
