@@ -123,7 +123,7 @@ class _Network:
         self._pack(name, tensors, count)
 
     def _pack(self, name: str, tensors: dict, count: int) -> None:
-        # Cooperative vectors are float16 on CUDA; on LLVM float32 is the faster (and exact) one.
+        # Cooperative vectors are float16 on CUDA, which ends at 65504; on LLVM float32 is the faster (and exact) one.
         half = dr.backend_v(self.dj.Float) == dr.JitBackend.CUDA
         self.scalar = self.dj.Float16 if half else self.dj.Float
         tensor = self.dj.TensorXf16 if half else self.dj.TensorXf
@@ -134,7 +134,10 @@ class _Network:
         net = nn.Sequential(*layers).alloc(tensor, size=shapes[0][1])
         for i in range(count):
             for ours, theirs in (("weight", "weights"), ("bias", "bias")):
-                value = np.ascontiguousarray(tensors[f"{name}.layers.{i}.{ours}"], np.float16 if half else np.float32)
+                value = np.ascontiguousarray(tensors[f"{name}.layers.{i}.{ours}"], np.float32)
+                if half:
+                    end = np.finfo(np.float16).max
+                    value = np.clip(value, -end, end).astype(np.float16)
                 net[f"layers.{2 * i}.{theirs}"] = tensor(value)
         self.packed: Any = nn.pack(net, layout="inference")  # the network, called
 

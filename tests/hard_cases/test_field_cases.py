@@ -57,6 +57,7 @@ def test_matter_out_of_view(file, check):
 @pytest.mark.parametrize("method", hard_cases.MARCHED)
 def test_uniform_density(sigma, method, check):
     """τ at points below the surface, towards the zenith: σ is at most e^6.5."""
+    sigma = fields.held(sigma)
     medium = hard_cases.baked(*fields.uniform(sigma), 64)
     below = np.array([1e-4, 1e-3, 3e-3, 0.01, 0.1, 1.0, 1.9])
     x = np.stack([0 * below, 0 * below, 1 - below], 1)

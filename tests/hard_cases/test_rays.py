@@ -14,7 +14,7 @@ from mi_ntf.core import field_file, spheres
 from mi_ntf.infer import march
 from mi_ntf.infer.bundle import Strand
 
-SIGMA = 1.5
+SIGMA = fields.held(1.5)
 R = np.sqrt(0.5)
 GRAZE = 1 - 0.5 * 0.06**2
 SLANT = np.array([2.0, -1.0, 0.5]) / np.linalg.norm([2.0, -1.0, 0.5])

@@ -103,6 +103,11 @@ def empty(**kwargs) -> tuple[Header, dict]:
     return header, t
 
 
+def held(sigma: float) -> float:
+    """The next σ whose logarithm float16 holds, which networks are of on CUDA."""
+    return float(np.exp(np.float64(np.float16(np.log(sigma)))))
+
+
 def uniform(sigma: float, **kwargs) -> tuple[Header, dict]:
     """σ everywhere in the unit sphere."""
     header, t = blobs([(0, 0, 0)], [0.3], **kwargs)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from helpers import fields
 from helpers.jit import arrays
+from helpers.variants import VARIANT
 from scipy.ndimage import map_coordinates
 
 from mi_ntf.core import field_file, reference
@@ -47,9 +48,13 @@ def case(request, rng):
 
 def assert_close(ours, truth, tolerance=3e-5):
     """Within `tolerance` of the output's range: float32 through two layers of sums of some dozen products, and exp. An
-    output that is the same everywhere is rounded all the same."""
+    output that is the same everywhere is rounded all the same. On CUDA layers are float16, 2^−11: ten times that in the
+    mean (measured 1.9e-3), a hundred times where exp or a normalisation amplifies it (0.040)."""
     truth = np.asarray(truth)
     span = max(np.ptp(truth), 1e-3)
+    if VARIANT.startswith("cuda"):
+        assert np.sqrt(((np.asarray(ours) - truth) ** 2).mean()) <= 10 * 2**-11 * span
+        tolerance = 100 * 2**-11
     assert np.abs(np.asarray(ours) - truth).max() <= tolerance * span + 2.4e-7 * np.abs(truth).max()
 
 
@@ -147,11 +152,12 @@ def test_gradient_of_density_reaches_positions(rng):
 
 
 def test_density_is_zero_outside_the_sphere():
-    field = NetworkField(*fields.uniform(5.0), mi)
+    held = fields.held(5.0)
+    field = NetworkField(*fields.uniform(held), mi)
     sigma = np.array(
         field.density(arrays(np.array([[0.57, 0.57, 0.57], [0.58, 0.58, 0.58], [0.99, 0, 0], [1.01, 0, 0]])))
     )
-    np.testing.assert_allclose(sigma, [5, 0, 5, 0], rtol=1e-5)
+    np.testing.assert_allclose(sigma, [held, 0, held, 0], rtol=1e-5)
 
 
 def test_voxels_hold_the_density_that_interpolates_it_and_the_reflectance_at_their_centres(rng):
