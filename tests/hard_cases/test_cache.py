@@ -342,7 +342,8 @@ def test_keys_follow_the_march_and_the_libraries(medium, cache, monkeypatch):
             patch.setattr(module, "__version__", "0.0.0")
             seen.append(names_of(cache, medium))
     with monkeypatch.context() as patch:
-        patch.setattr(map_cache.dr.detail, "llvm_version", lambda: (1, 2, 3))
+        compiler = "cuda_version" if VARIANT.startswith("cuda") else "llvm_version"
+        patch.setattr(map_cache.dr.detail, compiler, lambda: (1, 2, 3))
         seen.append(names_of(cache, medium))
     assert [len(names) for names in seen] == list(range(1, len(seen) + 1))
 

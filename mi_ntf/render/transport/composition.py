@@ -135,7 +135,7 @@ class Composition:
             return Part(medium, whole, table, mapped, building.build(drawn, medium, table, options))
         if not REGISTRY[method].per_field:
             return Part(medium, whole, table, mapped, mapped)
-        suns, about = self.lights.suns(), (medium, table, options)
+        suns, about = self.lights.suns()[table.first : table.first + table.count], (medium, table, options)
         of_table = building.with_suns(mapped, suns, *about) if suns.any() else mapped
         return Part(medium, whole, table, of_table, building.with_suns(mapped, DRAWN, *about))
 
