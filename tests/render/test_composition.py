@@ -10,6 +10,8 @@ from mi_ntf.core.architecture import Similarity
 from mi_ntf.evaluate import dial
 from mi_ntf.render.lights import scene_lights
 from mi_ntf.render.scene.media import find_media
+from mi_ntf.render.scene.settings import Settings
+from mi_ntf.render.transport import composition
 
 SEEDS = 4
 TURN = [-1.7, -0.75, 1.4]  # clear of the large sphere: where spheres overlap, volpath loses a medium
@@ -227,6 +229,24 @@ def test_a_sun_among_many_lights_is_marched_to(monkeypatch):
     assert light.rows.power[light.suns()].sum() > 0.5 * light.rows.power.sum()
     monkeypatch.setattr(scene_lights.Lights, "suns", lambda self: np.zeros(1, bool))
     assert dial.relative(picture("transmittance_atlas"), truth) > 0.015
+
+
+def test_parts_of_the_lights_know_their_own_suns():
+    """Each part those among its own rows, those that bounced light asks for among all."""
+    loaded = dial.scene("statue", "sky", 16, 1)
+    settings = Settings.of(dial.integrator(visibility="transmittance_atlas"))
+    whole = composition.Composition(loaded, settings, loaded.sensors()[0], 1)
+    expected, found = whole.lights.suns(), []
+    assert expected.any()
+    for i in range(3):
+        part = composition.Composition(loaded, settings.but(share=(i, 3)), loaded.sensors()[0], 1)
+        [one] = part.parts
+        own = getattr(one.mapped, "suns", np.zeros(one.table.count, bool))
+        assert len(own) == one.table.count
+        found += list(own)
+        assert (part.with_all_lights(lambda part=part: part.parts[0].mapped.suns) == expected).all()
+        assert not hasattr(one.drawn.looked_up, "suns")
+    assert found == list(expected)
 
 
 @pytest.mark.parametrize(("count", "bright", "expected"), [(64, 1, 1), (64, 6, 4), (15, 1, 0), (64, 0, 0)])

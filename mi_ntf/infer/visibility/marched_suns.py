@@ -14,7 +14,7 @@ class MarchedSuns:
     Neighbours look at one light at a time, so a march to few of many is next to none to all else."""
 
     def __init__(self, looked_up, march, suns: np.ndarray, dj: ModuleType):
-        self.looked_up, self.march = looked_up, march
+        self.looked_up, self.march, self.suns = looked_up, march, suns
         self._suns = dj.UInt32(suns.astype(np.uint32))
 
     def tau(self, x, wi, distance, index, active):

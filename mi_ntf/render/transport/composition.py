@@ -30,14 +30,15 @@ IN_SMOKE = 4
 @dataclass(frozen=True)
 class Part:
     """One ``nrf`` medium prepared for a render: lights in its field coordinates, all of them (`lights`) and those of
-    the present run (`table`); visibility of the table's lights and of drawn ones and any other rays (None: no
-    shadows)."""
+    the present run (`table`); visibility of the table's lights, of drawn ones and any other rays, and of all lights
+    (None: no shadows)."""
 
     medium: Any
     lights: Any
     table: Any
     mapped: Any
     drawn: Any
+    every: Any
 
     @property
     def frame(self):
@@ -123,7 +124,7 @@ class Composition:
         found = self.effects
         whole = self.lights.table(medium.frame)
         if not found.lit or not found.needs_visibility:
-            return Part(medium, whole, whole, None, None)
+            return Part(medium, whole, whole, None, None, None)
         table = whole.part(*self.runs[self.run]) if len(self.runs) > 1 else whole
         options = building.options(self.settings)
         drawn = REGISTRY[found.visibility].for_drawn
@@ -132,12 +133,17 @@ class Composition:
         method = found.visibility if table.count else drawn  # maps of no light are no maps
         mapped = building.build(method, medium, table, options)
         if drawn != method:
-            return Part(medium, whole, table, mapped, building.build(drawn, medium, table, options))
+            other = building.build(drawn, medium, table, options)
+            return Part(medium, whole, table, mapped, other, other)
         if not REGISTRY[method].per_field:
-            return Part(medium, whole, table, mapped, mapped)
-        suns, about = self.lights.suns()[table.first : table.first + table.count], (medium, table, options)
-        of_table = building.with_suns(mapped, suns, *about) if suns.any() else mapped
-        return Part(medium, whole, table, of_table, building.with_suns(mapped, DRAWN, *about))
+            return Part(medium, whole, table, mapped, mapped, mapped)
+        suns = self.lights.suns()
+
+        def marched(suns):
+            return building.with_suns(mapped, suns, medium, table, options) if suns.any() else mapped
+
+        own = suns[table.first : table.first + table.count]
+        return Part(medium, whole, table, marched(own), marched(DRAWN), marched(suns))
 
     def draw_from(self, stream) -> None:
         """Methods whose lookups draw numbers take them from `stream`, an opaque seed: one for each seed of the user's
@@ -184,10 +190,10 @@ class Composition:
         return hit, t * unit, index
 
     def with_all_lights(self, do):
-        """What `do()` returns where those of other runs shine too, marched to."""
+        """What `do()` returns where those of other runs shine too."""
         parts = self.parts
         if len(self.runs) > 1:
-            self.parts = [replace(p, table=p.lights, mapped=p.drawn) for p in parts]
+            self.parts = [replace(p, table=p.lights, mapped=p.every) for p in parts]
         try:
             return do()
         finally:
