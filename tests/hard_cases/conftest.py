@@ -6,10 +6,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import hard_cases, scenes
+from helpers.maps import find_medium
 from helpers.variants import VARIANT
 from hypothesis import settings
 
 import mi_ntf.render
+from mi_ntf.render import user_cache
+from mi_ntf.render.maps import map_cache
 
 # Properties are deterministic: the same examples in every run, no deadline, since the machine may be busy.
 # The catalogue takes more of them; `pytest_configure` comes before the tests are imported.
@@ -36,6 +39,35 @@ def variant():
 def blobs(tmp_path_factory):
     """A field file of the asymmetric object, σ = 20."""
     return scenes.write_blobs(tmp_path_factory.mktemp("field"), log_density=3.0, visibility=True)
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    return scenes.write_blobs(tmp_path_factory.mktemp("field"), log_density=3.0)
+
+
+@pytest.fixture
+def medium(path):
+    return find_medium(path)
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    """The folder of maps, not yet made."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("MI_NTF_MAP_CACHE", "on")
+    map_cache.forget()
+    user_cache._warned.clear()
+    yield tmp_path / "cache" / "mi-ntf" / "maps"
+    map_cache.forget()
+
+
+@pytest.fixture
+def warnings(monkeypatch):
+    """What is logged."""
+    texts = []
+    monkeypatch.setattr(user_cache.mi, "Log", lambda level, text: texts.append(text))
+    return texts
 
 
 @pytest.fixture

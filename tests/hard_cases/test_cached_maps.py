@@ -1,0 +1,207 @@
+"""Maps in the user's cache: damaged, of another field or program, too many. They may cost time, never a wrong picture,
+never memory."""
+
+import dataclasses
+import os
+from types import SimpleNamespace
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers import scenes
+from helpers.maps import OPTIONS, SIZE, build, find_medium, table, texels, without_cache
+from helpers.variants import VARIANT
+
+from mi_ntf.infer import profile
+from mi_ntf.render.maps import map_cache
+from mi_ntf.render.scene import loaded
+
+# --- files that do not hold what was written -------------------------------------------------------------------------
+
+
+def as_npy(array):
+    def change(file, data):
+        with open(file, "wb") as out:
+            np.save(out, array)
+
+    return change
+
+
+def floats(change):
+    """Numbers changed behind the seal."""
+    def apply(file, data):
+        values = np.frombuffer(data, "<f4", offset=map_cache.SEAL).copy()
+        change(values)
+        file.write_bytes(data[: map_cache.SEAL] + values.tobytes())
+
+    return apply
+
+
+DAMAGE = {
+    "empty": lambda file, data: file.write_bytes(b""),
+    "cut": lambda file, data: file.write_bytes(data[:-1]),
+    "cut in half": lambda file, data: file.write_bytes(data[: len(data) // 2]),
+    "longer": lambda file, data: file.write_bytes(data + b"\0"),
+    "zeros of the right length": lambda file, data: file.write_bytes(bytes(len(data))),
+    "npy": as_npy(np.ones(3 * SIZE // 4, np.float32)),
+    "npy of doubles": as_npy(np.ones(3 * SIZE // 8)),
+    "a pickle": lambda file, data: file.write_bytes(b"cos\nabort\n(tR." + data[14:]),
+    "NaN": floats(lambda v: v.__setitem__(5, np.nan)),
+    "inf": floats(lambda v: v.__setitem__(-1, np.inf)),
+    "zeros": floats(lambda v: v.fill(0)),
+    "swapped": floats(lambda v: v.__setitem__(slice(None), v[::-1].copy())),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_a_damaged_map_is_made_anew(medium, cache, warnings, damage):
+    expected = texels(medium)
+    (file,) = cache.iterdir()
+    data = file.read_bytes()
+    DAMAGE[damage](file, data)
+    map_cache.forget()
+    np.testing.assert_array_equal(texels(medium), expected)
+    assert file.read_bytes() == data and list(cache.iterdir()) == [file] and not warnings
+
+
+def test_every_flipped_bit_is_noticed(medium, cache, rng):
+    """Of the seal and of the texels; one light's map under another's name as well."""
+    texels(medium)
+    (file,) = cache.iterdir()
+    name, count, data = file.stem, 3 * SIZE // 4, file.read_bytes()
+    assert map_cache._read(name, count) is not None
+    for place in [*range(map_cache.SEAL), *rng.integers(map_cache.SEAL, len(data), 300)]:
+        flipped = bytearray(data)
+        flipped[place] ^= 1 << rng.integers(8)
+        file.write_bytes(flipped)
+        assert map_cache._read(name, count) is None, place
+    file.write_bytes(data)
+    assert map_cache._read(name, count) is not None
+    file.rename(file.with_name(f"{'0' * 64}.map"))
+    assert map_cache._read("0" * 64, count) is None
+
+
+def test_something_else_under_a_maps_name(medium, cache, warnings):
+    """A folder cannot be replaced, and a pipe would be waited for: a warning, a warning less, and the map."""
+    expected = texels(medium)
+    (file,) = cache.iterdir()
+    file.unlink()
+    file.mkdir()
+    map_cache.forget()
+    np.testing.assert_array_equal(texels(medium), expected)
+    assert len(warnings) == 1 and "Is a directory" in warnings[0]
+    file.rmdir()
+    os.mkfifo(file)
+    map_cache.forget()
+    np.testing.assert_array_equal(texels(medium), expected)
+    assert file.is_file() and len(warnings) == 1
+
+
+def test_numbers_that_are_not_finite_are_never_kept(cache):
+    made = SimpleNamespace(values=mi.Float([1.0, np.nan]))
+    assert map_cache.cached("0" * 64, lambda values=None: made, 2, 1e9) is made
+    assert not cache.exists()
+
+
+# --- keys ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_field_trained_over_while_it_is_loaded(tmp_path, cache):
+    """The process that holds the old field stores old maps, which the new field must never meet."""
+    path = scenes.write_blobs(tmp_path, log_density=3.0)
+    old = find_medium(path)
+    scenes.write_blobs(tmp_path, log_density=-1.0)  # the same name, size and, within a tick of the clock, time
+    before = texels(old)
+    map_cache.forget()
+    loaded._load.cache_clear()
+    new = find_medium(path)
+    after = texels(new)
+    np.testing.assert_array_equal(before, without_cache(old))
+    np.testing.assert_array_equal(after, without_cache(new))
+    assert np.abs(before - after).max() > 1
+    assert old.field.digest != new.field.digest and len(list(cache.iterdir())) == 2
+
+
+def test_a_field_written_within_one_tick_of_the_clock_is_read_anew(tmp_path):
+    path = scenes.write_blobs(tmp_path, log_density=3.0)
+    stat = path.stat()
+    old = loaded.load(str(path), 32)
+    scenes.write_blobs(tmp_path, log_density=-1.0)
+    os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+    assert path.stat().st_size == stat.st_size
+    assert loaded.load(str(path), 32).digest != old.digest
+
+
+def test_the_same_networks_in_another_file_share_maps(path, tmp_path, cache, medium):
+    copy = tmp_path / "copy.safetensors"
+    copy.write_bytes(path.read_bytes())
+    texels(medium)
+    map_cache.forget()
+    texels(find_medium(copy))
+    assert len(list(cache.iterdir())) == 1
+
+
+def names_of(cache, medium, options=OPTIONS):
+    map_cache.forget()
+    texels(medium, options=options)
+    return {p.name for p in cache.iterdir()}
+
+
+def test_keys_follow_the_march_and_the_libraries(medium, cache, monkeypatch):
+    """What decides texels, or their last bits, decides the name."""
+    seen = [names_of(cache, medium)]
+    seen.append(names_of(cache, medium, dataclasses.replace(OPTIONS, step=2 / 128)))
+    network = dataclasses.replace(OPTIONS, map_source="network")
+    seen.append(names_of(cache, medium, network))
+    monkeypatch.setattr(profile, "FOR_NETWORKS", 1.25)  # the rule for a march's step, which only this source follows
+    seen.append(names_of(cache, medium, network))
+    assert names_of(cache, medium) == seen[-1]
+    for module in (map_cache.mi, map_cache.dr, map_cache.np):
+        with monkeypatch.context() as patch:
+            patch.setattr(module, "__version__", "0.0.0")
+            seen.append(names_of(cache, medium))
+    with monkeypatch.context() as patch:
+        compiler = "cuda_version" if VARIANT.startswith("cuda") else "llvm_version"
+        patch.setattr(map_cache.dr.detail, compiler, lambda: (1, 2, 3))
+        seen.append(names_of(cache, medium))
+    assert [len(names) for names in seen] == list(range(1, len(seen) + 1))
+
+
+# --- memory ----------------------------------------------------------------------------------------------------------
+
+
+def held():
+    return sum(4 * len(m.values) for m in map_cache._maps.values())
+
+
+def kept(size: int):
+    """What stands for a map of `size` bytes."""
+    return SimpleNamespace(values=np.zeros(size // 4, np.float32), texels=SimpleNamespace(nbytes=size))
+
+
+def test_kept_maps_and_the_one_in_the_making_fit_into_map_memory(cache, monkeypatch):
+    """Lights that move each frame: a new map each time, in a memory for two and a half."""
+    monkeypatch.setenv("MI_NTF_MAP_CACHE", "memory")
+    limit, size, most = 2.5 * 1000, 1000, []
+
+    def make(values=None):
+        most.append(held() + size)
+        return kept(size)
+
+    for k in range(6):
+        map_cache.cached(str(k), make, size // 4, limit)
+    assert max(most) <= limit and max(most) == 2000 and held() == 2000
+    map_cache.cached("larger than all", lambda values=None: kept(2800), 700, limit)
+    assert held() == 0, "what exceeds the memory alone is not kept beside"
+
+
+def test_maps_of_one_run_of_several_are_not_kept(medium, cache):
+    whole = table()
+    build(medium, whole)
+    assert held() == 3 * SIZE
+    for k in range(3):
+        part = whole.part(k, k + 1)
+        first = build(medium, part, dataclasses.replace(OPTIONS, map_memory=SIZE / 2**20))
+        assert held() == 0
+        assert build(medium, part, OPTIONS) is not first
+    assert len(list(cache.iterdir())) == 4, "on disk each run is found again"
