@@ -6,6 +6,7 @@ from types import ModuleType
 import numpy as np
 
 from ..core.errors import MiNtfError
+from ..core.variants import VARIANTS
 
 
 def module(variant: str) -> ModuleType:
@@ -13,13 +14,12 @@ def module(variant: str) -> ModuleType:
 
     Raises MiNtfError for variants without a JIT compiler, without derivatives, or not linear RGB in single precision.
     """
-    backend, *rest = variant.split("_")
-    if backend not in ("llvm", "cuda") or rest != ["ad", "rgb"]:
+    if variant not in VARIANTS:
         raise MiNtfError(
             f"variant {variant}: the nrf and ntf plugins need llvm_ad_rgb or cuda_ad_rgb; "
             "add `-m llvm_ad_rgb` to the command line"
         )
-    return importlib.import_module(f"drjit.{backend}.ad")
+    return importlib.import_module(f"drjit.{variant.partition('_')[0]}.ad")
 
 
 ALIGNMENT = 64

@@ -104,6 +104,11 @@ class NetworkField:
         return hit, h, mixture.from_outputs(ops, pairs, raw[count:], h)
 
 
+def _half(dj: ModuleType) -> bool:
+    """Whether cooperative vectors are float16, which ends at 65504: on CUDA. On LLVM float32 is faster, and exact."""
+    return dr.backend_v(dj.Float) == dr.JitBackend.CUDA
+
+
 class _Network:
     """An encoding and its perceptron."""
 
@@ -123,8 +128,7 @@ class _Network:
         self._pack(name, tensors, count)
 
     def _pack(self, name: str, tensors: dict, count: int) -> None:
-        # Cooperative vectors are float16 on CUDA, which ends at 65504; on LLVM float32 is the faster (and exact) one.
-        half = dr.backend_v(self.dj.Float) == dr.JitBackend.CUDA
+        half = _half(self.dj)
         self.scalar = self.dj.Float16 if half else self.dj.Float
         tensor = self.dj.TensorXf16 if half else self.dj.TensorXf
         shapes = [tensors[f"{name}.layers.{i}.weight"].shape for i in range(count)]

@@ -182,8 +182,8 @@ LIGHTS = """<emitter type="constant"><rgb name="radiance" value="0.1"/></emitter
     ("raymarch", 3, True), ("transmittance_map", 2, True),
     ("transmittance_atlas", 3, False)])
 def test_parts_of_the_lights_add_up_to_the_frame(scene, tmp_path, visibility, depth, surface):
-    """Background, surfaces, bounces and opacity are there once. Bounced light is marched in parts, whatever the method.
-    """
+    """Background, surfaces, bounces and opacity are there once. In parts, bounced light is marched where maps would
+    serve the whole. The brightest lights, which an atlas marches to, come last."""
     path = scene(LIGHTS if surface else LIGHTS.split("<shape")[0])
     frame = Frame(0, {"visibility": visibility, "depth": str(depth), "spp": "4"})
     (alone,) = tasks(path, tmp_path / "whole", [frame])

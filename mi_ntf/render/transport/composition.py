@@ -113,7 +113,7 @@ class Composition:
 
     def select(self, run: int) -> None:
         """Prepare the lights of run `run`: the first adds all else that shines as well, later ones these lights alone,
-        where fields scatter them once. Further bounces march towards all lights in the first run."""
+        where fields scatter them once. Further bounces ask for all lights in the first run."""
         if run == self.run:
             return
         self.run, self.parts, self.in_view = run, [], []  # lets go of the maps before others are made
