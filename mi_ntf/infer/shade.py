@@ -19,8 +19,8 @@ def reflect(points, lights, visibility, specular=True, gradients=False, skin=Tru
     points      :class:`Points`
     lights      has ``count`` and ``sample(index, x, active) → (wi, irradiance, distance)``, and the number that
                 `visibility` knows the light by, where that is not its index
-    visibility  has ``tau`` (:mod:`mi_ntf.infer.visibility`); None: no shadow. The light then does not pass the skin
-                either, so a point reflects as a surface does, ρ ⟨n,ω_i⟩⁺
+    visibility  has ``tau`` (:mod:`mi_ntf.infer.visibility`), a number or a colour; None: no shadow. The light then does
+                not pass the skin either, so a point reflects as a surface does, ρ ⟨n,ω_i⟩⁺
     specular    whether the field has a specular lobe; without, all its albedo is diffuse
     skin        whether the points lie in a skin; otherwise on a surface, as without shadow
     gradients   whether a parameter is attached: the loop can then be differentiated in reverse. Transmittances are held
@@ -41,7 +41,8 @@ def reflect(points, lights, visibility, specular=True, gradients=False, skin=Tru
         if moving and visibility:
             tau = tau * _edge(wi, points.normal)
         value = [k * diffuse + gloss for k in points.albedo] if specular else [k * diffuse for k in points.albedo]
-        r, g, b = (c + e * v * tau for c, e, v in zip((r, g, b), irradiance, value, strict=True))
+        dimmed = tuple(tau) if dr.depth_v(tau) > 1 else (tau, tau, tau)
+        r, g, b = (c + e * v * t for c, e, v, t in zip((r, g, b), irradiance, value, dimmed, strict=True))
         return i + 1, r, g, b
 
     zero = dr.zeros(floats, dr.width(points.x[0]))

@@ -18,13 +18,13 @@ import numpy as np
 
 from ...core import spheres
 from ...core.errors import MiNtfError
-from .recent import Recent
+from .recent import Recent, Version
 
 ROWS = 512
 """Rows of blocks that a map is summed to at most, and twice as many columns; more only where more lights are wanted."""
 FLOOR = 1e-2
 """Share of an even sky that cells are cut by: dark regions too get a few, whose texels then have useful gradients."""
-_kept = Recent()
+_kept, _kept_of_emitters, _drawable = Recent(), Recent(4), Recent(2)
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(6)
 
 
@@ -146,6 +146,11 @@ def cells(image: np.ndarray, limit: int) -> Cells:
     return _kept.of(key, lambda: _cells(image, limit))
 
 
+def cells_of(emitter, kind: str, limit: int) -> Cells:
+    """Return the :func:`cells` of an ``envmap`` or ``constant``."""
+    return _kept_of_emitters.of((Version(emitter), limit), lambda: cells(image(emitter, kind), limit))
+
+
 def _cells(image: np.ndarray, limit: int) -> Cells:
     height, width = image.shape[:2]
     latitude, longitude = axes(height, width, limit)
@@ -246,6 +251,44 @@ def radiance(emitter, towards: np.ndarray) -> np.ndarray:
     si.wi = mi.Vector3f(*(-towards.T).astype(np.float32))
     found = np.array(emitter.eval(si), dtype=np.float64).reshape(3, -1).T
     return np.broadcast_to(found, (len(towards), 3))
+
+
+def drawable(emitter):
+    """Return an emitter of the same light whose own sampling finds all of it: `emitter` itself, or a copy of an
+    ``envmap`` whose `mis_compensation` leaves the light below its mean to BSDF samples (Karlík et al. 2019), which
+    points of fields do not draw."""
+    if emitter.class_name() != "EnvironmentMapEmitter":
+        return emitter
+    return _drawable.of(Version(emitter), lambda: _uncompensated(emitter) if _is_compensated(emitter) else emitter)
+
+
+PROBES = 64
+"""Rows and columns of an environment, at most, that tell how it is sampled."""
+
+
+def _is_compensated(emitter) -> bool:
+    """Whether the density of an ``envmap`` is not in proportion to its luminance, at the centres of texels."""
+    height, width = mi.traverse(emitter)["data"].shape[:2]
+    row, column = (np.unique(np.linspace(a, n - 1 - a, PROBES).astype(int)) for a, n in ((1, height), (0, width - 2)))
+    theta, phi = np.meshgrid(row * np.pi / (height - 1), (column + 0.5) * 2 * np.pi / (width - 2), indexing="ij")
+    own = np.stack([np.sin(phi) * np.sin(theta), np.cos(theta), -np.cos(phi) * np.sin(theta)], -1).reshape(-1, 3)
+    towards = own @ placement(emitter, "envmap")[0].T
+    luminance = radiance(emitter, towards * scale(emitter)) @ [0.212671, 0.715160, 0.072169]
+    ds = dr.zeros(mi.DirectionSample3f, len(towards))
+    ds.d = mi.Vector3f(*(towards * scale(emitter)).T.astype(np.float32))
+    density = np.array(emitter.pdf_direction(dr.zeros(mi.Interaction3f, len(towards)), ds), np.float64)
+    lit = luminance > 1e-3 * luminance.max()
+    ratio = density[lit] / luminance[lit]
+    return bool(lit.any() and ratio.min() < 0.9 * ratio.max())
+
+
+def _uncompensated(emitter):
+    copy = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(np.ones((2, 2, 3), np.float32))})
+    ours, theirs = mi.traverse(copy), mi.traverse(emitter)
+    for key in ("data", "scale", "to_world"):
+        ours[key] = theirs[key]
+    ours.update()
+    return copy
 
 
 def seen(emitter, d):

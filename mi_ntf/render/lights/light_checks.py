@@ -6,6 +6,9 @@ import numpy as np
 
 from ...core.errors import MiNtfError
 from .environment import name
+from .recent import Recent, Version
+
+_checked = Recent(2)
 
 
 def check(emitter, kind: str, drawn: bool = False) -> None:
@@ -17,6 +20,14 @@ def check(emitter, kind: str, drawn: bool = False) -> None:
             f"{called}: Mitsuba cannot sample timed_sunsky in a loop over shading points; use sunsky at one moment, or "
             "an envmap of the average over several"
         )
+    if kind == "envmap":  # whose texels take long to read
+        _checked.of((Version(emitter), drawn), lambda: _check(emitter, kind, drawn))
+    else:
+        _check(emitter, kind, drawn)
+
+
+def _check(emitter, kind: str, drawn: bool) -> None:
+    called = name(emitter, kind)
     for key, value in mi.traverse(emitter):
         numbers = _numbers(value)
         if numbers is None:

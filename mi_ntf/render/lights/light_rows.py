@@ -101,8 +101,8 @@ def sky(emitter, kind: str, limit: int) -> tuple[Rows, environment.Cells]:
     """At most `limit` directional lights for an ``envmap``, ``constant`` or ``sunsky``, and the cells that they are of;
     the sun of a ``sunsky`` comes last, a light of its own."""
     found = sun.sky(emitter) if kind == "sunsky" else None
-    image = found.image if found else environment.image(emitter, kind)
-    cells = environment.cells(image, max(1, limit - bool(found)))
+    limit = max(1, limit - bool(found))
+    cells = environment.cells(found.image, limit) if found else environment.cells_of(emitter, kind, limit)
     rotation, _ = environment.placement(emitter, kind)
     where, power = cells.direction @ rotation.T, cells.power
     if found:

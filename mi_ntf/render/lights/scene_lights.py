@@ -9,7 +9,7 @@ import numpy as np
 
 from ...infer.lights import LightTable
 from ..scene.frame import Frame
-from . import light_checks, light_gradients, light_rows
+from . import environment, light_checks, light_gradients, light_rows
 from .emitter_samples import EmitterSamples
 
 SUN, AMONG = 0.1, 16
@@ -62,7 +62,7 @@ class Lights:
     def __init__(self, scene, media=(), light_samples: int = 0, environment_lights: int = 512,
                  dimmest: float = 0.0, only: tuple[int, ...] | None = None):
         self._wrapped: list = []
-        outer = [e for i, e in enumerate(scene.emitters()) if only is None or i in only]
+        outer = [e for i, e in enumerate(scene.emitters()) if (only is None or i in only) and _is_found(e)]
         emitters = [self._unwrap(e, scene, media) for e in outer]
         self.background = scene.environment() is not None and any(e.is_environment() for e in outer)
         self.kinds = [kind(e) for e in emitters]
@@ -78,8 +78,10 @@ class Lights:
         self._dimmest = dimmest
         self.rows = every.part(self._bright(dimmest)) if dimmest else every
         pairs = [(e, w) for e, w in zip(emitters, outer, strict=True) if light_samples or not is_discrete(e)]
-        self.sampled = [e for e, _ in pairs if _shines(e)]
-        self._weights = [w.sampling_weight() for e, w in pairs if _shines(e)]
+        self.sampled = [_drawable(e, scene) for e, _ in pairs if _shines(e)]
+        # One of weight 0, which Mitsuba leaves to BSDF samples, shines as well: points of fields have emitter samples
+        # alone.
+        self._weights = [w.sampling_weight() or 1.0 for e, w in pairs if _shines(e)]
 
     def _bright(self, dimmest: float) -> np.ndarray:
         """Which of all rows remain."""
@@ -158,6 +160,20 @@ def is_discrete(emitter) -> bool:
 
 def _is_textured_spot(emitter) -> bool:
     return kind(emitter) == "spot" and mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
+
+
+def _is_found(emitter) -> bool:
+    """False for a light of one point or direction whose `sampling_weight` is 0: no ray meets it, so the stock
+    integrators never see it."""
+    return emitter.sampling_weight() > 0 or not mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta)
+
+
+def _drawable(emitter, scene):
+    """Return :func:`mi_ntf.render.lights.environment.drawable` of an emitter of `scene`."""
+    found = environment.drawable(emitter)
+    if found is not emitter:
+        found.set_scene(scene)
+    return found
 
 
 def _shines(emitter) -> bool:

@@ -71,11 +71,15 @@ def emitter_class() -> type:
         def _prepare(self):
             light_checks.check(self.inner, scene_lights.kind(self.inner), drawn=True)
             environment.check_unscaled(self.inner)
+            if not self.sampling_weight() and not mi.has_flag(self.inner.flags(), mi.EmitterFlags.Delta):
+                raise MiNtfError("ntf emitter: sampling_weight is 0, so that BSDF samples alone would find the light, "
+                                 "which know nothing of the field's shadow; give it a weight above 0")
+            self._drawn = environment.drawable(self.inner)
             self._method = _visibility(self.visibility, self.inner, self.medium)
 
         def sample_direction(self, it, sample, active=True):
             inner = self.attached()
-            ds, weight = inner.sample_direction(it, sample, active)
+            ds, weight = (inner if self.bare else self._drawn).sample_direction(it, sample, active)
             if _is_far(inner):
                 # The nested light never learns the scene's size: it believes in a unit sphere and would end shadow rays
                 # there.

@@ -10,7 +10,7 @@ from ...core.errors import MiNtfError
 from ...infer.visibility import REGISTRY
 from ..cost import model
 from . import gradient_checks
-from .media import ordinary_shapes
+from .media import ordinary_shapes, shape_groups, transmits
 from .settings import Settings
 
 PINHOLES = ("PerspectiveCamera",)
@@ -68,9 +68,12 @@ def describe(scene, settings: Settings, sensor, spp: int, media: list, light) ->
     lit = bool(light.rows.power.size or light.sampled) and not 0 <= depth < 2
     exhaustive = settings.light_samples == 0
     gradients = gradient_checks.check(scene, light)
-    # Derivatives by a light's place need the light's own transmittance.
-    collocated = lit and not gradients and settings.visibility != "none" and _at_camera(light, sensor, media)
-    surfaces = len(ordinary_shapes(scene)) > 0
+    shapes = ordinary_shapes(scene)
+    surfaces = len(shapes) > 0
+    # Derivatives by a light's place need the light's own transmittance. A camera ray crosses a surface or does not,
+    # where light is dimmed.
+    collocated = (lit and not gradients and settings.visibility != "none" and _at_camera(light, sensor, media)
+                  and not transmits(shape_groups(scene) + shapes))
     width, height = sensor.film().crop_size()
     bounces = _bounces(settings, media, surfaces, gradients) if lit and not 0 <= depth <= 2 else ""
     method, reason = _method(settings, width * height * spp, media, light, surfaces, bounces)

@@ -30,8 +30,9 @@ def find_media(scene) -> list:
 
 
 def ordinary_shapes(scene) -> list:
-    """All shapes but the bounds of ``nrf`` media. Raises MiNtfError where one holds another medium."""
-    shapes = [s for s in scene.shapes() if _nrf_medium(s) is None]
+    """Return the shapes that rays can meet: all but the bounds of ``nrf`` media and those of a ``null`` BSDF that do
+    not shine. Raises MiNtfError where one holds another medium."""
+    shapes = [s for s in scene.shapes() if _nrf_medium(s) is None and not _is_absent(s)]
     for shape in shapes:
         if shape.is_medium_transition():
             raise MiNtfError(
@@ -39,6 +40,24 @@ def ordinary_shapes(scene) -> list:
                 "not see; remove the medium, or render the scene with volpath"
             )
     return shapes
+
+
+def shape_groups(scene) -> list:
+    """Return the ``shapegroup`` objects of `scene`, which its list of shapes leaves out."""
+    return [node for node in mi.traverse(scene).hierarchy if node.class_name() == "ShapeGroupPlugin"]
+
+
+def transmits(objects: list) -> bool:
+    """Whether light may cross one of `objects`, shapes and groups, without being scattered: at the null component of a
+    BSDF."""
+    return any(isinstance(node, mi.BSDF) and mi.has_flag(node.flags(), mi.BSDFFlags.Null)
+               for shape in objects for node in mi.traverse(shape).hierarchy)
+
+
+def _is_absent(shape) -> bool:
+    """Whether a shape neither scatters light nor emits it."""
+    simple = shape.class_name() != "Instance" and not shape.is_medium_transition() and not shape.is_emitter()
+    return simple and shape.bsdf().class_name() == "Null"
 
 
 def _nrf_medium(shape):

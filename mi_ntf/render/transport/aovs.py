@@ -64,9 +64,10 @@ def _channels(name: str, lights: int) -> tuple[str, ...]:
 
 
 def _tau(shadow, table, x, light, active):
-    """τ from field points `x` to light `light` of the table."""
+    """τ from field points `x` to light `light` of the table, the mean of a coloured one."""
     wi, _, distance = table.sample(light, x, True)
-    return shadow.tau(x, wi, distance, light, active) if shadow else mi.Float(1)
+    tau = shadow.tau(x, wi, distance, light, active) if shadow else mi.Float(1)
+    return dr.mean(tau) if dr.depth_v(tau) > 1 else tau
 
 
 class Sums:
@@ -112,14 +113,38 @@ class Sums:
         if not self.later:
             self.opacity = opacity
 
-    def add_surface(self, ray, hit, transmittance) -> None:
-        """What lies behind the fields: preliminary intersections `hit` of the rays; `transmittance` of the fields
-        before them."""
+    def of_rays(self, rays: int) -> "Sums":
+        """Empty sums of the same outputs for so many other rays."""
+        return Sums(self.wanted, self.lights, rays, self.first, self.later)
+
+    def add_behind(self, other: "Sums", transmittance, index) -> None:
+        """Add the sums of rays that go on where the rays `index` cross a surface; `transmittance`: what is left of the
+        latter there."""
+        def add(sums, values, where, weight) -> None:
+            for total, value in zip(sums, values, strict=True):
+                dr.scatter_reduce(dr.ReduceOp.Add, total, value * weight, where, mode=dr.ReduceMode.NoConflicts)
+
+        for name, sums in self.sums.items():
+            add(sums, other.sums[name], index, transmittance)
+        add(self.stopped, other.stopped, index, transmittance)
+        if self.layers is not None:
+            lights = dr.opaque(mi.UInt32, self.lights)
+            lane = dr.arange(mi.UInt32, dr.width(other.layers))
+            ray = lane // lights
+            there = dr.gather(mi.UInt32, index, ray) * lights + (lane - ray * lights)
+            add([self.layers], [other.layers], there, dr.gather(mi.Float, transmittance, ray))
+        if not self.later:
+            opacity = 1 - transmittance * (1 - other.opacity)
+            dr.scatter(self.opacity, opacity, index)
+
+    def add_surface(self, ray, hit, transmittance, way) -> None:
+        """What lies behind the fields: preliminary intersections `hit` of the rays; `transmittance`: how much of each
+        ray ends there; `way`: distance from the camera to the rays' origins."""
         if self.later:
             return
         si, hit = hit.compute_surface_interaction(mi.Ray3f(ray)), hit.is_valid()
         weight = dr.select(hit, transmittance, 0)
-        values = {"depth": lambda: [si.t], "normal": lambda: si.sh_frame.n,
+        values = {"depth": lambda: [si.t + way], "normal": lambda: si.sh_frame.n,
                   "albedo": lambda: si.bsdf().eval_diffuse_reflectance(si, hit)}
         for name in (n for n in values if n in self.sums):
             self.sums[name] = [total + dr.select(hit, value, 0) * weight

@@ -1,6 +1,5 @@
 """Camera rays through a composition: radiance and opacity."""
 
-import itertools
 from dataclasses import replace
 from typing import Any
 
@@ -11,7 +10,8 @@ from ...infer import march, shade
 from ..lights import environment
 from .composition import Composition, Part
 from .seen import Seen
-from .walk import Paths, Walk
+from .surfaces import Surfaces
+from .walk import Paths, Walk, join
 
 
 def trace(composition: Composition, ray, quadrature, stream, sums=None, seen: Seen | None = None):
@@ -25,15 +25,18 @@ def trace(composition: Composition, ray, quadrature, stream, sums=None, seen: Se
 
 class _CameraLight:
     """The light along rays: `hit`, the surfaces that they meet (None without surfaces); `total`, the sum so far, a
-    float a ray for each channel; `met`, the samples of the fields and the scene length of their t's unit."""
+    float a ray for each channel; `met`, the samples of the fields and the scene length of their t's unit; `crossing`,
+    the rays that go straight on through the surfaces (None without any); `way`, how far the rays have come already."""
 
-    def __init__(self, composition: Composition, ray, quadrature, stream, sums, seen: Seen):
+    def __init__(self, composition: Composition, ray, quadrature, stream, sums, seen: Seen, way=None):
         self.scene, self.ray, self.stream, self.sums, self.seen = composition, ray, stream, sums, seen
         self.offset, self.depth = quadrature
         self.effects, self.first_run = composition.effects, not composition.run
         self.total = [dr.zeros(mi.Float, dr.width(ray.o)) for _ in range(3)]
         self.hit: Any = None
         self.met: Any = None
+        self.crossing: Paths | None = None
+        self.way = mi.Float(0) if way is None else way
 
     def trace(self):
         surfaces, ray, found = self.scene.surfaces, self.ray, self.effects
@@ -43,6 +46,8 @@ class _CameraLight:
         transmittance = self._fields() if self.scene.in_view else dr.ones(mi.Float, dr.width(ray.o))
         if (surfaces or found.bounces == "paths") and self.first_run:
             self.scene.with_all_lights(lambda: self._bounces(transmittance))
+        elif surfaces and surfaces.transmitting:
+            self._surface_paths(surfaces, self._walk(), self._camera(transmittance), lit=False)
         opacity = 1 - transmittance
         radiance = mi.Color3f(*self.total)
         missed = True
@@ -52,11 +57,38 @@ class _CameraLight:
         if self.sums:
             self.sums.add_opacity(opacity)
             if self.hit is not None:
-                self.sums.add_surface(ray, self.hit, transmittance)
+                self.sums.add_surface(ray, self.hit, self._stopped(transmittance), self.way)
         if found.background and self.first_run:
             behind = environment.seen(self.scene.scene.environment(), ray.d)
             radiance += dr.select(missed, transmittance, 0) * behind
             opacity = dr.ones(mi.Float, dr.width(ray.o))
+        if self.crossing is not None and dr.width(self.crossing.pixel):
+            radiance, opacity = self._behind(self.crossing, radiance, opacity, transmittance)
+        return radiance, opacity
+
+    def _stopped(self, transmittance):
+        """The part of the rays' `transmittance` that ends on the surfaces they meet."""
+        if self.crossing is not None and dr.width(self.crossing.pixel):
+            transmittance = mi.Float(transmittance)
+            dr.scatter(transmittance, mi.Float(0), self.crossing.pixel)
+        return transmittance
+
+    def _behind(self, paths: Paths, radiance, opacity, transmittance):
+        """Add what the rays that cross surfaces meet behind them: ``(radiance, opacity)`` of all rays."""
+        pixel = paths.pixel
+        quadrature = tuple(dr.gather(mi.Float, a, pixel) for a in (self.offset, self.depth))
+        sums = self.sums and self.sums.of_rays(dr.width(pixel))
+        one: Any = dr.opaque(mi.UInt32, 1)
+        stream = mi.sample_tea_32(self.stream, one)[0]
+        dr.make_opaque(stream)
+        light, covered = _CameraLight(self.scene, paths.ray, quadrature, stream, sums, Seen(keep=False),
+                                      paths.way).trace()
+        through = dr.gather(mi.Float, transmittance, pixel)
+        if self.sums:
+            self.sums.add_behind(sums, through, pixel)
+        for channel, value in zip(radiance, light * paths.weight, strict=True):
+            dr.scatter_reduce(dr.ReduceOp.Add, channel, value, pixel, mode=dr.ReduceMode.NoConflicts)
+        dr.scatter(opacity, 1 - through * (1 - covered), pixel)
         return radiance, opacity
 
     def _fields(self):
@@ -91,6 +123,7 @@ class _CameraLight:
         points = self.seen.points(samples, i, lambda: self._points(i, part, samples, index, t))
         if self.sums:
             distance = (dr.gather(mi.Float, samples.bundle.base, index) + t) * unit
+            distance += self.way if dr.width(self.way) == 1 else dr.gather(mi.Float, self.way, index)
             self.sums.add_field(i, part, points, samples, kept, distance, self.scene.shadow(part, "mapped"))
         if self.effects.lit:
             reflected = self._with_bounces(part, points, self.scene.reflect(part, points, self.stream, view))
@@ -112,26 +145,29 @@ class _CameraLight:
             return light
         return [a + b for a, b in zip(light, bounced.reflect(part, points), strict=True)]
 
+    def _walk(self) -> Walk:
+        return Walk(self.scene, self.scene.settings.max_depth, self.total, self.stream)
+
+    def _camera(self, transmittance) -> Paths:
+        """The camera rays behind the fields."""
+        everyone = dr.arange(mi.UInt32, dr.width(self.ray.o))
+        way = dr.zeros(mi.Float, dr.width(everyone)) + self.way
+        transmitting = self.scene.surfaces and self.scene.surfaces.transmitting
+        return Paths(mi.Ray3f(self.ray), mi.Color3f(transmittance), everyone, mi.Float(-1), self._random(everyone),
+                     way if transmitting else None)
+
     def _bounces(self, transmittance):
         """Adds the light of surfaces that the camera sees, and of paths of more than one bounce."""
-        surfaces, n = self.scene.surfaces, dr.width(self.ray.o)
-        walk = Walk(self.scene, self.scene.settings.max_depth, self.total, self.stream)
-        everyone = dr.arange(mi.UInt32, n)
-        camera = Paths(mi.Ray3f(self.ray), mi.Color3f(transmittance), everyone, mi.Float(-1), self._random(everyone))
+        surfaces, walk, camera = self.scene.surfaces, self._walk(), self._camera(transmittance)
         # A camera ray goes on from matter, from the surface behind it, or from both.
         onward = []
-        met: Any = dr.compress(self.hit.is_valid()) if surfaces else ()
-        if surfaces and dr.width(met):
-            onward += self._surface_paths(walk, camera, met)
+        if surfaces:
+            onward += self._surface_paths(surfaces, walk, camera, self.effects.lit)
         if self.effects.bounces and self.scene.in_view:
             onward += self._field_paths(walk, camera)
         if not onward or not (self.effects.bounces or (surfaces and surfaces.lights_can_be_hit)):
             return
-        ends = list(itertools.accumulate(dr.width(paths.pixel) for paths in onward))
-        whole = camera.take(dr.zeros(mi.UInt32, ends[-1]))
-        for paths, end in zip(onward, ends, strict=True):
-            count = dr.width(paths.pixel)
-            whole.put(paths, dr.arange(mi.UInt32, count) + (end - count))
+        whole = join(onward)
         walk.run(whole.take(dr.compress(dr.max(whole.weight) > 0)))
 
     def _random(self, sequence):
@@ -139,14 +175,21 @@ class _CameraLight:
         start, sequence = mi.sample_tea_32(self.stream, sequence)
         return mi.PCG32(dr.width(sequence), mi.UInt64(start), mi.UInt64(sequence))
 
-    def _surface_paths(self, walk: Walk, camera: Paths, met) -> list[Paths]:
-        """What goes on from the surfaces that the camera rays `met` meet, whose light is added: nothing without any."""
+    def _surface_paths(self, surfaces: Surfaces, walk: Walk, camera: Paths, lit: bool) -> list[Paths]:
+        """What goes on from the surfaces that camera rays meet, whose light is added: nothing unless they are `lit`.
+        Sets `crossing`."""
+        met: Any = dr.compress(self.hit.is_valid())
+        if not dr.width(met) or not (lit or surfaces.shining or surfaces.transmitting):
+            return []
         paths = replace(camera.take(met), rng=self._random(met + dr.width(camera.pixel)))
         hit = dr.gather(type(self.hit), self.hit, met)
         si = hit.compute_surface_interaction(mi.Ray3f(paths.ray))
-        if self.scene.surfaces and self.scene.surfaces.shining:
+        if surfaces.shining and self.first_run:
             walk.add(paths, si.emitter(self.scene.scene).eval(si))
-        return [walk.on_surface(paths, si)] if self.effects.lit else []
+        if not (lit or surfaces.transmitting):
+            return []
+        paths, self.crossing = walk.on_surface(paths, si, lit)
+        return [paths] if lit else []
 
     def _field_paths(self, walk: Walk, camera: Paths):
         """What matter scatters on of camera rays: from one of a ray's shading points, drawn by their weights."""

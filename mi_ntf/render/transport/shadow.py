@@ -14,14 +14,14 @@ class Shadow:
         self.frame, self.own, self.others, self.surfaces, self.far = frame, own, others, surfaces, far
 
     def tau(self, x, wi, distance, index, active):
-        """The product of their transmittances, in [0, 1]."""
+        """Return the product of their transmittances, in [0, 1]; a colour where surfaces may have one."""
         tau = self.own.tau(x, wi, type(distance)(dr.inf) if self.far else distance, index, active)
         p, d = self.frame.point_to_world(x), self.frame.direction_to_world(wi)
         length = distance * self.frame.length
         for frame, other in self.others:
             tau = tau * between(frame, other, p, d, length, index, active & (tau > 0))
         if self.surfaces:
-            tau = dr.select(self.surfaces.blocked(p, d, length, active & (tau > 0)), 0, tau)
+            tau = tau * self.surfaces.transmission(p, d, length, active & (tau > 0))
         return tau
 
 

@@ -5,6 +5,7 @@ import mitsuba as mi
 
 from ..lights import environment
 from ..lights.emitter_samples import sharp
+from ..scene.media import shape_groups, transmits
 
 
 class Surfaces:
@@ -14,16 +15,19 @@ class Surfaces:
     hide_emitters  whether shapes that shine are left out of what the camera sees
     transmittance  callable ``(p, d, distance, active, sun=False)``: what the fields let through, scene coordinates
 
-    Direct light as stock ``path`` estimates it: emitter and BSDF sampling, weighted by the power heuristic (Veach
-    1997), each dimmed by the fields on its way.
+    Direct light as stock ``volpath`` estimates it: emitter and BSDF sampling, weighted by the power heuristic (Veach
+    1997), each dimmed by the fields on its way and by the null transmission of shapes (`transmitting`: some may have
+    any).
     """
 
     def __init__(self, scene, shapes: list, hide_emitters: bool, transmittance):
         environment.check_unscaled(scene.environment())
         self.scene, self.transmittance = scene, transmittance
-        self._all = _scene_of(shapes)
+        groups = shape_groups(scene)
+        self._all = _scene_of(groups + shapes)
         seen = [s for s in shapes if not (hide_emitters and s.is_emitter())]
-        self._seen = self._all if len(seen) == len(shapes) else _scene_of(seen)
+        self._seen = self._all if len(seen) == len(shapes) else _scene_of(groups + seen)
+        self.transmitting = transmits(groups + shapes)
         self.shining = any(s.is_emitter() for s in seen)
         deltas = (mi.has_flag(e.flags(), mi.EmitterFlags.Delta) for e in scene.emitters())
         self.lights_can_be_hit = not all(deltas)
@@ -36,10 +40,34 @@ class Surfaces:
         """The next intersection of rays on their way through the scene, a SurfaceInteraction3f."""
         return self._all.ray_intersect(ray)
 
-    def blocked(self, p, d, distance, active):
-        """Whether a shape lies between `p` and the light at `distance` along `d`."""
+    def transmission(self, p, d, distance, active):
+        """Return the share of the light at `distance` along `d` that the shapes let through to `p`: a Float of 0 or 1,
+        or a Color3f where they are `transmitting`."""
         far = dr.detach(distance) * (1 - mi.math.ShadowEpsilon)
-        return self._all.ray_test(mi.Ray3f(dr.detach(p), dr.detach(d), far, 0.0, []), active)
+        return self._transmission(mi.Ray3f(dr.detach(p), dr.detach(d), far, 0.0, []), active)
+
+    def _transmission(self, ray, active):
+        """:meth:`transmission` along a whole ray: the product of the null transmissions of all that it crosses."""
+        if not self.transmitting:
+            return dr.select(self._all.ray_test(ray, active), mi.Float(0), 1)
+
+        def cross(ray, through, active):
+            si = self._all.ray_intersect(ray, active)
+            active = active & si.is_valid()
+            value = si.bsdf().eval_null_transmission(si, active)
+            through = dr.select(active, through * value, through)
+            onward = si.spawn_ray(ray.d)
+            onward.maxt = ray.maxt - si.t
+            return onward, through, active & (dr.max(through) > 0)
+
+        n = max(dr.width(ray.o), dr.width(ray.d), dr.width(active))
+        with dr.suspend_grad():
+            return dr.while_loop(
+                state=(mi.Ray3f(ray), dr.ones(mi.Color3f, n), mi.Bool(active)),
+                cond=lambda ray, through, active: active,
+                body=cross,
+                label="null surfaces",
+            )[1]
 
     def direct(self, si, rng, active):
         """Reflected radiance of one emitter sample."""
@@ -49,22 +77,26 @@ class Surfaces:
         ds, weight = self.scene.sample_emitter_direction(si, u, False, active)
         active = active & (ds.pdf > 0)
         value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active)
-        active = active & ((dr.max(value) > 0) & ~self._all.ray_test(si.spawn_ray_to(ds.p), active))
+        active = active & (dr.max(value) > 0)
         value = value * weight * dr.select(ds.delta, 1, _power(ds.pdf, pdf))
+        value = value * self._transmission(si.spawn_ray_to(ds.p), active)
         return dr.select(active, value * self.transmittance(si.p, ds.d, ds.dist, active, sharp(ds)), 0)
 
     def scatter(self, si, rng, active):
-        """``(ray, weight, pdf)`` of a BSDF sample; pdf is −1 for specular reflection and refraction."""
+        """Return ``(ray, weight, pdf, crossed)`` of a BSDF sample; pdf is −1 for specular reflection and refraction;
+        `crossed`: the sample is of the null component, so the ray goes straight on."""
         u = mi.Point2f(rng.next_float32(), rng.next_float32())
         sample, weight = si.bsdf().sample(mi.BSDFContext(), si, rng.next_float32(), u, active)
         pdf = dr.select(mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta), -1, sample.pdf)
-        return si.spawn_ray(si.to_world(sample.wo)), dr.select(active, weight, 0), pdf
+        crossed = active & mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
+        return si.spawn_ray(si.to_world(sample.wo)), dr.select(active, weight, 0), pdf, crossed
 
-    def emission(self, si, ray, pdf, active):
-        """Radiance along BSDF-sampled rays from the emitter that they reach at `si`; `pdf` is that of the sample."""
+    def emission(self, si, ray, pdf, active, way=None):
+        """Radiance along BSDF-sampled rays from the emitter that they reach at `si`; `pdf` is that of the sample, `way`
+        the distance from the point of that sample to where `ray` begins, None for 0."""
         emitter = si.emitter(self.scene)
         start = dr.zeros(mi.Interaction3f, dr.width(ray.o))
-        start.p = ray.o
+        start.p = ray.o if way is None else ray.o - way * ray.d
         ds = mi.DirectionSample3f(self.scene, si, start)
         other = self.scene.pdf_emitter_direction(start, ds, active & (pdf > 0))
         value = emitter.eval(si, active) * dr.select(pdf < 0, 1, _power(pdf, other))
@@ -73,8 +105,10 @@ class Surfaces:
 
 
 def _scene_of(shapes: list):
-    """A scene of these very shapes alone."""
-    return mi.load_dict({"type": "scene", **{f"shape_{i}": s for i, s in enumerate(shapes)}}, optimize=False)
+    """A scene of these very shapes alone, for the rays' intersections."""
+    # Mitsuba refuses a scene all of whose emitters have the weight 0, as these shapes may.
+    objects = {"unused": {"type": "point"}, **{f"shape_{i}": s for i, s in enumerate(shapes)}}
+    return mi.load_dict({"type": "scene", **objects}, optimize=False)
 
 
 def _power(a, b):

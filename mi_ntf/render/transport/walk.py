@@ -1,5 +1,6 @@
 """More than one bounce: paths through fields and between surfaces, a wavefront a bounce."""
 
+import itertools
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -20,25 +21,40 @@ STEPS = 128
 @dataclass(frozen=True)
 class Paths:
     """Rays on their way: `weight` of the light that they bring to their `pixel`; `pdf` of the BSDF sample that sent
-    them, −1 for a specular one, 0 where they come from a field, whose light is summed at its points; random stream."""
+    them, −1 for a specular one, 0 where they come from a field, whose light is summed at its points; random stream.
+    `way`: distance from the last scattering point to where `ray` begins, None where no surface can be crossed."""
 
     ray: Any
     weight: Any
     pixel: Any
     pdf: Any
     rng: Any
+    way: Any = None
 
     def take(self, index) -> "Paths":
-        """Those of the given indices."""
-        return Paths(*(dr.gather(type(a), a, index) for a in self._values()))
+        """Return those of the given indices."""
+        return replace(self, **{name: dr.gather(type(a), a, index) for name, a in self._values()})
 
     def put(self, others: "Paths", index) -> None:
         """Write `others` to the given places."""
-        for a, b in zip(self._values(), others._values(), strict=True):
+        for (_, a), (_, b) in zip(self._values(), others._values(), strict=True):
             dr.scatter(a, b, index)
 
     def _values(self) -> list:
-        return [getattr(self, f.name) for f in fields(self)]
+        pairs = [(f.name, getattr(self, f.name)) for f in fields(self)]
+        return [(name, value) for name, value in pairs if value is not None]
+
+
+def join(parts: list[Paths]) -> Paths:
+    """Return the paths of all `parts`, one after the other; at least one has some."""
+    if len(parts) == 1:
+        return parts[0]
+    ends = list(itertools.accumulate(dr.width(paths.pixel) for paths in parts))
+    whole = next(p for p in parts if dr.width(p.pixel)).take(dr.zeros(mi.UInt32, ends[-1]))
+    for paths, end in zip(parts, ends, strict=True):
+        count = dr.width(paths.pixel)
+        whole.put(paths, dr.arange(mi.UInt32, count) + (end - count))
+    return whole
 
 
 class Walk:
@@ -51,24 +67,51 @@ class Walk:
     def run(self, paths: Paths, depth: int = 2) -> None:
         """Follow `paths`, whose light would arrive over `depth` edges."""
         while dr.width(paths.pixel):
-            surfaces = self.scene.surfaces
-            si = surfaces.intersect(paths.ray) if surfaces else None
-            if surfaces and surfaces.lights_can_be_hit:
-                self.add(paths, surfaces.emission(si, paths.ray, paths.pdf, paths.pdf != 0))
-            if 0 <= self.max_depth <= depth:
-                return
+            last = 0 <= self.max_depth <= depth
             depth += 1
-            paths = self._roulette(self._bounce(paths, si, depth), depth)
+            scattered = []
+            while dr.width(paths.pixel):
+                onward, paths = self._flight(paths, depth, last)
+                scattered.append(onward)
+            if last:
+                return
+            paths = self._roulette(join(scattered), depth)
 
     def add(self, paths: Paths, light) -> None:
         """Add `light` times the paths' weights to their pixels."""
         for total, value in zip(self.total, paths.weight * light, strict=True):
             dr.scatter_reduce(dr.ReduceOp.Add, total, value, paths.pixel)
 
-    def _bounce(self, paths: Paths, si, depth: int) -> Paths:
-        """The next vertices, in fields or on surfaces: their direct light, and the paths on from there."""
+    def _flight(self, paths: Paths, depth: int, last: bool) -> tuple[Paths, Paths]:
+        """Follow paths to their next vertices, in fields or on surfaces, and add the light there. Return those that
+        scatter and, apart, those that cross a surface, which is no vertex. `last`: only emitters add light, since paths
+        are as long as they may be."""
+        surfaces, nobody = self.scene.surfaces, paths.take(mi.UInt32())
+        si = surfaces.intersect(paths.ray) if surfaces else None
+        if surfaces and surfaces.lights_can_be_hit:
+            self.add(paths, surfaces.emission(si, paths.ray, paths.pdf, paths.pdf != 0, paths.way))
+        if last and not (surfaces and surfaces.transmitting):
+            return nobody, nobody
         n = dr.width(paths.pixel)
-        hit, t, which = dr.zeros(mi.Bool, n), si.t if si else mi.Float(dr.inf), dr.zeros(mi.UInt32, n)
+        hit, t, which = self._fly(paths, si.t if si else mi.Float(dr.inf))
+        onward, crossing = paths.take(dr.arange(mi.UInt32, n)), nobody
+        onward = replace(onward, weight=dr.zeros(mi.Color3f, n))
+        for i, part in enumerate(() if last else self.scene.parts):
+            index: Any = dr.compress(hit & (which == i))
+            if dr.width(index):
+                there = self.in_field(part, paths.take(index), dr.gather(mi.Float, t, index), depth)
+                onward.put(there, index)
+        index = dr.compress(~hit & si.is_valid()) if si is not None else ()
+        if dr.width(index):
+            there = paths.take(index)
+            there, crossing = self.on_surface(there, surfaces.intersect(there.ray), not last)
+            onward.put(there, index)
+        return onward, crossing
+
+    def _fly(self, paths: Paths, end):
+        """Return whether paths scatter in a field before the distance `end`, where, and the number of its part."""
+        n = dr.width(paths.pixel)
+        hit, t, which = dr.zeros(mi.Bool, n), end, dr.zeros(mi.UInt32, n)
         if self.scene.parts:
             depths = [-dr.log(1 - paths.rng.next_float32()) for _ in self.scene.parts]
             steps = min(STEPS, self.scene.settings.samples)
@@ -76,19 +119,7 @@ class Walk:
             if self.scene.effects.visibility == "none":
                 hit = hit & (paths.pdf != 0)  # nothing dims what leaves a field, so nothing scatters it either
         dr.eval(hit, t, which, paths.rng.state)
-        onward = paths.take(dr.arange(mi.UInt32, n))
-        onward = replace(onward, weight=dr.zeros(mi.Color3f, n))
-        for i, part in enumerate(self.scene.parts):
-            index: Any = dr.compress(hit & (which == i))
-            if dr.width(index):
-                there = self.in_field(part, paths.take(index), dr.gather(mi.Float, t, index), depth)
-                onward.put(there, index)
-        if si is not None:
-            index = dr.compress(~hit & si.is_valid())
-            if dr.width(index):
-                there = paths.take(index)
-                onward.put(self.on_surface(there, self.scene.surfaces.intersect(there.ray)), index)
-        return onward
+        return hit, t, which
 
     def in_field(self, part, paths: Paths, t, depth: int) -> Paths:
         """Paths that meet a point of `part` at the distance `t`; at `depth` 2 its direct light is known already."""
@@ -103,17 +134,27 @@ class Walk:
         value, pdf = scatter.evaluate(wi, points.wo, points.reflectance)
         weight = paths.weight * dr.select(pdf > 1e-8, mi.Color3f(*value) / pdf, 0)
         ray = mi.Ray3f(frame.point_to_world(x), frame.direction_to_world(wi))
-        return replace(paths, ray=ray, weight=weight, pdf=dr.zeros(mi.Float, dr.width(t)))
+        zero = dr.zeros(mi.Float, dr.width(t))
+        return replace(paths, ray=ray, weight=weight, pdf=zero, way=None if paths.way is None else mi.Float(zero))
 
-    def on_surface(self, paths: Paths, si) -> Paths:
-        """Paths that meet the surface point `si`."""
+    def on_surface(self, paths: Paths, si, lit: bool = True) -> tuple[Paths, Paths]:
+        """Add the direct light at the surface points `si`, if `lit`. Return the paths that scatter there, one for each
+        of `paths`, and those that cross the surface."""
         surfaces = self.scene.surfaces
         active = si.is_valid() & (dr.max(paths.weight) > 0)
-        self.add(paths, surfaces.direct(si, paths.rng, active))
-        # One kernel for each: fused, Dr.Jit 1.5 defines a BSDF's function twice and LLVM refuses it.
-        dr.eval(self.total, paths.rng.state)
-        ray, weight, pdf = surfaces.scatter(si, paths.rng, active)
-        return replace(paths, ray=ray, weight=paths.weight * weight, pdf=pdf)
+        if lit:
+            self.add(paths, surfaces.direct(si, paths.rng, active))
+            # One kernel for each: fused, Dr.Jit 1.5 defines a BSDF's function twice and LLVM refuses it.
+            dr.eval(self.total, paths.rng.state)
+        ray, weight, pdf, crossed = surfaces.scatter(si, paths.rng, active)
+        weight = paths.weight * weight
+        scattered = replace(paths, ray=ray, weight=weight, pdf=pdf)
+        if not surfaces.transmitting:
+            return scattered, paths.take(mi.UInt32())
+        dr.eval(scattered.ray, weight, pdf, crossed, paths.rng.state)
+        straight = replace(paths, ray=ray, weight=weight, way=paths.way + si.t)
+        straight = straight.take(dr.compress(crossed & (dr.max(weight) > 0)))
+        return replace(scattered, weight=dr.select(crossed, 0, weight), way=dr.zeros(mi.Float, dr.width(pdf))), straight
 
     def _roulette(self, paths: Paths, depth: int) -> Paths:
         """The paths that still carry light."""
