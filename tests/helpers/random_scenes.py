@@ -26,6 +26,15 @@ BSDFS = {
     "mirror": {"type": "conductor"},
     "principled": {"type": "principled", "roughness": 0.4, "specular": 0.5},
 }
+LEAF = {"type": "mask", "opacity": {"type": "checkerboard", "color0": 0.2, "color1": 0.9},
+        "nested": {"type": "twosided", "bsdf": {"type": "diffuse"}}}
+CROSSED = {
+    "null": {"type": "null"},
+    "leaf": LEAF,
+    "pane": {"type": "thindielectric", "specular_transmittance": {"type": "rgb", "value": [0.9, 0.7, 0.4]}},
+    "blend": {"type": "blendbsdf", "weight": 0.4, "a": {"type": "null"}, "b": {"type": "diffuse"}},
+}
+"""BSDFs with a null component."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +70,7 @@ def write_fields(folder: Path) -> dict[str, Path]:
 class _Draw:
     """A random stream that notes its choices."""
 
-    def __init__(self, seed: int):
+    def __init__(self, seed: int | list[int]):
         self.rng, self.notes = np.random.default_rng(seed), []
 
     def pick(self, name: str, options, weights=None):
@@ -86,7 +95,11 @@ def draw(seed: int, files: dict[str, Path]) -> Scene:
     film, signed, coloured = _film(d)
     scene["sensor"] = _sensor(d, eye, centre, radius, film, d.pick("spp", (1, 2, 4, 9)))
     integrator = _integrator(d)
-    return Scene(seed, " ".join(d.notes), scene, integrator, signed, coloured)
+    more = _Draw([seed, 1])  # a stream of its own, so that the other choices of old seeds stay what they were
+    _vary(more, scene, centre, radius, eye)
+    limit = more.pick("limit", ("", "noise_threshold", "max_error", "time_budget"), (6, 1, 1, 1))
+    integrator |= {limit: more.pick(limit, (0.05, 0.3))} if limit else {}
+    return Scene(seed, " ".join(d.notes + more.notes), scene, integrator, signed, coloured)
 
 
 def draw_pair(seed: int, files: dict[str, Path]) -> tuple[Scene, dict]:
@@ -105,7 +118,10 @@ def draw_pair(seed: int, files: dict[str, Path]) -> tuple[Scene, dict]:
     drawn = d.pick("light_samples", (2, 4)) if set(SKIES) & set(kinds) else d.pick("light_samples", (0, 0, 3))
     ours = {"type": "nrf", "visibility": "raymarch", "samples": 768, "light_samples": drawn, "bounces": "paths",
             **both}
-    return Scene(seed, " ".join(d.notes), scene, ours, False, 3), {"type": "volpath", "rr_depth": 64, **both}
+    more = _Draw([seed, 1])
+    _vary(more, scene, centre, radius, eye)
+    theirs = {"type": "volpath", "rr_depth": 64, **both}
+    return Scene(seed, " ".join(d.notes + more.notes), scene, ours, False, 3), theirs
 
 
 def _media(d: _Draw, files: dict, count: int, apart: bool):
@@ -163,6 +179,32 @@ def _surfaces(d: _Draw, centre, radius, bsdfs: dict) -> dict:
         shapes["ball"] = {"type": "sphere", "center": place.tolist(), "radius": 0.4 * radius,
                           "bsdf": bsdfs[d.pick("bsdf", tuple(bsdfs))]}
     return shapes
+
+
+def _vary(d: _Draw, scene: dict, centre, radius, eye) -> None:
+    """Add to `scene` surfaces that let light through, instances, and lights that are sampled unevenly."""
+    to_world = mi.ScalarTransform4f
+    for name, towards in (("at_light", emitters.AWAY), ("at_camera", (eye - centre) / radius)):
+        if d.pick(name, (0, 0, 1)):
+            place = (centre + 0.6 * radius * np.asarray(towards)).tolist()
+            look = to_world().look_at(place, centre.tolist(), [0, 1, 0.1]) @ to_world().scale(0.7 * radius)
+            scene[name] = {"type": "rectangle", "to_world": look, "bsdf": CROSSED[d.pick("bsdf", tuple(CROSSED))]}
+    if d.pick("case", (0, 0, 0, 0, 1)):
+        scene["case"] = {"type": "sphere", "center": centre.tolist(), "radius": 7 * radius, "bsdf": {"type": "null"}}
+    if d.pick("instances", (0, 0, 0, 1)):
+        bsdf = d.pick("bsdf", ("leaf", "diffuse"))
+        scene["group"] = {"type": "shapegroup", "ball": {
+            "type": "sphere", "radius": 0.3 * radius, "bsdf": (CROSSED | BSDFS)[bsdf]}}
+        for i, at in enumerate(([1.2, 0.5, 0.9], [-0.8, 0.9, 1.1])):
+            scene[f"instance_{i}"] = {"type": "instance", "group": {"type": "ref", "id": "group"},
+                                      "to_world": to_world().translate((centre + radius * np.array(at)).tolist())}
+    lights = [light.get("emitter", light) for name, light in scene.items() if name.startswith("light_")]
+    for i, light in enumerate(lights):
+        # Mitsuba refuses a scene whose emitters all have the weight 0, and ntf refuses that weight.
+        weights = (1.0, 0.3, 2.0, 0.0) if i and light["type"] != "ntf" else (1.0, 2.0)
+        light["sampling_weight"] = d.pick("weight", weights)
+        if light["type"] == "envmap":
+            light["mis_compensation"] = bool(d.pick("mis_compensation", (0, 1)))
 
 
 COLOURS = {"rgb": 3, "rgba": 3, "luminance": 1, "luminance_alpha": 1, "xyz": 3, "xyza": 3}
