@@ -1,8 +1,9 @@
 """Reader of COLMAP models, text or binary.
 
-Accepted folders: `DIR/images` with the model in `DIR/sparse/0`, `DIR/sparse` or `DIR`; DIR may be the model's own
-folder with `images` in it or up to two levels above. Masks in `masks` beside `images`. Cameras with lens distortion are
-undone (`lens`), those of fisheyes are not read.
+Accepted folders: `DIR/images` with the model in `DIR/sparse/0`, `DIR/sparse` or `DIR`, or in `DIR/colmap` in place of
+`DIR`; of several models the one with most images is read. DIR may be the model's own folder with `images` in it or up
+to three levels above. Masks in `masks` beside `images`. Cameras with lens distortion are undone (`lens`), those of
+fisheyes are not read.
 
 Source of the camera models: COLMAP's documentation, "Camera Models", and `src/colmap/sensor/models.h`.
 """
@@ -13,7 +14,7 @@ import numpy as np
 
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.data import colmap_files
-from mi_ntf.data.images import SUFFIXES, mask_places
+from mi_ntf.data.file_names import SUFFIXES, locate, mask_places, plain
 from mi_ntf.data.schema import Camera, Found, View
 
 FORM = "COLMAP model"
@@ -24,20 +25,33 @@ PARAMETERS = {
 """Where fx, fy, cx, cy and OpenCV's k1, k2, p1, p2, k3 to k6 stand among a camera's parameters."""
 
 
-def find_model(folder: Path) -> Path | None:
-    """The folder that holds `cameras` and `images`, as .bin or .txt, or None."""
-    for place in (folder / "sparse" / "0", folder / "sparse", folder):
-        if any((place / f"cameras{s}").is_file() and (place / f"images{s}").is_file() for s in (".bin", ".txt")):
-            return place
-    return None
+def models(folder: Path) -> list[Path]:
+    """The folders that hold `cameras` and `images`, as .bin or .txt."""
+    places = []
+    for sparse in (folder / "sparse", folder / "colmap" / "sparse"):
+        numbered = [place for place in sparse.iterdir() if place.is_dir()] if sparse.is_dir() else []
+        places += [*sorted(numbered, key=lambda place: (len(place.name), place.name)), sparse]
+    return [place for place in (*places, folder) if colmap_files.suffix(place)]
+
+
+def _largest(folder: Path) -> tuple[Path, list[str]]:
+    """``(model, what was assumed)``: the folder's model that has most images, of equal ones the first."""
+    found = models(folder)
+    if len(found) == 1:
+        return found[0], []
+    counts = [colmap_files.count(model) for model in found]
+    told = ", ".join(f"{model.relative_to(folder)} with {count}" for model, count in zip(found, counts, strict=True))
+    model = found[counts.index(max(counts))]
+    return model, [f"of {len(found)} COLMAP models the one with most photographs is read, {model} ({told}); name a "
+                   "model's own folder to read another"]
 
 
 def read(folder: Path) -> Found:
     """All posed photographs of the folder's model as one split, `train`, by name, and its points. Raises MiNtfError."""
-    model = find_model(folder)
-    assert model is not None  # what makes it a folder of this form
-    cameras, images, points = colmap_files.read(model)
-    root = next((p for p in (folder, folder.parent, folder.parent.parent) if (p / "images").is_dir()), None)
+    model, assumed = _largest(folder)
+    cameras, images, points, noted = colmap_files.read(model)
+    root = next((p for p in (folder, folder / "colmap", *list(folder.absolute().parents)[:3]) if (p / "images").is_dir()
+                 ), None)
     if root is None:
         raise MiNtfError(f"{folder / 'images'} does not exist; put the photographs of the model {model} there")
     views = []
@@ -47,14 +61,17 @@ def read(folder: Path) -> Found:
             raise MiNtfError(f"{where}: there is no camera {image.camera}; export the model again with `colmap "
                              "model_converter`")
         camera = cameras[image.camera]
-        views.append(View(where, root / "images" / image.name, image.name, mask_places(root / "masks", image.name),
+        name = plain(image.name)
+        views.append(View(where, locate(root / "images", image.name), name, mask_places(root / "masks", name),
                           _opengl(image), _camera(camera, f"{model}, camera {image.camera}"),
                           (camera.width, camera.height)))
     if not views:
         raise MiNtfError(f"{model}: the model has no posed photograph; run `colmap mapper` again")
     stored = sum(f.suffix.lower() in SUFFIXES for f in (root / "images").rglob("*"))
     notes = [f"{stored - len(views)} of {stored} photographs in {root / 'images'} have no pose and are left out"]
-    return Found(FORM, {"train": views}, None, points, notes if stored > len(views) else [])
+    assumed += noted + ([f"{model} has no points3D, so points tell nothing of the object's place"] if points is None
+                        else [])
+    return Found(FORM, {"train": views}, None, points, notes if stored > len(views) else [], assumed)
 
 
 def _camera(camera: colmap_files.Camera, where: str) -> Camera:

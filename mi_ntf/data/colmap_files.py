@@ -1,7 +1,7 @@
 """The three files of a COLMAP model, text or binary, read within their own length.
 
 Source of the forms: COLMAP's documentation, "Output format". The files `rigs` and `frames` of newer models repeat what
-`images` says of single cameras and are left aside.
+`images` says of single cameras and are left aside, and so are the images' points: their lines may be missing.
 """
 
 import math
@@ -12,7 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from mi_ntf.core.errors import MiNtfError, shown
-from mi_ntf.data.images import is_file_name
+from mi_ntf.data import text as texts
+from mi_ntf.data.file_names import is_file_name
 
 MODELS = {
     "SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "OPENCV_FISHEYE": 8,
@@ -38,20 +39,46 @@ class Image(NamedTuple):
     translation: tuple[float, ...]
 
 
-def read(folder: Path) -> tuple[dict[int, Camera], list[Image], np.ndarray]:
-    """``(cameras by number, images, points (P, 3))`` of the model in `folder`; binary files come first.
-
-    Raises MiNtfError, with the file's name, where one is missing or is not what COLMAP writes.
-    """
-    suffix = ".bin" if (folder / "cameras.bin").is_file() else ".txt"
-    readers = (_cameras_bin, _images_bin, _points_bin) if suffix == ".bin" else (_cameras_txt, _images_txt, _points_txt)
-    return tuple(_whole(folder / f"{name}{suffix}", reader)
-                 for name, reader in zip(("cameras", "images", "points3D"), readers, strict=True))
+def suffix(folder: Path) -> str | None:
+    """The extension of the model's files in `folder`, None where there is no model; binary files come first."""
+    return next((s for s in (".bin", ".txt") if (folder / f"cameras{s}").is_file() and (folder / f"images{s}").is_file()
+                 ), None)
 
 
-def _whole(path: Path, reader):
+class Model(NamedTuple):
+    cameras: dict[int, Camera]
+    images: list[Image]
+    points: np.ndarray | None
+    """(P, 3), None where the model has no file of points."""
+    assumed: list[str]
+
+
+def read(folder: Path) -> Model:
+    """The model in `folder`. Raises MiNtfError, with the file's name, where one is not what COLMAP writes."""
+    assumed: list[str] = []
+    form = suffix(folder)
+    of_cameras, of_images, of_points = (
+        (_cameras_bin, _images_bin, _points_bin) if form == ".bin" else (_cameras_txt, _images_txt, _points_txt))
+    place = folder / f"points3D{form}"
+    return Model(_whole(folder / f"cameras{form}", of_cameras, assumed),
+                 _whole(folder / f"images{form}", of_images, assumed),
+                 _whole(place, of_points, assumed) if place.is_file() else None, assumed)
+
+
+def count(folder: Path) -> int:
+    """How many images the model in `folder` has. Raises MiNtfError."""
+    form = suffix(folder)
+    return len(_whole(folder / f"images{form}", _images_bin if form == ".bin" else _images_txt, []))
+
+
+def _whole(path: Path, reader, assumed: list[str]):
+    """What `reader` makes of the file; what is assumed of its text is added to `assumed`."""
     try:
-        return reader(path.read_bytes() if path.suffix == ".bin" else path.read_text())
+        if path.suffix == ".bin":
+            return reader(path.read_bytes())
+        text, note = texts.read(path)
+        assumed += [note] if note else []
+        return reader(text)
     except (OSError, ValueError, struct.error) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise MiNtfError(f"{path}: cannot be read as part of a COLMAP model ({shown(str(reason))}); it needs cameras, "
@@ -85,19 +112,20 @@ def _points(rows: list[tuple[float, ...]]) -> np.ndarray:
 # --- text -------------------------------------------------------------------------------------------------------------
 
 
-def _rows(text: str, least: int, step: int = 1) -> list[list[str]]:
-    """The words of every line, at `step` 2 of every other one; comments and empty lines before it are left out."""
-    found, lines = [], iter(text.split("\n"))
-    for line in lines:
-        words = line.split()
-        if not words or words[0].startswith("#"):
-            continue
-        if len(words) < least:
-            raise ValueError(f"the line {shown(line)} has {len(words)} words, expected {least} or more")
-        found.append(words)
-        for _ in range(step - 1):
-            next(lines, None)
-    return found
+def _rows(text: str, least: int) -> list[list[str]]:
+    """The words of every line but comments and empty ones."""
+    return [_words(line, least, -1) for line in text.split("\n") if not _is_comment(line)]
+
+
+def _is_comment(line: str) -> bool:
+    return not line.strip() or line.lstrip().startswith("#")
+
+
+def _words(line: str, least: int, splits: int) -> list[str]:
+    words = line.split(maxsplit=splits)
+    if len(words) < least:
+        raise ValueError(f"the line {shown(line)} has {len(words)} words, expected {least} or more")
+    return words
 
 
 def _cameras_txt(text: str) -> dict[int, Camera]:
@@ -110,7 +138,28 @@ def _cameras_txt(text: str) -> dict[int, Camera]:
 
 
 def _images_txt(text: str) -> list[Image]:
-    return [_image(" ".join(words[9:]), int(words[8]), tuple(map(float, words[1:8]))) for words in _rows(text, 10, 2)]
+    """Every image's line. The line of its points that follows may be empty, or missing, as some programs leave it."""
+    images, points_may_follow = [], False
+    for line in text.split("\n"):
+        if points_may_follow and _is_points(line):
+            points_may_follow = False
+        elif not _is_comment(line):
+            words = _words(line, 10, 9)  # the last is the name, with the spaces in it
+            images.append(_image(words[9].rstrip(), int(words[8]), tuple(map(float, words[1:8]))))
+            points_may_follow = True
+    return images
+
+
+def _is_points(line: str) -> bool:
+    """Whether the line is empty or consists of triples of numbers: x, y, number of the point.
+
+    The line of an image does not: its tenth word is a name.
+    """
+    words = line.split()
+    try:
+        return len(words) % 3 == 0 and all(map(math.isfinite, map(float, words[:12])))
+    except ValueError:
+        return False
 
 
 def _points_txt(text: str) -> np.ndarray:
@@ -136,7 +185,7 @@ class _Bytes:
 
     def name(self) -> str:
         end = self.data.index(b"\0", self.at)
-        text = self.data[self.at : end].decode()
+        text = texts.decode(self.data[self.at : end])[0]
         self.at = end + 1
         return text
 

@@ -18,8 +18,6 @@ import numpy as np
 from mi_ntf.core import files, ops, srgb
 from mi_ntf.core.errors import MiNtfError, shown
 
-SUFFIXES = (".png", ".exr", ".jpg", ".jpeg", ".tif", ".tiff")
-MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 LINEAR = srgb.decode(ops, np.arange(256) / 255.0).astype(np.float32)
 """sRGB's 256 levels in linear light."""
 
@@ -222,27 +220,6 @@ def read_mask(path: Path) -> np.ndarray:
     except Exception as error:
         raise MiNtfError(f"{path}: cannot be read as a mask ({shown(str(error))}); write it as 8-bit grey PNG"
                          ) from error
-
-
-def is_file_name(name: object) -> bool:
-    """Whether `name` is text that a file could be called by and that one line can show, in any folder."""
-    if not isinstance(name, str) or not name.isprintable():  # half a character is not printable either
-        return False
-    parts = [len(part.encode()) for part in name.split("/")]
-    return 0 < sum(parts) <= 2000 and max(parts) <= 240
-
-
-def mask_places(masks: Path, name: str) -> list[Path]:
-    """Where in the folder `masks` the mask of photograph `name` may lie: the same name as PNG, as COLMAP writes it
-    (name.jpg.png), or with another suffix. A leading folder `images` (`images_4`) is left out."""
-    relative = Path(name)
-    if relative.is_absolute() or not relative.name:
-        return []
-    if len(relative.parts) > 1 and relative.parts[0].startswith("images"):
-        relative = Path(*relative.parts[1:])
-    base = masks / relative
-    return [base.with_suffix(".png"), base.with_name(base.name + ".png"),
-            *(base.with_suffix(suffix) for suffix in MASK_SUFFIXES[1:])]
 
 
 def write_exr(path: Path, rgba: np.ndarray) -> None:

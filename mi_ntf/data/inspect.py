@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from mi_ntf.core import files
-from mi_ntf.data import inspect_figures, measures
+from mi_ntf.data import assumptions, inspect_figures, measures
 from mi_ntf.data.measures import percent
 from mi_ntf.data.page import Page
 from mi_ntf.data.readers import FORMS, load_dataset
@@ -19,8 +19,8 @@ def inspect(folder: Path, out: Path | None = None, **options) -> dict:
     """Read the data set in `folder` with `options` of :func:`load_dataset`, write the page and return the numbers.
 
     `out`, the page, is DIR-inspect.html in the current folder unless given. Keys of the result: "folder", "form",
-    "said" (what the reader told), "warnings", "page", "views" (one mapping a photograph) and those of
-    :func:`measures.numbers`. Raises MiNtfError.
+    "said" (what the reader told), "assumed" (the assumptions among that), "warnings", "page", "views" (one mapping a
+    photograph) and those of :func:`measures.numbers`. Raises MiNtfError.
     """
     folder = Path(folder)
     out = Path(f"{folder.resolve().name}-inspect.html") if out is None else Path(out)
@@ -30,8 +30,8 @@ def inspect(folder: Path, out: Path | None = None, **options) -> dict:
     rows = measures.measure(splits)
     found = measures.numbers(splits, rows)
     form, reader = next((form, reader) for form, is_there, reader in FORMS if is_there(folder))
-    found = {"folder": str(folder), "form": form, "said": said, **found, "warnings": measures.warnings(found, rows),
-             "page": str(out), "views": [_plain(row) for row in rows]}
+    found = {"folder": str(folder), "form": form, "said": said, "assumed": assumptions.said(said), **found,
+             "warnings": measures.warnings(found, rows), "page": str(out), "views": [_plain(row) for row in rows]}
     _page(folder, reader(folder), splits, rows, found).write(out)
     return found
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from mi_ntf.core.errors import MiNtfError, shown
-from mi_ntf.data.images import SUFFIXES, mask_places
+from mi_ntf.data.file_names import SUFFIXES, mask_places
 from mi_ntf.data.poses import check_rigid
 from mi_ntf.data.schema import Camera, Found, View
 

@@ -21,7 +21,7 @@ from pathlib import Path
 
 from mi_ntf.core.errors import MiNtfError, shown
 from mi_ntf.data import json_entries as entries
-from mi_ntf.data.images import is_file_name
+from mi_ntf.data.file_names import is_file_name, locate, plain
 from mi_ntf.data.schema import SPLITS, Camera, Found, View, focal_length
 
 FORM = "nerfstudio data set (transforms.json)"
@@ -34,7 +34,7 @@ DISTORTION = ("k1", "k2", "p1", "p2", "k3")
 def read(folder: Path) -> Found:
     """The splits that the file names, or all its frames as `train`. Raises MiNtfError."""
     path = folder / "transforms.json"
-    data = entries.load(path)
+    data, assumed = entries.load(path)
     views = [_view(data, entry, f"{path}, frame {i}", folder) for i, entry in enumerate(data["frames"])]
     splits, notes = _splits(data, views, path)
     kept = {split: [view for view in chosen if view.image.is_file()] for split, chosen in splits.items()}
@@ -42,7 +42,7 @@ def read(folder: Path) -> Found:
     if left > count / 2 and kept["train"]:  # else it is another folder that is meant, or a copy that was broken off
         splits = {split: chosen for split, chosen in kept.items() if chosen}
         notes += [f"{count - left} of {count} frames have no photograph and are left out"] if left < count else []
-    return Found(FORM, splits, entries.unit_sphere(data, path), None, notes)
+    return Found(FORM, splits, entries.unit_sphere(data, path), None, notes, assumed)
 
 
 def _view(data: dict, entry: object, where: str, folder: Path) -> View:
@@ -53,7 +53,8 @@ def _view(data: dict, entry: object, where: str, folder: Path) -> View:
     both = data | entry
     view = entries.view(entry, where, folder, _camera(both, where), entries.size(both, where))
     if "mask_path" in entry:
-        view = dataclasses.replace(view, masks=[folder / entries.file_name(entry, "mask_path", where)], mask_first=True)
+        mask = locate(folder, entries.file_name(entry, "mask_path", where))
+        view = dataclasses.replace(view, masks=[mask], mask_first=True)
     return view
 
 
@@ -96,11 +97,11 @@ def _splits(data: dict, views: list[View], path: Path) -> tuple[dict[str, list[V
     for split, names in named.items():
         if not isinstance(names, list) or not all(map(is_file_name, names)):
             raise MiNtfError(f"{path}: '{split}_filenames' is {shown(names)}, expected a list of frames' 'file_path'")
-        unknown = next((name for name in names if os.path.normpath(name) not in place), None)
+        unknown = next((name for name in names if os.path.normpath(plain(name)) not in place), None)
         if unknown is not None:
             raise MiNtfError(f"{path}: '{split}_filenames' has {shown(unknown)}, which is the 'file_path' of no frame; "
                              "write the names alike")
-        splits[split] = [place[os.path.normpath(name)] for name in names]
+        splits[split] = [place[os.path.normpath(plain(name))] for name in names]
     lists = ", ".join(f"{split}_filenames" for split in named)
     used = {id(view) for split in splits.values() for view in split}
     rest = [view for view in views if id(view) not in used]

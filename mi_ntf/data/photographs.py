@@ -8,6 +8,7 @@ import numpy as np
 
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.data import background, images, lens
+from mi_ntf.data.file_names import first
 from mi_ntf.data.schema import Camera, View, focal_length
 
 HALF = (1e-3, 65504.0)
@@ -92,7 +93,7 @@ def _mask(view: View, image: images.Decoded) -> np.ndarray | None:
     """
     if image.alpha is not None and not view.mask_first:
         return None
-    place = next((place for place in view.masks if place.is_file()), None)
+    place = first(view.masks)
     if place is None:
         lacks = "has no mask" if view.mask_first else "has no alpha channel and no mask"
         raise MiNtfError(f"{view.image}: {lacks}{' (' + str(view.masks[0]) + ')' if view.masks else ''}; training must "

@@ -18,13 +18,27 @@ from pathlib import Path
 import numpy as np
 
 from mi_ntf.core.errors import MiNtfError
-from mi_ntf.data import bounds, colmap, images, lens, light, llff, nerfstudio, photographs, poses, transforms_json
+from mi_ntf.data import (
+    assumptions,
+    bounds,
+    colmap,
+    file_names,
+    images,
+    lens,
+    light,
+    llff,
+    nerfstudio,
+    photographs,
+    poses,
+    transforms_json,
+)
+from mi_ntf.data.assumptions import PREFIX
 from mi_ntf.data.schema import Found, Split, View
 
 FORMS = (
     ("transforms_<split>.json", lambda folder: (folder / "transforms_train.json").is_file(), transforms_json.read),
     (nerfstudio.FORM, lambda folder: (folder / "transforms.json").is_file(), nerfstudio.read),
-    (colmap.FORM, lambda folder: colmap.find_model(folder) is not None, colmap.read),
+    (colmap.FORM, lambda folder: bool(colmap.models(folder)), colmap.read),
     (llff.FORM, lambda folder: (folder / "poses_bounds.npy").is_file(), llff.read),
 )
 """Name, whether a folder is of the form, reader. Where a folder is of several, the first is the one that says most."""
@@ -52,8 +66,9 @@ def load_dataset(folder: Path, say: Callable[[str], None] = print, *, size: int 
         found = reader(folder)
         form = found.form
         views = _with_options(found.views, masks, flash_offset)
+        views, settled = assumptions.settle(views)
         say(_summary(found, folder, size, background))
-        for note in [*notes, *found.notes]:
+        for note in [*notes, *found.notes, *(PREFIX + text for text in [*found.assumed, *settled])]:
             say(note)
         return _load(folder, found, split_off(views, say), say, size, background == "black", flash_offset)
     except MiNtfError as error:
@@ -133,10 +148,10 @@ def _with_options(views: dict[str, list[View]], masks: Path | None, flash_offset
 
     def change(view: View) -> View:
         if masks is not None:
-            plain = Path(view.name).name
-            places = images.mask_places(Path(masks), view.name)
-            if alone[Path(plain).stem] == 1:  # else a mask could be another photograph's
-                places += images.mask_places(Path(masks), plain)
+            base = Path(view.name).name
+            places = file_names.mask_places(Path(masks), view.name)
+            if alone[Path(base).stem] == 1:  # else a mask could be another photograph's
+                places += file_names.mask_places(Path(masks), base)
             view = replace(view, masks=places, mask_first=True)
         if flash_offset is None:
             return view

@@ -102,6 +102,8 @@ class Found:
     points: np.ndarray | None = None
     """(P, 3) reconstructed points."""
     notes: list[str] = field(default_factory=list)
+    assumed: list[str] = field(default_factory=list)
+    """What was assumed where the data set could mean something else, a sentence each."""
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,8 @@ All three are one format; they differ in what may be missing:
     camera         `camera_angle_x` (radians), or NRHints' `camera_intrinsics` [cx, cy, fx, fy] (pixels)
     w, h           found from the images
     file_path      with or without extension; NRHints names it in `file_ext`
-    pl_pos         missing: the light is at the camera. pl_intensity (one number or RGB) missing: estimated
+    pl_pos         x, y, z or x, y, z, 1; missing: the light is at the camera
+    pl_intensity   one number or RGB; missing: estimated
     unit_sphere    missing: found
 
 Source of the two foreign dialects: the public loaders of NeRF (Mildenhall et al. 2020) and of NRHints (Zeng et al.
@@ -23,11 +24,13 @@ from mi_ntf.data.schema import SPLITS, Camera, Found, View
 
 def read(folder: Path) -> Found:
     """Every split that `folder` has; `train` must be there. Raises MiNtfError."""
-    views, spheres = {}, {}
+    views, spheres, notes = {}, {}, []
     for split in SPLITS:
         path = folder / f"transforms_{split}.json"
         if split == "train" or path.is_file():
-            views[split], spheres[split] = _read_split(folder, path)
+            data, assumed = entries.load(path)
+            views[split], spheres[split] = _split(data, folder, path)
+            notes += assumed
     given = {split: sphere for split, sphere in spheres.items() if sphere is not None}
     sphere = given.get("train") or next(iter(given.values()), None)
     for split, (center, radius) in given.items():
@@ -36,7 +39,7 @@ def read(folder: Path) -> Found:
             raise MiNtfError(f"{folder / f'transforms_{split}.json'}: 'unit_sphere' is {center.tolist()}, {radius:g}, "
                              f"another split says {sphere[0].tolist()}, {sphere[1]:g}; all splits show one object: "
                              "write the same sphere")
-    return Found(_dialect(views["train"], sphere), views, sphere)
+    return Found(_dialect(views["train"], sphere), views, sphere, assumed=notes)
 
 
 def _dialect(views: list[View], sphere: tuple[np.ndarray, float] | None) -> str:
@@ -48,9 +51,8 @@ def _dialect(views: list[View], sphere: tuple[np.ndarray, float] | None) -> str:
     return "NeRF-synthetic (Blender) data set"
 
 
-def _read_split(folder: Path, path: Path) -> tuple[list[View], tuple[np.ndarray, float] | None]:
-    """``(views, sphere or None)`` of one file."""
-    data = entries.load(path)
+def _split(data: dict, folder: Path, path: Path) -> tuple[list[View], tuple[np.ndarray, float] | None]:
+    """``(views, sphere or None)`` of one file's contents."""
     camera, size = _camera(data, str(path)), entries.size(data, str(path))
     views = [entries.view(entry, f"{path}, frame {i}", folder, camera, size) for i, entry in enumerate(data["frames"])]
     return views, entries.unit_sphere(data, path)

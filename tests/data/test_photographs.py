@@ -13,7 +13,7 @@ from data import forms
 from PIL import Image
 
 from mi_ntf.core.errors import MiNtfError
-from mi_ntf.data import images, lens, photographs, schema
+from mi_ntf.data import file_names, images, lens, photographs, schema
 from mi_ntf.data.readers import load_dataset
 
 
@@ -36,8 +36,8 @@ def test_jpeg_takes_its_alpha_from_the_mask(tmp_path):
     grey = np.zeros((8, 8), np.uint8)
     grey[:, 4:], grey[:, 7] = 255, 128
     Image.fromarray(grey).save(mask)
-    places = images.mask_places(tmp_path / "masks", "images/a.jpg")
-    assert mask in places and places == images.mask_places(tmp_path / "masks", "a.jpg")
+    places = file_names.mask_places(tmp_path / "masks", "images/a.jpg")
+    assert mask in places and places == file_names.mask_places(tmp_path / "masks", "a.jpg")
     pixels = images.linear(read(photo, places))
     # one level of 255 is what JPEG's own rounding of a flat block may change, half a level what storing adds; sRGB's
     # slope is below 2.3
@@ -60,7 +60,7 @@ def test_a_photograph_without_alpha_and_mask_is_refused(tmp_path):
     Image.fromarray(np.zeros((2, 2, 3), np.uint8)).save(tmp_path / "a.png")
     with pytest.raises(MiNtfError, match=r"a.png: has no alpha channel and no mask \(.*masks/a.png\); training must .* "
                                          "name the masks' folder with --masks DIR, .* --background black"):
-        read(tmp_path / "a.png", images.mask_places(tmp_path / "masks", "a.png"))
+        read(tmp_path / "a.png", file_names.mask_places(tmp_path / "masks", "a.png"))
 
 
 def test_exr_without_alpha_is_opaque_or_masked(tmp_path):

@@ -140,7 +140,7 @@ def test_counts_of_binary_models_that_lie(tmp_path, name, count):
 
 
 def _cut(folder: Path) -> None:
-    (folder / "sparse/0/points3D.txt").unlink()
+    (folder / "sparse/0/points3D.txt").write_text("1 0.5\n")
 
 
 def _shrink(folder: Path) -> None:
@@ -151,7 +151,7 @@ def _shrink(folder: Path) -> None:
 @pytest.mark.parametrize(("model", "change", "text"), [
     ("OPENCV_FISHEYE", lambda f: None, r"camera 1: its model OPENCV_FISHEYE is not read .*`colmap image_undistorter` "
      r"and .* \(read as COLMAP model\)$"),
-    ("PINHOLE", _cut, r"points3D.txt: cannot be read .*No such file.*`colmap model_converter`"),
+    ("PINHOLE", _cut, r"points3D.txt: cannot be read .*has 2 words.*`colmap model_converter`"),
     ("PINHOLE", lambda f: (f / "images").rename(f / "photos"), "images does not exist; put the photographs of"),
     ("PINHOLE", lambda f: (f / "images/002.png").unlink(), "images/002.png does not exist; the data set is incomplete"),
     ("PINHOLE", lambda f: (f / "masks/002.png").unlink(), "002.png: has no alpha channel and no mask"),
