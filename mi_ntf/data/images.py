@@ -1,9 +1,9 @@
 """Image files as pixels over black, colour spaces explicit.
 
-    EXR          linear; alpha premultiplied, as renderers write it
-    PNG, JPEG    8 bit, sRGB; alpha straight (JPEG has none)
+    EXR          linear; alpha premultiplied, as renderers write it; windows and layers: `exr`
+    PNG, JPEG    8 bit, sRGB or what their ICC profile or gAMA says (`colour`); alpha straight (JPEG has none)
     TIFF         8 bit: as PNG; 16 bit: linear, 65535 is 1, alpha straight; floating point: as EXR
-    masks        grey level / 255 is the alpha; black: background
+    masks        `masks`
 
 Pillow, OpenEXR and OpenCV are imported where they are needed.
 """
@@ -17,6 +17,7 @@ import numpy as np
 
 from mi_ntf.core import files, ops, srgb
 from mi_ntf.core.errors import MiNtfError, shown
+from mi_ntf.data import colour, exif, exr
 
 LINEAR = srgb.decode(ops, np.arange(256) / 255.0).astype(np.float32)
 """sRGB's 256 levels in linear light."""
@@ -45,6 +46,8 @@ class Decoded(NamedTuple):
     """(H, W): 8-bit, or float32."""
     straight: bool
     """The colour is not yet multiplied by alpha."""
+    assumed: tuple[str, ...] = ()
+    """What was assumed of the file, a clause each."""
 
 
 def as_linear(image: Decoded, mask: np.ndarray | None = None) -> np.ndarray:
@@ -126,27 +129,22 @@ def _count_bad(image: Decoded, rows: slice) -> int:
 
 
 def _read_exr(path: Path) -> Decoded:
-    import OpenEXR
-
-    with OpenEXR.File(str(path), separate_channels=True) as file:
-        channels = {name: np.array(c.pixels, dtype=np.float32) for name, c in file.channels().items()}
-    missing = [name for name in "RGB" if name not in channels]
-    if missing:
-        raise MiNtfError(f"{path}: has channels {', '.join(sorted(channels))}, lacks {', '.join(missing)}; "
-                         "write it as RGB or RGBA")
-    return Decoded(np.stack([channels["R"], channels["G"], channels["B"]], -1), channels.get("A"), False)
+    rgb, alpha, assumed = exr.read(path)
+    return Decoded(rgb, alpha, False, tuple(assumed))
 
 
 def _read_srgb(path: Path) -> Decoded:
-    """8-bit image. The Exif orientation is left aside on purpose: poses and masks belong to the stored pixels."""
+    """8-bit image, as it is stored: what an Exif orientation turns is found by all photographs (`orientation`)."""
     from PIL import Image
 
     with Image.open(path) as image:
+        exif.check_stored(image, path)
         if image.mode not in ("L", "LA", "P", "RGB", "RGBA"):
             raise MiNtfError(f"{path}: image of mode '{image.mode}'; write it with 8 bits a channel, or as EXR or TIFF")
         has_alpha = image.mode in ("LA", "RGBA") or "transparency" in image.info
-        stored = np.asarray(image.convert("RGBA" if has_alpha else "RGB"))
-    return Decoded(stored[..., :3], stored[..., 3] if has_alpha else None, True)
+        alpha = np.asarray(image.convert("RGBA").getchannel("A")) if has_alpha else None
+        rgb, note = colour.to_srgb(image, path)
+        return Decoded(np.asarray(rgb), alpha, True, (note,) if note else ())
 
 
 def _read_tiff(path: Path) -> Decoded:
@@ -154,9 +152,11 @@ def _read_tiff(path: Path) -> Decoded:
 
     Pillow would cut 16 bits to 8, and OpenCV multiplies 8 bits by alpha; each reads what it reads well.
     """
-    bits, premultiplied = _tiff_tags(path)
+    bits, premultiplied, profile = _tiff_tags(path)
     if bits and max(bits) <= 8:
         return _read_srgb(path)
+    if profile:
+        colour.check_linear(profile, path)
     stored = opencv(f"{path}: TIFF of more than 8 bits").imread(str(path), -1)  # -1: as it is, IMREAD_UNCHANGED
     if stored is None:
         raise ValueError("OpenCV finds no image in it")
@@ -170,16 +170,16 @@ def _read_tiff(path: Path) -> Decoded:
     return Decoded(rgb, stored[..., 3] if stored.shape[2] == 4 else None, whole and not premultiplied)
 
 
-def _tiff_tags(path: Path) -> tuple[tuple[int, ...], bool]:
-    """Bits of each sample, and whether alpha is associated, as far as Pillow knows the file."""
+def _tiff_tags(path: Path) -> tuple[tuple[int, ...], bool, bytes | None]:
+    """Bits of each sample, whether alpha is associated, and the ICC profile, as far as Pillow knows the file."""
     from PIL import Image, UnidentifiedImageError
 
     try:
         with Image.open(path) as image:
             tags = image.tag_v2  # type: ignore[attr-defined]  # a TIFF has them
-            return tuple(tags.get(258, (1,))), 1 in tuple(tags.get(338, ()))
+            return tuple(tags.get(258, (1,))), 1 in tuple(tags.get(338, ())), image.info.get("icc_profile")
     except UnidentifiedImageError:
-        return (), False
+        return (), False, None
 
 
 def opencv(what: str):
@@ -195,31 +195,11 @@ def size_of(path: Path) -> tuple[int, int] | None:
     """(width, height) in pixels as the head of an image file says it; None where only reading the whole would tell."""
     try:
         if path.suffix.lower() == ".exr":
-            import OpenEXR
-
-            low, high = OpenEXR.File(str(path), header_only=True).header()["dataWindow"]
-            width, height = high - low + 1
-            return int(width), int(height)
-        from PIL import Image
-
-        with Image.open(path) as image:
-            return image.size
+            return exr.size(path)
+        head = exif.head(path)
+        return head and head.size
     except Exception:  # told when it is read
         return None
-
-
-def read_mask(path: Path) -> np.ndarray:
-    """Alpha (H, W) of 8 bits of a mask; a grey level is a share of coverage, no colour."""
-    from PIL import Image
-
-    try:
-        with Image.open(path) as image:
-            if image.mode[:1] in ("I", "F"):
-                raise ValueError(f"mode '{image.mode}'")
-            return np.asarray(image.convert("L"))
-    except Exception as error:
-        raise MiNtfError(f"{path}: cannot be read as a mask ({shown(str(error))}); write it as 8-bit grey PNG"
-                         ) from error
 
 
 def write_exr(path: Path, rgba: np.ndarray) -> None:

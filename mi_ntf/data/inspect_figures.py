@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mi_ntf.data import lens, measures, page
+from mi_ntf.data import colour, lens, measures, page
 from mi_ntf.data.images import LINEAR, levels, linear, opencv
 from mi_ntf.data.schema import Camera, Split, View
 
@@ -151,7 +151,8 @@ def _whole(view: View, pinhole: Camera, width: int, height: int) -> np.ndarray |
             return None
         image.draft("RGB", (2 * width, 2 * height))  # JPEG is decoded at a fraction of its size
         target = (2 * width, 2 * height) if bent else (width, height)
-        stored = np.asarray(image.convert("RGB").resize(target, Image.Resampling.BOX))
+        rgb, _ = colour.to_srgb(image, view.image)
+        stored = np.asarray(rgb.resize(target, Image.Resampling.BOX))
     if bent:
         stored = _straight(stored, lens.rescaled(bent, view.size or size, target), pinhole, (width, height))
     return LINEAR[stored]

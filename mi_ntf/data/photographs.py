@@ -7,7 +7,8 @@ makes one of half precision, or of single precision where half would not hold a 
 import numpy as np
 
 from mi_ntf.core.errors import MiNtfError
-from mi_ntf.data import background, images, lens
+from mi_ntf.data import background, images, lens, masks
+from mi_ntf.data.assumptions import Assumed
 from mi_ntf.data.file_names import first
 from mi_ntf.data.schema import Camera, View, focal_length
 
@@ -15,16 +16,18 @@ HALF = (1e-3, 65504.0)
 """Between these, the brightest light of a photograph for which half precision will do: it has 11 bits down to 6e-5."""
 
 
-def load(views: list[View], size: int | None = None, black: bool = False
+def load(views: list[View], size: int | None = None, black: bool = False, assumed: Assumed | None = None
          ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """``(images (N, H, W, 4) as stored, c2w (N, 4, 4), focal (N, 2), principal (N, 2))`` of a split; pixels, float64.
 
     `size`: longer side in pixels that photographs are scaled down to. `black`: alpha is what the black background tells
-    (`background`) instead of masks. Every photograph has one size in the end. Raises MiNtfError.
+    (`background`) instead of masks. What is assumed is added to `assumed`. Every photograph has one size in the end.
+    Raises MiNtfError.
     """
     stored, straighten, intrinsics = np.empty((0, 0, 0, 4), np.uint8), lens.Straightener(), []
+    assumed = Assumed() if assumed is None else assumed
     for i, view in enumerate(views):
-        pixels, camera = read(view, size, black, straighten)
+        pixels, camera = read(view, size, black, straighten, assumed)
         if i == 0:
             stored = np.empty((len(views), *pixels.shape), _fitting(pixels))
         if pixels.shape != stored.shape[1:]:
@@ -56,11 +59,13 @@ def _held(stored: np.ndarray, count: int, dtype: np.dtype) -> np.ndarray:
     return wider
 
 
-def read(view: View, size: int | None, black: bool, straighten: lens.Straightener) -> tuple[np.ndarray, Camera]:
+def read(view: View, size: int | None, black: bool, straighten: lens.Straightener, assumed: Assumed | None = None
+         ) -> tuple[np.ndarray, Camera]:
     """``(pixels (H, W, 4), camera)`` of one photograph: 8-bit levels, or float32. Raises MiNtfError."""
-    image = images.decode(view.image)
+    assumed = Assumed() if assumed is None else assumed
+    image, mask = _stored(view, black, assumed)
     height, width = image.rgb.shape[:2]
-    camera, mask = _camera(view, width, height), None if black else _mask(view, image)
+    camera = _camera(view, width, height)
     target, whole = lens.shrunk(width, height, size), image.rgb.dtype == np.uint8
     bent = any(camera.distortion)
     if whole and not bent and target == (width, height):
@@ -79,6 +84,14 @@ def read(view: View, size: int | None, black: bool, straighten: lens.Straightene
     return pixels, camera
 
 
+def _stored(view: View, black: bool, assumed: Assumed) -> tuple[images.Decoded, np.ndarray | None]:
+    """The photograph and its mask, both as the photograph is stored."""
+    image = images.decode(view.image)
+    for note in image.assumed:
+        assumed.add(note, view.image)
+    return image, None if black else _mask(view, image, assumed)
+
+
 def _as_levels(pixels: np.ndarray) -> np.ndarray:
     stored = np.empty(pixels.shape, np.uint8)
     for rows in images.strips(pixels):
@@ -86,7 +99,7 @@ def _as_levels(pixels: np.ndarray) -> np.ndarray:
     return stored
 
 
-def _mask(view: View, image: images.Decoded) -> np.ndarray | None:
+def _mask(view: View, image: images.Decoded, assumed: Assumed) -> np.ndarray | None:
     """The mask that is the photograph's alpha, None where that has its own.
 
     Training must know which pixels show the object, so a photograph with neither is an error.
@@ -100,7 +113,8 @@ def _mask(view: View, image: images.Decoded) -> np.ndarray | None:
                          "tell the object from what is behind it: put a mask there (PNG, white: object, black: "
                          "background), name the masks' folder with --masks DIR, write the photograph as RGBA PNG, or, "
                          "if all were taken with a flash in a dark room, say --background black")
-    mask = images.read_mask(place)
+    mask, note = masks.read(place)
+    assumed.add(note, view.image)
     if mask.shape != image.rgb.shape[:2]:
         raise MiNtfError(f"{place}: is {mask.shape[1]}x{mask.shape[0]}, its photograph {view.image} is "
                          f"{image.rgb.shape[1]}x{image.rgb.shape[0]}; a mask has the size of its photograph")

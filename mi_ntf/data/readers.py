@@ -32,7 +32,7 @@ from mi_ntf.data import (
     poses,
     transforms_json,
 )
-from mi_ntf.data.assumptions import PREFIX
+from mi_ntf.data.assumptions import PREFIX, Assumed
 from mi_ntf.data.schema import Found, Split, View
 
 FORMS = (
@@ -83,7 +83,10 @@ def _load(folder: Path, found: Found, views: dict[str, list[View]], say: Callabl
     poses.check_views(views["train"], None if found.sphere is None else found.sphere[0])
     for view in every:  # before an hour is spent on those that are there
         images.check_exists(view.image)
-    loaded = {name: photographs.load(split, size, black) for name, split in views.items()}
+    assumed = Assumed()
+    loaded = {name: photographs.load(split, size, black, assumed) for name, split in views.items()}
+    for text in assumed.sentences():
+        say(PREFIX + text)
     _check_masks(views["train"], loaded["train"][0])
     _say_pixels(loaded["train"][0], size, black, say)
     if found.sphere is None:

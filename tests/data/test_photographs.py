@@ -51,8 +51,9 @@ def test_jpeg_takes_its_alpha_from_the_mask(tmp_path):
     mask.write_bytes(b"no image")
     with pytest.raises(MiNtfError, match=r"a.jpg.png: cannot be read as a mask"):
         read(photo, [mask])
-    Image.fromarray(np.zeros((8, 8), np.uint16)).save(mask)
-    with pytest.raises(MiNtfError, match=r"a.jpg.png: cannot be read as a mask \(.mode 'I;16'.\); write it as 8-bit"):
+    mask = mask.with_suffix(".tif")
+    Image.fromarray(np.zeros((8, 8), np.float32)).save(mask)
+    with pytest.raises(MiNtfError, match=r"a.jpg.tif: cannot be read as a mask \(.mode 'F'.\); write it as 8-bit"):
         read(photo, [mask])
 
 
