@@ -89,8 +89,9 @@ def _scaled(views: Views) -> tuple[Views, list[str]]:
 
 
 def _size(view: View) -> tuple[int, int] | None:
-    """(width, height) of the photograph."""
-    return images.size_of(view.image)
+    """(width, height) of the photograph as its camera sees it."""
+    size = images.size_of(view.image)
+    return size[::-1] if size and view.upright and view.orientation > 4 else size
 
 
 def said(sentences: Iterable[str]) -> list[str]:

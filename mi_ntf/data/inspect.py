@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from mi_ntf.core import files
-from mi_ntf.data import assumptions, inspect_figures, measures
+from mi_ntf.data import assumptions, inspect_figures, measures, orientation
 from mi_ntf.data.measures import percent
 from mi_ntf.data.page import Page
 from mi_ntf.data.readers import FORMS, load_dataset
@@ -89,7 +89,8 @@ def _page(folder: Path, read: Found, splits: dict[str, Split], rows: list[measur
                 "sphere; lengths in its radii.")
     page.figure(inspect_figures.directions(splits, np.array(found["gap"]["direction"])),
                 "The sides the object was seen from. Dark: no camera for training is near.")
-    views = {view.image: view for split in read.views.values() for view in split}
+    settled, _ = orientation.settle(read.views, False)
+    views = {view.image: view for split in settled.values() for view in split}
     page.section("Masks")
     page.text("The line is the mask's outline; what is outside is dimmed and bluish"
               + ("." if found["masked"] else ", what is not known is orange.")

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mi_ntf.data import colour, lens, measures, page
+from mi_ntf.data import colour, exif, lens, measures, page
 from mi_ntf.data.images import LINEAR, levels, linear, opencv
 from mi_ntf.data.schema import Camera, Split, View
 
@@ -139,7 +139,7 @@ def _scaled(plane: np.ndarray, width: int, height: int) -> np.ndarray:
 
 def _whole(view: View, pinhole: Camera, width: int, height: int) -> np.ndarray | None:
     """The photograph's 8-bit file with its background as `pinhole` sees it (height, width, 3), linear. None for files
-    of another kind."""
+    of another kind, and for turned ones of a lens."""
     from PIL import Image
 
     if view.image.suffix.lower() not in (".jpg", ".jpeg", ".png"):
@@ -147,12 +147,16 @@ def _whole(view: View, pinhole: Camera, width: int, height: int) -> np.ndarray |
     bent = view.camera if isinstance(view.camera, Camera) and any(view.camera.distortion) else None
     with Image.open(view.image) as image:
         size = image.size
-        if image.mode not in ("L", "LA", "P", "RGB", "RGBA"):
+        turned = view.upright and view.orientation > 4
+        quarter = width != height and ((size[0] > size[1]) != turned) != (width > height)  # `photographs.load` did
+        if image.mode not in ("L", "LA", "P", "RGB", "RGBA") or (bent and (quarter or view.upright)):
             return None
         image.draft("RGB", (2 * width, 2 * height))  # JPEG is decoded at a fraction of its size
-        target = (2 * width, 2 * height) if bent else (width, height)
+        target = (2 * width, 2 * height) if bent else (height, width) if quarter != turned else (width, height)
         rgb, _ = colour.to_srgb(image, view.image)
         stored = np.asarray(rgb.resize(target, Image.Resampling.BOX))
+    stored = exif.turned(stored, view.orientation) if view.upright else stored
+    stored = np.rot90(stored) if quarter else stored
     if bent:
         stored = _straight(stored, lens.rescaled(bent, view.size or size, target), pinhole, (width, height))
     return LINEAR[stored]

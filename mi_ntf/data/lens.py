@@ -38,6 +38,14 @@ def shrink(pixels: np.ndarray, camera: Camera, new: tuple[int, int]) -> tuple[np
     return cv2.resize(pixels, new, interpolation=cv2.INTER_AREA), rescaled(camera, old, new)
 
 
+def quarter_turn(pixels: np.ndarray, camera: Camera, c2w: np.ndarray) -> tuple[np.ndarray, Camera, np.ndarray]:
+    """A picture (H, W, 4) of a pinhole turned by 90 degrees to the left, and the camera and pose that it is then of:
+    the camera is rolled about its optical axis."""
+    turned = Camera(camera.fy, camera.fx, camera.cy, pixels.shape[1] - camera.cx)
+    roll = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    return np.rot90(pixels), turned, c2w @ roll
+
+
 class Straightener:
     """Makes pictures of distorted cameras those of pinholes. It keeps the maps of the last camera: most data sets have
     one camera alone."""

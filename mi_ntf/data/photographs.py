@@ -7,7 +7,7 @@ makes one of half precision, or of single precision where half would not hold a 
 import numpy as np
 
 from mi_ntf.core.errors import MiNtfError
-from mi_ntf.data import background, images, lens, masks
+from mi_ntf.data import background, exif, images, lens, masks
 from mi_ntf.data.assumptions import Assumed
 from mi_ntf.data.file_names import first
 from mi_ntf.data.schema import Camera, View, focal_length
@@ -21,15 +21,20 @@ def load(views: list[View], size: int | None = None, black: bool = False, assume
     """``(images (N, H, W, 4) as stored, c2w (N, 4, 4), focal (N, 2), principal (N, 2))`` of a split; pixels, float64.
 
     `size`: longer side in pixels that photographs are scaled down to. `black`: alpha is what the black background tells
-    (`background`) instead of masks. What is assumed is added to `assumed`. Every photograph has one size in the end.
-    Raises MiNtfError.
+    (`background`) instead of masks. Every photograph has one size in the end: portraits are turned by 90 degrees if the
+    first is none, with their cameras, and landscapes likewise. What is assumed is added to `assumed`. Raises
+    MiNtfError.
     """
-    stored, straighten, intrinsics = np.empty((0, 0, 0, 4), np.uint8), lens.Straightener(), []
+    stored, straighten, intrinsics, poses = np.empty((0, 0, 0, 4), np.uint8), lens.Straightener(), [], []
     assumed = Assumed() if assumed is None else assumed
     for i, view in enumerate(views):
-        pixels, camera = read(view, size, black, straighten, assumed)
+        (pixels, camera), c2w = read(view, size, black, straighten, assumed), view.c2w
         if i == 0:
             stored = np.empty((len(views), *pixels.shape), _fitting(pixels))
+        if pixels.shape != stored.shape[1:] and pixels.shape[1::-1] == stored.shape[1:3]:
+            pixels, camera, c2w = lens.quarter_turn(pixels, camera, c2w)
+            assumed.add(f"{'landscapes' if pixels.shape[0] > pixels.shape[1] else 'portraits'} are turned to the left "
+                        "with their cameras, to lie as the first photograph does", view.image)
         if pixels.shape != stored.shape[1:]:
             raise MiNtfError(f"{view.image}: is {pixels.shape[1]}x{pixels.shape[0]}, {views[0].image} is "
                              f"{stored.shape[2]}x{stored.shape[1]}; all photographs of a split have one size: scale or "
@@ -37,8 +42,9 @@ def load(views: list[View], size: int | None = None, black: bool = False, assume
         stored = _held(stored, i, _fitting(pixels))
         stored[i] = pixels if pixels.dtype == stored.dtype or pixels.dtype != np.uint8 else images.linear(pixels)
         intrinsics.append((camera.fx, camera.fy, camera.cx, camera.cy))
+        poses.append(c2w)
     numbers = np.array(intrinsics, dtype=np.float64)
-    return stored, np.stack([view.c2w for view in views]), numbers[:, :2], numbers[:, 2:]
+    return stored, np.stack(poses), numbers[:, :2], numbers[:, 2:]
 
 
 def _fitting(pixels: np.ndarray) -> np.dtype:
@@ -63,7 +69,7 @@ def read(view: View, size: int | None, black: bool, straighten: lens.Straightene
          ) -> tuple[np.ndarray, Camera]:
     """``(pixels (H, W, 4), camera)`` of one photograph: 8-bit levels, or float32. Raises MiNtfError."""
     assumed = Assumed() if assumed is None else assumed
-    image, mask = _stored(view, black, assumed)
+    image, mask = _upright(view, *_stored(view, black, assumed))
     height, width = image.rgb.shape[:2]
     camera = _camera(view, width, height)
     target, whole = lens.shrunk(width, height, size), image.rgb.dtype == np.uint8
@@ -92,6 +98,15 @@ def _stored(view: View, black: bool, assumed: Assumed) -> tuple[images.Decoded, 
     return image, None if black else _mask(view, image, assumed)
 
 
+def _upright(view: View, image: images.Decoded, mask: np.ndarray | None) -> tuple[images.Decoded, np.ndarray | None]:
+    """Both as pose and camera have them."""
+    if not view.upright:
+        return image, mask
+    alpha, mask = (None if plane is None else exif.turned(plane, view.orientation)
+                   for plane in (image.alpha, mask))
+    return image._replace(rgb=exif.turned(image.rgb, view.orientation), alpha=alpha), mask
+
+
 def _as_levels(pixels: np.ndarray) -> np.ndarray:
     stored = np.empty(pixels.shape, np.uint8)
     for rows in images.strips(pixels):
@@ -100,7 +115,7 @@ def _as_levels(pixels: np.ndarray) -> np.ndarray:
 
 
 def _mask(view: View, image: images.Decoded, assumed: Assumed) -> np.ndarray | None:
-    """The mask that is the photograph's alpha, None where that has its own.
+    """The mask that is the photograph's alpha, as the photograph is stored; None where that has its own.
 
     Training must know which pixels show the object, so a photograph with neither is an error.
     """
@@ -115,6 +130,7 @@ def _mask(view: View, image: images.Decoded, assumed: Assumed) -> np.ndarray | N
                          "if all were taken with a flash in a dark room, say --background black")
     mask, note = masks.read(place)
     assumed.add(note, view.image)
+    mask = exif.turned(mask, exif.UNDONE[view.orientation]) if view.mask_upright else mask
     if mask.shape != image.rgb.shape[:2]:
         raise MiNtfError(f"{place}: is {mask.shape[1]}x{mask.shape[0]}, its photograph {view.image} is "
                          f"{image.rgb.shape[1]}x{image.rgb.shape[0]}; a mask has the size of its photograph")

@@ -28,6 +28,7 @@ from mi_ntf.data import (
     light,
     llff,
     nerfstudio,
+    orientation,
     photographs,
     poses,
     transforms_json,
@@ -66,9 +67,10 @@ def load_dataset(folder: Path, say: Callable[[str], None] = print, *, size: int 
         found = reader(folder)
         form = found.form
         views = _with_options(found.views, masks, flash_offset)
+        views, turned = orientation.settle(views, background is None)
         views, settled = assumptions.settle(views)
         say(_summary(found, folder, size, background))
-        for note in [*notes, *found.notes, *(PREFIX + text for text in [*found.assumed, *settled])]:
+        for note in [*notes, *found.notes, *(PREFIX + text for text in [*found.assumed, *turned, *settled])]:
             say(note)
         return _load(folder, found, split_off(views, say), say, size, background == "black", flash_offset)
     except MiNtfError as error:

@@ -89,6 +89,12 @@ class View:
     """The mask is the alpha, whatever the image has."""
     rescaled: bool = False
     """The photograph may be a copy of another size than `size`; `camera` is that of `size`."""
+    orientation: int = 1
+    """The file's Exif orientation, 1 to 8."""
+    upright: bool = False
+    """Pose and camera are those of the photograph turned by `orientation`."""
+    mask_upright: bool = False
+    """The mask is that of the photograph turned by `orientation`."""
 
 
 @dataclass(frozen=True)
