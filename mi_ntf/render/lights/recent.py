@@ -7,11 +7,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+KEPT = 8
+
 
 class Recent(dict):
     """The `kept` results that were asked for last, by what they were made of."""
 
-    def __init__(self, kept: int = 8):
+    def __init__(self, kept: int = KEPT):
         super().__init__()
         self._kept = kept
 

@@ -70,8 +70,9 @@ class Walk:
             last = 0 <= self.max_depth <= depth
             depth += 1
             scattered = []
-            while dr.width(paths.pixel):
-                onward, paths = self._flight(paths, depth, last)
+            flying: Paths | None = paths
+            while flying and dr.width(flying.pixel):
+                onward, flying = self._flight(flying, depth, last)
                 scattered.append(onward)
             if last:
                 return
@@ -82,19 +83,19 @@ class Walk:
         for total, value in zip(self.total, paths.weight * light, strict=True):
             dr.scatter_reduce(dr.ReduceOp.Add, total, value, paths.pixel)
 
-    def _flight(self, paths: Paths, depth: int, last: bool) -> tuple[Paths, Paths]:
+    def _flight(self, paths: Paths, depth: int, last: bool) -> tuple[Paths, Paths | None]:
         """Follow paths to their next vertices, in fields or on surfaces, and add the light there. Return those that
-        scatter and, apart, those that cross a surface, which is no vertex. `last`: only emitters add light, since paths
-        are as long as they may be."""
-        surfaces, nobody = self.scene.surfaces, paths.take(mi.UInt32())
+        scatter and, apart, those that cross a surface, which is no vertex; None: no surface lets any cross. `last`:
+        only emitters add light, since paths are as long as they may be."""
+        surfaces, crossing = self.scene.surfaces, None
         si = surfaces.intersect(paths.ray) if surfaces else None
         if surfaces and surfaces.lights_can_be_hit:
             self.add(paths, surfaces.emission(si, paths.ray, paths.pdf, paths.pdf != 0, paths.way))
         if last and not (surfaces and surfaces.transmitting):
-            return nobody, nobody
+            return paths, None
         n = dr.width(paths.pixel)
         hit, t, which = self._fly(paths, si.t if si else mi.Float(dr.inf))
-        onward, crossing = paths.take(dr.arange(mi.UInt32, n)), nobody
+        onward = paths.take(dr.arange(mi.UInt32, n))
         onward = replace(onward, weight=dr.zeros(mi.Color3f, n))
         for i, part in enumerate(() if last else self.scene.parts):
             index: Any = dr.compress(hit & (which == i))
@@ -137,9 +138,9 @@ class Walk:
         zero = dr.zeros(mi.Float, dr.width(t))
         return replace(paths, ray=ray, weight=weight, pdf=zero, way=None if paths.way is None else mi.Float(zero))
 
-    def on_surface(self, paths: Paths, si, lit: bool = True) -> tuple[Paths, Paths]:
+    def on_surface(self, paths: Paths, si, lit: bool) -> tuple[Paths, Paths | None]:
         """Add the direct light at the surface points `si`, if `lit`. Return the paths that scatter there, one for each
-        of `paths`, and those that cross the surface."""
+        of `paths`, and those that cross the surface (None: no surface lets any)."""
         surfaces = self.scene.surfaces
         active = si.is_valid() & (dr.max(paths.weight) > 0)
         if lit:
@@ -150,7 +151,7 @@ class Walk:
         weight = paths.weight * weight
         scattered = replace(paths, ray=ray, weight=weight, pdf=pdf)
         if not surfaces.transmitting:
-            return scattered, paths.take(mi.UInt32())
+            return scattered, None
         dr.eval(scattered.ray, weight, pdf, crossed, paths.rng.state)
         straight = replace(paths, ray=ray, weight=weight, way=paths.way + si.t)
         straight = straight.take(dr.compress(crossed & (dr.max(weight) > 0)))
