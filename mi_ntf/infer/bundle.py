@@ -51,6 +51,20 @@ def density_where(active, density, p):
     return dr.if_stmt((*p,), active, lambda *p: density(p), lambda *p: type(p[0])(0), label="density")
 
 
+def slope_where(active, density, p):
+    """``(σ, ∂σ/∂x, ∂σ/∂y, ∂σ/∂z)`` at `p` where `active`, 0 elsewhere."""
+
+    def slope(*p):
+        with dr.isolate_grad(), dr.resume_grad():
+            q = dr.detach(p)
+            dr.enable_grad(q)
+            sigma = density(q)
+            dr.backward(sigma)
+            return (dr.detach(sigma), *dr.grad(q))
+
+    return dr.if_stmt((*p,), active, slope, lambda *p: (type(p[0])(0),) * 4, label="slope")
+
+
 def safe_inverse(d):
     """1/d by components, ±1e8 where a component is 0."""
     return tuple(dr.rcp(dr.select(dr.abs(c) < 1e-8, dr.select(c < 0, -1e-8, 1e-8), c)) for c in d)

@@ -5,11 +5,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import scenes
+from helpers.derivatives import backward, differences, forward
 
 from mi_ntf.core.errors import MiNtfError
-
-WEIGHTS = [1.0, 0.6, -0.4]
-"""Of the colour channels in the scalar that is differentiated: none cancels another."""
 
 
 @pytest.fixture(scope="module")
@@ -22,56 +20,6 @@ def setting(blobs, lights, visibility, **options):
     integrator = {"type": "nrf", "visibility": visibility, "hide_emitters": True, "samples": 256, **options}
     scene = scenes.scene(blobs, integrator, lights, size=12, spp=16)
     return scene, mi.traverse(scene)
-
-
-def value(scene, parameters, seed=3):
-    """A weighted mean over the picture that prefers its upper right: no symmetry hides an error. Derivatives are taken
-    with the random numbers of seed 3, which may not be the picture's own."""
-    image = mi.render(scene, parameters, seed=seed, seed_grad=3 if seed != 3 else 4)[..., :3]
-    height, width = image.shape[:2]
-    y, x = np.mgrid[:height, :width]
-    weights = (1 + x / width - 0.5 * y / height)[..., None] * np.array(WEIGHTS)
-    return dr.mean(image * mi.TensorXf(weights.astype(np.float32)), axis=None)
-
-
-def forward(scene, parameters, name, direction, kind):
-    """The derivative of :func:`value` as `name` moves along `direction`."""
-    original = kind(parameters[name])
-    t = mi.Float(0)
-    dr.enable_grad(t)
-    parameters[name] = original + t * kind(direction)
-    parameters.update()
-    result = value(scene, parameters, 4)
-    dr.forward(t)
-    slope = float(dr.grad(result).array[0])
-    parameters[name] = original
-    parameters.update()
-    return slope
-
-
-def backward(scene, parameters, name, direction, kind):
-    original = kind(parameters[name])
-    attached = kind(original)
-    dr.enable_grad(attached)
-    parameters[name] = attached
-    parameters.update()
-    dr.backward(value(scene, parameters, 4))
-    slope = float(np.sum(np.array(dr.grad(attached), np.float64) * np.array(kind(direction), np.float64)))
-    parameters[name] = original
-    parameters.update()
-    return slope
-
-
-def differences(scene, parameters, name, direction, kind, step):
-    """The same by central differences."""
-    original, found = kind(parameters[name]), []
-    for sign in (1, -1):
-        parameters[name] = original + sign * step * kind(direction)
-        parameters.update()
-        found.append(float(value(scene, parameters).array[0]))
-    parameters[name] = original
-    parameters.update()
-    return (found[0] - found[1]) / (2 * step)
 
 
 @pytest.mark.parametrize("mode", [forward, backward])
@@ -112,6 +60,32 @@ def test_position(blobs, visibility, mode):
     scene, parameters = setting(blobs, {"light": scenes.light("point")}, visibility)
     expected = unshadowed if visibility == "none" else truth
     assert mode(scene, parameters, *case[2:]) == pytest.approx(expected, rel=0.03)
+
+
+@pytest.mark.parametrize("other", ["field", "floor"])
+def test_position_moves_shadows_on_other_things(blobs, other):
+    """Of one field on another, and of a field on a surface: all that the camera sees."""
+    up = mi.ScalarTransform4f()
+    if other == "floor":
+        lying = up.translate([0.4, -1.8, 0.3]).rotate([1, 0, 0], -90).scale(6)
+        shapes = {"floor": {"type": "rectangle", "to_world": lying}}
+        aim = {"origin": [0.4, 2.5, 3.5], "target": [0.4, -1.8, -1.0]}
+    else:
+        away = [-3.9, -2.2, -2.4]
+        shift = {"to_world": up.translate(away)}
+        shapes = {"second": {**scenes.ball(blobs, **shift), "center": [0.4 + away[0], -0.2 + away[1], 0.3 + away[2]]}}
+        aim = {"origin": [-3.5, -1.4, 2.5], "target": [-3.5, -2.4, -2.1]}
+    found = []
+    for visibility in ("raymarch", "none"):
+        integrator = {"type": "nrf", "visibility": visibility, "hide_emitters": True, "samples": 256}
+        scene = scenes.scene(blobs, integrator, {"light": scenes.light("point")}, size=12, spp=16, shapes=shapes)
+        parameters = mi.traverse(scene)
+        parameters["sensor.to_world"] = mi.Transform4f().look_at(**aim, up=[0, 1, 0])
+        case = scene, parameters, "light.position", [-0.3, -0.6, 1.0], mi.Point3f
+        found += [differences(*case, 0.1), backward(*case)]
+    truth, slope, unshadowed, _ = found
+    assert abs(truth - unshadowed) > 0.5 * abs(truth)
+    assert slope == pytest.approx(truth, rel=0.05)
 
 
 def test_many_moving_lights_are_refused(blobs):

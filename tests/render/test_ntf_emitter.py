@@ -5,9 +5,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import scenes, ztest
+from helpers.derivatives import backward, differences, forward
 
-from mi_ntf.core.errors import MiNtfError
-from mi_ntf.infer.visibility import transmittance_atlas
+from mi_ntf.core.errors import MiNtfError, root
+from mi_ntf.infer.visibility import REGISTRY, transmittance_atlas
 from mi_ntf.render.plugins import emitter
 
 SEEDS = 4
@@ -148,11 +149,15 @@ def test_the_shadow_of_a_sun_is_sharp_where_skies_are_looked_up(blobs, monkeypat
     assert error[0] < 0.01 and error[1] > 0.03
 
 
-@pytest.mark.parametrize("kind", ["sunsky", "constant", "area"])
-def test_a_direction_is_worth_what_it_was_drawn_with(blobs, monkeypatch, kind):
-    """What integrators with derivatives ask for once more, by the same march or lookup."""
+@pytest.fixture
+def few_directions(monkeypatch):
     monkeypatch.setattr(transmittance_atlas, "SIDE", 8)
     monkeypatch.setattr(transmittance_atlas, "RESOLUTION", 16)
+
+
+@pytest.mark.parametrize("kind", ["sunsky", "constant", "area"])
+def test_a_direction_is_worth_what_it_was_drawn_with(blobs, few_directions, monkeypatch, kind):
+    """What integrators with derivatives ask for once more, by the same march or lookup."""
     monkeypatch.setitem(ABOVE, "sunsky", {**ABOVE["sunsky"], "sun_scale": 1.0})
     n, u = 1024, np.random.default_rng(0).random((4, 1024)).astype(np.float32)
     it = dr.zeros(mi.Interaction3f, n)
@@ -233,3 +238,51 @@ def test_a_floor_beside_its_field_is_not_shadowed_twice(blobs):
         for path in (None, blobs)
     )
     np.testing.assert_allclose(wrapped, bare, rtol=1e-3, atol=1e-4)  # equal seeds draw equal lights
+
+
+def under(integrator: str, path, visibility: str):
+    """The floor in the shadow of a point light, and its parameters."""
+    options = {} if integrator == "direct" else {"max_depth": 2}
+    loaded = floor_scene({"type": integrator, **options}, light("point", path, visibility), {"type": "diffuse"}, 12)
+    return loaded, mi.traverse(loaded)
+
+
+@pytest.fixture(scope="module")
+def soft(tmp_path_factory):
+    """Shadows that move by more than a march's steps before they are gone."""
+    return scenes.write_blobs(tmp_path_factory.mktemp("soft"), log_density=2.0, visibility=True)
+
+
+def test_derivatives_by_a_lights_place(soft, few_directions):
+    """Shadows move with the light; whatever else holds them, they are the march's."""
+    place = "light.emitter.position", [1.0, 0.3, 0.5], mi.Point3f
+    truth, unshadowed = (differences(*under("direct", soft, v), *place, 0.05) for v in ("raymarch", "none"))
+    assert abs(truth - unshadowed) > 0.5 * abs(truth)
+    for visibility in REGISTRY:
+        slope = backward(*under("direct", soft, visibility), *place)
+        assert slope == pytest.approx(unshadowed if visibility == "none" else truth, rel=0.04), visibility  # 0.015
+
+
+@pytest.mark.parametrize(("integrator", "mode"), [("direct", forward), ("path", forward), ("prb", backward)])
+@pytest.mark.parametrize("visibility", ["raymarch", "transmittance_atlas"])
+def test_derivatives_by_power_and_by_surfaces(soft, few_directions, integrator, mode, visibility):
+    """The picture is linear in the one; with the other, the points that rays to the light start from move."""
+    setting = under(integrator, soft, visibility)
+    power = "light.emitter.intensity.value", [1.0, 0.5, 0.2], mi.Color3f
+    assert mode(*setting, *power) == pytest.approx(differences(*setting, *power, 10.0), rel=1e-3)
+    place = "floor.to_world", [0.0, 1.0, 0.0], mi.Transform4f
+    truth = differences(*under("direct", soft, "raymarch"), *place, 0.05)
+    assert mode(*setting, *place) == pytest.approx(truth, rel=0.12)  # 0.08; without the shadow's, of the other sign
+
+
+def test_prb_knows_no_derivative_by_a_lights_place(soft):
+    """Beside one that it knows it would leave that out without a word."""
+    loaded, parameters = under("prb", soft, "raymarch")
+    for key, kind in (("light.emitter.position", mi.Point3f), ("light.emitter.intensity.value", mi.Color3f)):
+        value = kind(parameters[key])
+        dr.enable_grad(value)
+        parameters[key] = value
+    parameters.update()
+    with pytest.raises((MiNtfError, RuntimeError)) as caught:
+        dr.backward(dr.mean(mi.render(loaded, parameters, spp=1), axis=None))
+    assert "ntf emitter: gradients by position of its light: prb leaves them out" in str(root(caught.value))

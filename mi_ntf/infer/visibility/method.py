@@ -39,12 +39,12 @@ class Method:
     summary      what it does, a sentence
     build        ``(medium, table, options, dj, keep)`` → an object with ``tau``, in the medium's field coordinates, and
                  with ``stream``, an opaque seed that the renderer sets, where lookups draw numbers.
-                 `table`: the :class:`mi_ntf.infer.lights.LightTable` that what is held per light is made for, and whose
-                 moving lights are followed more finely; None: the others. ``keep(width, step, make)`` → ``make()``, or
-                 ``make(values)`` where what it would make, `width` numbers for each of the squared
-                 ``map_resolution`` rays of each light, marched in steps of `step`, is at hand; for a field's own maps
-                 their table of directions and their options come after `make`. ``some=``: a function of rows of
-                 `table` that makes a map of these lights alone, where each light's numbers are its own
+                 `table`: the :class:`mi_ntf.infer.lights.LightTable` that what is held per light is made for; None:
+                 the others. ``keep(width, step, make)`` → ``make()``, or ``make(values)`` where what it would make,
+                 `width` numbers for each of the squared ``map_resolution`` rays of each light, marched in steps of
+                 `step`, is at hand; for a field's own maps their table of directions and their options come after
+                 `make`. ``some=``: a function of rows of `table` that makes a map of these lights alone, where each
+                 light's numbers are its own
     pair         ``(work, prices)`` → nanoseconds of a point and light; `work`: :class:`mi_ntf.render.cost.model.Work`,
                  `prices`: :class:`mi_ntf.render.cost.model.Constants`
     prices       name → nanoseconds on two cores of 2024; the first is what `pair` counts in, the second what `making`

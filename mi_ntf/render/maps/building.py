@@ -54,8 +54,8 @@ def size_per_field(method: str, medium, table, options: Options) -> int:
 def build(method: str, medium, table, options: Options):
     """The visibility `method` (never ``auto``) of `medium`, in its field coordinates; None for ``none``.
 
-    `table`: the :class:`mi_ntf.infer.lights.LightTable` of the same coordinates, which maps and volumes are made for,
-    and whose moving lights a march follows more finely; None serves the others.
+    `table`: the :class:`mi_ntf.infer.lights.LightTable` of the same coordinates, which maps and volumes are made for;
+    None serves the others.
     """
 
     def keep(width: int, step: float, make, directions=None, own: Options = options, some=None):

@@ -43,6 +43,10 @@ def emitter_class() -> type:
         light weigh nothing, so gloss needs more samples than under the bare light. The camera sees an environment or
         area light as it is.
 
+        Pictures can be differentiated by what stock integrators know derivatives of: the light's power and place, and
+        the surfaces. The shadows of what moves are marched for it, whatever `visibility` is, unless ``none``. Where
+        place is that of a light of one point or direction, ``prb`` knows no derivative and is refused.
+
         The ``nrf`` integrator takes the nested light bare where the medium is in the scene, since it casts the shadows
         of fields itself. Stock ``volpath`` does too if the medium fills a shape there: give it the bare light.
 
@@ -65,7 +69,7 @@ def emitter_class() -> type:
             # An environment's flags let the camera see it; the shape that shines asks for those of its emitter.
             self.m_flags = int(self.inner.flags())
             self.m_needs_sample_2 = self.m_needs_sample_3 = False
-            self.bare = False
+            self.bare = self._drawn_still = False
             self._prepare()
 
         def _prepare(self):
@@ -76,9 +80,11 @@ def emitter_class() -> type:
                                  "which know nothing of the field's shadow; give it a weight above 0")
             self._drawn = environment.drawable(self.inner)
             self._method = _visibility(self.visibility, self.inner, self.medium)
+            self._march = building.build("raymarch", self.medium, None, Options(STEP))
 
         def sample_direction(self, it, sample, active=True):
             inner = self.attached()
+            self._drawn_still = not _attached_place(inner)
             ds, weight = (inner if self.bare else self._drawn).sample_direction(it, sample, active)
             if _is_far(inner):
                 # The nested light never learns the scene's size: it believes in a unit sphere and would end shadow rays
@@ -100,7 +106,9 @@ def emitter_class() -> type:
             distance = mi.Float(dr.inf) if _is_far(self.inner) else ds.dist / frame.length
             x, d = frame.point_to_field(it.p), frame.direction_to_field(ds.d)
             sun = ds.pdf > SHARP  # never that of one light, whose map has the number 0
-            return outside.tau(self._method, x, d, distance, mi.UInt32(sun), active)
+            # Maps and networks stay where lights were.
+            method = self._march if dr.grad_enabled(x, d, distance) else self._method
+            return outside.tau(method, x, d, distance, mi.UInt32(sun), active)
 
         def attached(self):
             """The nested light; one with a surface shines from the shape that this emitter belongs to."""
@@ -116,6 +124,10 @@ def emitter_class() -> type:
             return dr.select(active, hit, 0)
 
         def eval_direction(self, it, ds, active=True):
+            place = _attached_place(self.inner)
+            if place and self._drawn_still:
+                raise MiNtfError(f"ntf emitter: gradients by {place} of its light: prb leaves them out; render with "
+                                 "direct or path, or detach it")
             value = self.attached().eval_direction(it, ds, active)
             return value if self.bare else value * self._tau(it, ds, active)
 
@@ -161,6 +173,15 @@ def _visibility(name: str, inner, medium):
 def _is_one(inner) -> bool:
     """Whether a light shines from one point or direction."""
     return light_rows.kind(inner).single and scene_lights.is_discrete(inner)
+
+
+def _attached_place(inner) -> str:
+    """Name of the parameter that moves a light of one point or direction, if it carries gradients; else nothing."""
+    if not mi.has_flag(inner.flags(), mi.EmitterFlags.Delta):
+        return ""
+    attached = (key for key, value in mi.traverse(inner)
+                if key.split(".")[-1] in ("position", "to_world") and dr.grad_enabled(value))
+    return next(attached, "")
 
 
 def _is_far(emitter) -> bool:
