@@ -9,6 +9,7 @@ from ...core.variants import VARIANTS
 from ...infer.backend import module
 from ..scene import scene_file
 from ..scene.environment_option import Environment
+from . import render_errors
 from .emitter import emitter_class
 from .integrator import integrator_class
 from .medium import medium_class
@@ -20,7 +21,8 @@ _watching = False
 
 
 def register() -> None:
-    """Make the plugins known to the current variant, and to every variant that is set later. May be called again.
+    """Make the plugins known to the current variant, and to every variant that is set later, and let ``mi.render`` tell
+    their errors (:mod:`mi_ntf.render.plugins.render_errors`). May be called again.
 
     Raises MiNtfError in a variant that they cannot run in (none set, scalar, spectral, …).
     """
@@ -39,6 +41,7 @@ def register() -> None:
     mi.register_emitter("ntf", classes["emitter"])
     if not _watching:
         _watching = True
+        render_errors.show()
         mi.detail.add_variant_callback(_on_variant)
 
 
