@@ -2,7 +2,7 @@
 
 import mitsuba as mi
 
-from ...core.errors import root
+from ...core.errors import MiNtfError, root
 from ...infer.visibility import names
 from ..scene.settings import Limits
 from ..transport import aovs, rendering
@@ -77,8 +77,10 @@ def integrator_class() -> type:
         scene, position and direction, whose shadows are then marched whatever the method; and by the reflectance of
         diffuse surfaces. Other parameters with gradients are refused.
 
-        Does not support: media other than ``nrf``; spectral and polarised variants; derivatives by the fields and by
-        environments that turn; ``timed_sunsky``; environments whose `to_world` shears or, among surfaces, scales.
+        Does not support: media other than ``nrf``; fields in a ``shapegroup``; a place inside another integrator, such
+        as ``aov`` or ``moment``, since it has `aovs` of its own; spectral and polarised variants; derivatives by the
+        fields and by environments that turn; ``timed_sunsky``; environments whose `to_world` shears or, among surfaces,
+        scales.
         """
 
         def __init__(self, props):
@@ -116,6 +118,11 @@ def integrator_class() -> type:
                 return rendering.render(self, scene, sensor, seed, spp, develop)
             except RuntimeError as error:
                 raise root(error) from None
+
+        def sample(self, *_):
+            raise MiNtfError("nrf integrator: it renders whole pictures and cannot stand inside another one, such "
+                             "as aov or moment; make it the scene's own, and ask it for channels by its property "
+                             '"aovs" (depth, normal, albedo, …)')
 
         def aov_names(self):
             """Of the last render: a layer for each light is known from then on."""

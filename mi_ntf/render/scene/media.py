@@ -7,7 +7,7 @@ from ...core.errors import MiNtfError
 
 
 def find_media(scene) -> list:
-    """The scene's ``nrf`` media. Raises MiNtfError where there is none, or a bounding shape is wrong."""
+    """The scene's ``nrf`` media. Raises MiNtfError where there is none, or a bounding shape is wrong or in a group."""
     media: list = []
     bounds: list[list] = []
     for shape in scene.shapes():
@@ -18,6 +18,12 @@ def find_media(scene) -> list:
             media.append(medium)
             bounds.append([])
         bounds[next(i for i, m in enumerate(media) if m is medium)].append(shape)
+    for shape in _grouped(scene):
+        if _nrf_medium(shape) is not None:
+            raise MiNtfError(
+                f"nrf integrator: {_called(shape)} bounds an nrf medium inside a shapegroup, but fields cannot be "
+                "instanced; take the shape out of the group, and give each other place a shape and a medium of its own"
+            )
     if not media:
         raise MiNtfError(
             'nrf integrator: the scene has no nrf medium; put one inside a bounding shape: <shape type="sphere"> '
@@ -33,7 +39,7 @@ def ordinary_shapes(scene) -> list:
     """Return the shapes that rays can meet: all but the bounds of ``nrf`` media and those of a ``null`` BSDF that do
     not shine. Raises MiNtfError where one holds another medium."""
     shapes = [s for s in scene.shapes() if _nrf_medium(s) is None and not _is_absent(s)]
-    for shape in shapes:
+    for shape in shapes + _grouped(scene):
         if shape.is_medium_transition():
             raise MiNtfError(
                 f"nrf integrator: {_called(shape)} bounds a medium that is no nrf medium, which this integrator does "
@@ -58,6 +64,12 @@ def _is_absent(shape) -> bool:
     """Whether a shape neither scatters light nor emits it."""
     simple = shape.class_name() != "Instance" and not shape.is_medium_transition() and not shape.is_emitter()
     return simple and shape.bsdf().class_name() == "Null"
+
+
+def _grouped(scene) -> list:
+    """Return the shapes inside the shape groups of `scene`."""
+    return [node for group in shape_groups(scene) for node in mi.traverse(group).hierarchy if isinstance(node, mi.Shape)
+            and node is not group]
 
 
 def _nrf_medium(shape):
