@@ -83,8 +83,11 @@ def test_agrees_with_volpath(blobs, light, floor, lamp, depth):
     np.testing.assert_allclose(ours.mean((0, 1)), theirs.mean((0, 1)), rtol=0.02)
 
 
-# Two uniform balls that overlap, of unequal size, seen along −z: every transmittance is a chord.
-CENTRES, LENGTHS, SIGMAS = np.array([[-0.4, 0.0, 0.0], [0.7, 0.3, 0.4]]), np.array([1.0, 1.5]), np.array([0.8, 1.2])
+# Uniform balls that overlap, of unequal size, seen along −z: every transmittance is a chord. Centre, radius, σ times
+# radius of each.
+TWO = [((-0.4, 0.0, 0.0), 1.0, 0.8), ((0.7, 0.3, 0.4), 1.5, 1.2)]
+TEN = [((0.09 * i * np.cos(2.4 * i), 0.09 * i * np.sin(2.4 * i), 0.12 * i - 0.54), 1.2 - 0.06 * i, 0.15 + 0.02 * i)
+       for i in range(10)]
 TOWARDS = np.array([0.6, 0.64, 0.48])
 
 
@@ -96,17 +99,17 @@ def chord(p, d, centre, radius, length=np.inf):
     return np.clip(-b + h, 0, length) - np.clip(-b - h, 0, length)
 
 
-def overlap_by_quadrature(x, y, steps=1500):
+def overlap_by_quadrature(balls, x, y, steps=1500):
     """Single scattering by a midpoint rule along parallel view rays at (x, y), light of irradiance 1 from `TOWARDS`."""
+    balls = [(np.array(centre), radius, sigma / radius) for centre, radius, sigma in balls]
     view, total = np.array([0.0, 0.0, -1.0]), np.zeros((*x.shape, 3))
     passed = np.zeros(x.shape)
     dt = 5.0 / steps
     for k in range(steps):
         p = np.stack([x, y, np.full(x.shape, 2.5 - (k + 0.5) * dt)], -1)
-        inside = [((p - c) ** 2).sum(-1) < r * r for c, r in zip(CENTRES, LENGTHS, strict=True)]
-        sigma = [s / r * i for s, r, i in zip(SIGMAS, LENGTHS, inside, strict=True)]
-        light = sum(s / r * chord(p, TOWARDS, c, r) for s, c, r in zip(SIGMAS, CENTRES, LENGTHS, strict=True))
-        for centre, s in zip(CENTRES, sigma, strict=True):
+        sigma = [s * (((p - c) ** 2).sum(-1) < r * r) for c, r, s in balls]
+        light = sum(s * chord(p, TOWARDS, c, r) for c, r, s in balls)
+        for (centre, _, _), s in zip(balls, sigma, strict=True):
             n = (p - centre) / np.linalg.norm(p - centre, axis=-1, keepdims=True)
             wi, wo = (tuple(np.full(x.shape, c) for c in v) for v in (TOWARDS, -view))
             diffuse, gloss = microfacet.scattering(ops, wi, wo, tuple(np.moveaxis(n, -1, 0)), 0.5)
@@ -116,11 +119,12 @@ def overlap_by_quadrature(x, y, steps=1500):
     return total, 1 - np.exp(-passed)
 
 
-@pytest.mark.parametrize("visibility", ["raymarch", "transmittance_map"])
-def test_overlapping_fields_against_quadrature(tmp_path, visibility):
+@pytest.mark.parametrize(("balls", "visibility"), [(TWO, "raymarch"), (TWO, "transmittance_map"), (TEN, "raymarch")],
+                         ids=["two marched", "two mapped", "ten"])
+def test_overlapping_fields_against_quadrature(tmp_path, balls, visibility):
     """Densities add for the view, transmittances multiply for the light."""
     media = {}
-    for i, (centre, length, sigma) in enumerate(zip(CENTRES, LENGTHS, SIGMAS, strict=True)):
+    for i, (centre, length, sigma) in enumerate(balls):
         path = tmp_path / f"{i}.safetensors"
         field_file.save(path, *fields.uniform(sigma, similarity=Similarity(tuple(centre), length)), np.float32)
         media[f"ball_{i}"] = {
@@ -142,7 +146,7 @@ def test_overlapping_fields_against_quadrature(tmp_path, visibility):
     image = scenes.render(loaded)
     # Pixels by their own 4×4 quadrature points; x to the right.
     c = (np.arange(64) + 0.5) / 16 - 2
-    light, alpha = overlap_by_quadrature(*np.meshgrid(c, -c))
+    light, alpha = overlap_by_quadrature(balls, *np.meshgrid(c, -c))
     light, alpha = (v.reshape(16, 4, 16, 4, -1).mean((1, 3)) for v in (light, alpha))
     np.testing.assert_allclose(image[..., 3:], alpha, atol=0.04)  # voxels of a field's 1/48 at the rims
     # A field's voxels of 1/48 at the rims; that one logistic is no exponential makes most of the map's error.

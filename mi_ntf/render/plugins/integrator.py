@@ -68,10 +68,11 @@ def integrator_class() -> type:
         whatever `sample_count` says; the film is right after every pass. What came of it is logged and is the attribute
         ``achieved``.
 
-        Any number of ``nrf`` media, which may overlap (densities add), and ordinary shapes with any BSDF: all hide,
-        shade and, from `max_depth` 3 on, light each other. Shadow rays of surfaces are marched where `visibility` is a
-        method of maps or volumes. With ``none`` fields cast no shadows and receive none, and light that one scatters
-        meets no field again.
+        Any number of ``nrf`` media, which may overlap, and ordinary shapes with any BSDF: all hide, shade and, from
+        `max_depth` 3 on, light each other. Where media overlap, densities add; stock ``volpath`` knows one medium at a
+        time and is no reference there. Shadow rays of surfaces are marched where `visibility` is a method of maps or
+        volumes. With ``none`` fields cast no shadows and receive none, and light that one scatters meets no field
+        again.
 
         The image can be differentiated by the lights: power, an environment's texels, and, of at most 32 lights in the
         scene, position and direction, whose shadows are then marched whatever the method; and by the reflectance of
