@@ -114,7 +114,7 @@ def render_file(path: Path, parameters: dict[str, str], *, sensor_index: int = 0
         raise MiNtfError(f"{path}: no integrator specified")
 
     sensor = scene.sensors()[sensor_index]
-    scene.integrator().render(scene, sensor, develop=False)
+    scene_file.render_to_film(scene, sensor)
     begun = time.time()
     sensor.film().write(str(output or path))
     written = (output or path).with_suffix(".exr")  # of EXR films

@@ -91,9 +91,7 @@ void register_factories(std::string_view name, ObjectType type, PluginRegisterFn
 
 /// One name serves several kinds of object in `nrf`; Unknown switches Mitsuba's check off.
 ObjectType object_type(std::string_view name) {
-    if (name == "nrf")
-        return ObjectType::Unknown;
-    return name == "ntf" ? ObjectType::Emitter : ObjectType::Integrator;
+    return name == "nrf" ? ObjectType::Unknown : ObjectType::Emitter;
 }
 
 } // namespace

@@ -19,7 +19,7 @@ from .. import __version__, bridge
 from ..core.errors import MiNtfError, sentence
 from ..core.variants import VARIANTS
 from ..render.maps import map_cache
-from ..render.scene import changed, environment_option
+from ..render.scene import changed, environment_option, scene_file
 from ..render.scene.environment_option import Environment
 from ..render.scene.settings import Limits
 from . import changes, image_file
@@ -159,7 +159,7 @@ def _render(scene, task: Task, precision: type) -> dict[str, np.ndarray]:
         integrator.share = task.part, task.parts
     if ours:
         integrator.patches = _kept.get("patches")
-    integrator.render(scene, sensors[0], develop=False)
+    scene_file.render_to_film(scene, sensors[0])
     if ours:
         _kept["patches"] = integrator.patches
     bitmap = sensors[0].film().bitmap()

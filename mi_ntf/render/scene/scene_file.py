@@ -38,6 +38,16 @@ def load(path: Path, parameters: dict[str, str], environment: Environment | None
         return changed.instantiated(path, state)
 
 
+def render_to_film(scene: Any, sensor: Any) -> None:
+    """Render `scene` with its integrator; the film of `sensor` holds the picture.
+
+    Mitsuba's integrators that are written in Python (``prb`` and others) refuse not to develop, although the film has
+    all samples by then.
+    """
+    integrator = scene.integrator()
+    integrator.render(scene, sensor, develop=type(integrator).__module__.startswith("mitsuba.python."))
+
+
 def _named(state) -> set[Path]:
     """Files that the plugins of a parsed scene read."""
     found, resolver = set(), cast(Any, mi).file_resolver()
