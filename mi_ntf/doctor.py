@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from mi_ntf import __version__
+from mi_ntf.jobs.options import cores
 
 PYTHON_MINIMUM = (3, 11)
 MITSUBA = "3.9.1"
@@ -64,7 +65,8 @@ class Check:
 
 def examine() -> dict[str, Any]:
     """All findings as plain data: `ok` (every needed check passed), `version`, `checks` (list of Check fields)."""
-    checks = [check_python(), *check_mitsuba(), check_llvm(), check_cuda(), check_bridge(), check_libpython()]
+    checks = [check_python(), check_cores(), *check_mitsuba(), check_llvm(), check_cuda()]
+    checks += [check_bridge(), check_libpython()]
     checks += [check_extra(name) for name in EXTRAS]
     return {
         "ok": all(check.ok for check in checks if check.needed),
@@ -103,6 +105,16 @@ def check_python() -> Check:
         f"{platform.python_version()} ({sys.executable})",
         "" if ok else f"make the environment with Python {minimum} or newer",
     )
+
+
+def check_cores() -> Check:
+    """Cores of this process. With one, Mitsuba alone waits for ever when it reads or writes an EXR file."""
+    count = cores()
+    remedy = (
+        "mi-ntf and scenes with its plugins use two threads by themselves; render other scenes with `mitsuba -t 3` "
+        "and call drjit.set_thread_count(2) in Python programs without mi_ntf.render.register()"
+    )
+    return Check("cores", count > 1, False, str(count), "" if count > 1 else remedy)
 
 
 def check_mitsuba() -> list[Check]:

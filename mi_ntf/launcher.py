@@ -6,6 +6,7 @@ another environment (:mod:`mi_ntf.render.scene.environment_option`).
 """
 
 import argparse
+import ctypes
 import json
 import time
 from collections.abc import Callable, Sequence
@@ -19,7 +20,7 @@ import OpenEXR
 from mi_ntf import bridge
 from mi_ntf.core import files
 from mi_ntf.core.errors import MiNtfError
-from mi_ntf.core.variants import VARIANTS
+from mi_ntf.core.variants import VARIANTS, enough_threads
 from mi_ntf.render.scene import scene_file
 from mi_ntf.render.scene.environment_option import Environment
 from mi_ntf.watch import TEV, Tev, printed, watch
@@ -47,6 +48,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("-o", "--output", metavar="FILE", help="image to write (default: beside the scene)")
     p.add_argument("-O", type=int, choices=range(6), dest="optimise", metavar="0-5", help="Dr.Jit optimisation level")
     p.add_argument("-S", action="store_true", dest="print_ir", help="print the intermediate representation")
+    p.add_argument("-V", type=int, dest="width", metavar="WIDTH", help="vector width of LLVM kernels, a power of two")
     p.add_argument("-W", action="count", default=0, dest="wavefront", help="wavefronts in place of a megakernel")
     own = p.add_argument_group("not of the program `mitsuba`")
     own.add_argument("--env", type=Path, metavar="FILE", help="latitude-longitude image in place of the environment's")
@@ -137,7 +139,7 @@ def _annotate(path: Path, achieved: dict) -> None:
 
 
 def _apply_settings(args: argparse.Namespace) -> None:
-    """Variant, plugins, threads, log level, search path and Dr.Jit flags."""
+    """Variant, plugins, threads, log level, search path, Dr.Jit flags and vector width."""
     level = min(args.verbose, 2)
     mi.set_log_level((mi.LogLevel.Info, mi.LogLevel.Debug, mi.LogLevel.Trace)[level])
     dr.set_log_level((dr.LogLevel.Error, dr.LogLevel.Warn, dr.LogLevel.Info)[level])
@@ -159,8 +161,8 @@ def _apply_settings(args: argparse.Namespace) -> None:
     if args.threads is not None:
         if args.threads < 1:
             raise MiNtfError(f"-t {args.threads}: at least one thread is needed")
-        # The film writes EXR from a worker thread and waits for it for ever if there is none.
-        dr.set_thread_count(max(args.threads, 2))
+        dr.set_thread_count(args.threads)
+    enough_threads(dr)
     for folder in filter(None, args.append.split(";")):
         mi.file_resolver().append(folder)  # type: ignore[operator]  # an object in the stub
 
@@ -179,3 +181,18 @@ def _apply_settings(args: argparse.Namespace) -> None:
     if args.wavefront > 1:
         dr.set_flag(dr.JitFlag.SymbolicCalls, False)
     dr.set_flag(dr.JitFlag.PrintIR, args.print_ir)
+    if args.width is not None:
+        _set_vector_width(args.width)
+
+
+def _set_vector_width(width: int) -> None:
+    """Let LLVM kernels handle `width` numbers at a time. Python has no function for it, so that of Dr.Jit's library is
+    called."""
+    if width < 1 or width & (width - 1):
+        raise MiNtfError(f"-V {width}: the vector width must be a power of two, such as 8")
+    if not str(mi.variant()).startswith("llvm"):
+        return  # as the stock program
+    library = ctypes.CDLL(str(Path(dr.__file__).with_name("libdrjit-core.so")))
+    get_processor, get_features = library._Z19jit_llvm_target_cpuv, library._Z24jit_llvm_target_featuresv
+    get_processor.restype = get_features.restype = ctypes.c_char_p
+    library._Z19jit_llvm_set_targetPKcS0_j(get_processor(), get_features(), width)

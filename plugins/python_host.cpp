@@ -153,6 +153,11 @@ void start_python(const fs::path &site_packages) {
                                  ".so.1.0 and cannot be run; `mi-ntf doctor` names the remedy");
     }
 
+    // Mitsuba takes the names of files as UTF-8, whatever the locale; in the locale C (LC_ALL=C, or one
+    // that is not installed) Python would not find those that are not ASCII.
+    if (auto utf8_mode = static_cast<int *>(dlsym(RTLD_DEFAULT, "Py_UTF8Mode")))
+        *utf8_mode = 1;
+
     // The program name leads Python to pyvenv.cfg and so to the environment's packages.
     wchar_t *name = PYTHON(Py_DecodeLocale, wchar_t *, const char *, size_t *)(env.python.c_str(), nullptr);
     PYTHON(Py_SetProgramName, void, const wchar_t *)(name);

@@ -6,7 +6,7 @@ import types
 from pathlib import Path
 
 import pytest
-from helpers.programs import run_program
+from helpers.programs import run_on_one_core, run_program
 
 from mi_ntf import cli, doctor
 from mi_ntf.core.errors import MiNtfError
@@ -233,6 +233,14 @@ def test_doctor_as_json(tmp_path: Path):
     assert checks["mitsuba"]["found"] == doctor.MITSUBA
     assert checks["bridge"]["found"].startswith(f"built for mitsuba {doctor.MITSUBA}")
     assert all(check["remedy"] == "" for check in checks.values() if check["needed"])
+
+
+def test_doctor_knows_what_one_core_does(tmp_path: Path):
+    done = run_on_one_core("mi-ntf", "doctor", "--json", cwd=tmp_path)
+    report = json.loads(done.stdout)
+    found = {check["name"]: check for check in report["checks"]}["cores"]
+    assert report["ok"] and (found["ok"], found["found"]) == (False, "1")
+    assert "`mitsuba -t 3`" in found["remedy"] and "drjit.set_thread_count(2)" in found["remedy"]
 
 
 def test_doctor_survives_a_missing_llvm(tmp_path: Path):

@@ -19,7 +19,7 @@ import numpy as np
 from mi_ntf import jobs
 from mi_ntf.core import files, spheres
 from mi_ntf.core.errors import MiNtfError
-from mi_ntf.core.variants import VARIANTS
+from mi_ntf.core.variants import VARIANTS, enough_threads
 from mi_ntf.data import schema
 from mi_ntf.data.bounds import bounding_sphere
 
@@ -49,8 +49,10 @@ def camera_to_world(position: np.ndarray, target: np.ndarray) -> np.ndarray:
 def _load(path: Path):
     """The scene's shapes that emit no light, and an integrator that sees them: its own where it is a path tracer, for
     media a volumetric one, else `path` or `volpath` of depth 6."""
+    import drjit as dr
     import mitsuba as mi
 
+    enough_threads(dr)
     variant = mi.variant()
     if variant is None:
         mi.set_variant(*VARIANTS)

@@ -15,11 +15,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from ..core import errors
+from ..core.variants import enough_threads
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 """Read by PyTorch and NumPy when they are loaded."""
-LEAST = 2
-"""Threads of Dr.Jit: with a single one Mitsuba waits for ever when it reads an EXR file."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +61,8 @@ def prepare(setup: Setup) -> None:
     if setup.threads is not None and importlib.util.find_spec("drjit"):
         import drjit
 
-        drjit.set_thread_count(max(LEAST, setup.threads))
+        drjit.set_thread_count(setup.threads)
+        enough_threads(drjit)
     _prepared.add(setup)
 
 

@@ -8,8 +8,17 @@ from pathlib import Path
 
 def run_program(*words: str | Path, cwd: Path, **environment: str) -> subprocess.CompletedProcess[str]:
     """Run a program of this environment (`mitsuba`, `mi-ntf`, `python`) and return text and exit status."""
-    program = Path(sys.executable).parent / words[0]
-    command = [str(program), *map(str, words[1:])]
     return subprocess.run(
-        command, cwd=cwd, env={**os.environ, **environment}, capture_output=True, text=True, timeout=300
+        _command(words), cwd=cwd, env={**os.environ, **environment}, capture_output=True, text=True, timeout=300
     )
+
+
+def run_on_one_core(*words: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
+    """The same, with a single core for the program."""
+    core = min(os.sched_getaffinity(0))
+    return subprocess.run(_command(words), cwd=cwd, capture_output=True, text=True, timeout=120,
+                          preexec_fn=lambda: os.sched_setaffinity(0, {core}))
+
+
+def _command(words: tuple[str | Path, ...]) -> list[str]:
+    return [str(Path(sys.executable).parent / words[0]), *map(str, words[1:])]

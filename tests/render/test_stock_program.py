@@ -7,7 +7,7 @@ import numpy as np
 import OpenEXR
 import pytest
 from helpers import scenes
-from helpers.programs import run_program
+from helpers.programs import run_on_one_core, run_program
 
 import mi_ntf.render
 from mi_ntf.core.errors import MiNtfError
@@ -101,6 +101,21 @@ def test_runs_in_a_row_exit_cleanly(folder, tmp_path, runs):
         assert done.returncode == 0 and "rror" not in done.stderr, done.stdout + done.stderr
 
 
+def test_a_scene_of_python_is_written_as_xml_that_the_program_renders(folder, variant, tmp_path):
+    mi_ntf.render.register()
+    parts = {"type": "scene", "integrator": scenes.nrf("none"), "light": scenes.light("point"),
+             "sensor": {"type": "perspective", "film": scenes.film(16),
+                        "to_world": variant.ScalarTransform4f().look_at([1, 1, 5], [0, 0, 0], [0, 1, 0])},
+             "ball": scenes.ball(folder / "blobs.safetensors")}
+    state = variant.parser.parse_dict(variant.parser.ParserConfig(variant.variant()), parts)
+    variant.parser.write_file(state, str(tmp_path / "scene.xml"))
+    done = run_program("mitsuba", "-m", "llvm_ad_rgb", "-o", "a.exr", "scene.xml", cwd=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    expected = np.array(variant.render(variant.load_dict(parts), seed=0))
+    assert expected[..., :3].max() > 0.05
+    np.testing.assert_allclose(read_image(tmp_path / "a.exr"), expected, rtol=2e-3, atol=1e-4)  # of 16 bits
+
+
 @pytest.mark.parametrize("integrator", ["volpath", "prbvolpath"])
 def test_stock_volumetric_integrators_see_the_field(folder, integrator, tmp_path):
     """The same medium under Mitsuba's own path tracers: the pixel means agree."""
@@ -118,6 +133,55 @@ def test_stock_volumetric_integrators_see_the_field(folder, integrator, tmp_path
     # 49 000 paths, a tenth of which reach the light, of relative spread about 1: 1.5 %, times two.
     assert images[0][..., :3].mean() == pytest.approx(images[1][..., :3].mean(), rel=0.03)
     assert images[0][..., 3].mean() == pytest.approx(images[1][..., 3].mean(), rel=0.02)
+
+
+ENVIRONMENT = '<emitter type="envmap"><string name="filename" value="sky.exr"/></emitter>'
+FROM_PYTHON = """
+import sys
+import mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+from mi_ntf.render import register
+register()
+mi.Bitmap(mi.render(mi.load_file(sys.argv[2], visibility="none"))).write(sys.argv[1])
+"""
+
+
+@pytest.mark.parametrize("program", [("mitsuba",), ("mitsuba", "-t", "2"), ("mi-ntf", "render"),
+                                     ("mi-ntf", "render", "-t", "1"), ("python", "-c", FROM_PYTHON)],
+                         ids=lambda p: " ".join(p[:-1] if p[0] == "python" else p))
+def test_one_core_is_enough(folder, tmp_path, program):
+    """Mitsuba alone waits for ever: it reads and writes EXR files in another thread. `mitsuba -t 2` has none either."""
+    OpenEXR.File({}, {"RGB": np.ones((4, 8, 3), np.float32)}).write(str(folder / "sky.exr"))
+    path = write(folder, "one_core.xml", light=ENVIRONMENT)
+    out = tmp_path / "a.exr"
+    flags = (out,) if program[0] == "python" else ("-m", "llvm_ad_rgb", "-D", "visibility=none", "-o", out)
+    done = run_on_one_core(*program, *flags, path, cwd=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert read_image(out)[..., :3].max() > 0.1
+
+
+@pytest.mark.parametrize("locale", ["C", "xx_XX.UTF-8"])  # the latter is installed nowhere
+@pytest.mark.parametrize("program", [("mitsuba",), ("mi-ntf", "render")], ids=lambda p: p[0])
+def test_names_of_files_need_no_locale(folder, tmp_path, program, locale):
+    place = tmp_path / "Schädel 頭"
+    place.mkdir()
+    (place / "Öl.safetensors").write_bytes((folder / "blobs.safetensors").read_bytes())
+    (place / "scene.xml").write_text(SCENE.format(**NRF).replace("blobs.safetensors", "Öl.safetensors"))
+    flags = ("-m", "llvm_ad_rgb", "-D", "visibility=none", "-D", "spp=1", "-o", place / "ß.exr")
+    done = run_program(*program, *flags, place / "scene.xml", cwd=tmp_path, LC_ALL=locale)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert (place / "ß.exr").stat().st_size > 0
+
+
+def test_the_vector_width_is_that_of_the_stock_program(folder, tmp_path):
+    path = write(folder)
+    flags = ("-m", "llvm_ad_rgb", "-D", "visibility=none", "-D", "spp=1", "-V", "4", "-S", "-o", "a.exr")
+    for program in (("mitsuba",), ("mi-ntf", "render")):
+        done = run_program(*program, *flags, path, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        assert "<4 x float>" in done.stderr and "<8 x float>" not in done.stderr and "<16 x" not in done.stderr
+    done = run_program("mi-ntf", "render", "-m", "llvm_ad_rgb", "-V", "6", path, cwd=tmp_path)
+    assert done.returncode == 1 and "-V 6: the vector width must be a power of two, such as 8" in done.stderr
 
 
 UNKNOWN = '(line 3, col 4): failed to instantiate integrator plugin of type "nrf": nrf integrator: unknown property "v'
