@@ -6,6 +6,7 @@ Neither an error, nor a full disk, nor ``kill -9`` leaves half a file under the 
 import glob
 import os
 import platform
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -73,8 +74,8 @@ def tidy(path: str | Path) -> None:
 
 
 def _temporary(path: Path) -> Path:
-    """This process's own: several may write one file at a time."""
-    return path.with_name(f"{path.name}.{platform.node()}-{os.getpid()}.part")
+    """Name of this thread alone: several threads and processes may write one file at a time."""
+    return path.with_name(f"{path.name}.{platform.node()}-{threading.get_native_id()}-{os.getpid()}.part")
 
 
 def _alive(process: int) -> bool:

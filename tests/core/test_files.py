@@ -84,6 +84,28 @@ def test_what_a_killed_writer_left_is_removed_and_a_living_ones_is_not(tmp_path)
     assert set(names(tmp_path)) == kept | {"f"}
 
 
+def test_two_threads_write_one_file_at_a_time_each_its_own(tmp_path):
+    path, both = tmp_path / "f", threading.Barrier(2, timeout=20)
+    faults = []
+
+    def write(letter):
+        try:
+            with files.replacing(path) as temporary:
+                temporary.write_text(letter)
+                both.wait()  # each has written, none has put its file in place
+                assert temporary.read_text() == letter
+        except Exception as error:
+            faults.append(error)
+
+    threads = [threading.Thread(target=write, args=(letter,)) for letter in "ab"]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not faults
+    assert path.read_text() in "ab" and names(tmp_path) == ["f"]
+
+
 def test_a_reader_never_sees_half_a_file(tmp_path):
     """Two processes write ten times 1 MB of one letter each, while a third reads."""
     path = tmp_path / "f"

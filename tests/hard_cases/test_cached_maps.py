@@ -3,6 +3,8 @@ never memory."""
 
 import dataclasses
 import os
+import sys
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import mitsuba as mi
@@ -101,6 +103,50 @@ def test_numbers_that_are_not_finite_are_never_kept(cache):
     made = SimpleNamespace(values=mi.Float([1.0, np.nan]))
     assert map_cache.cached("0" * 64, lambda values=None: made, 2, 1e9) is made
     assert not cache.exists()
+
+
+# --- threads ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("apart", ["in one scene", "in threads"])
+def test_several_media_of_one_file_bake_it_once(tmp_path, monkeypatch, apart):
+    """Mitsuba makes the media of a scene in parallel."""
+    path, baked = scenes.write_blobs(tmp_path), []
+    grid_field = loaded.GridField
+    monkeypatch.setattr(loaded, "GridField", lambda *args: baked.append(args) or grid_field(*args))
+    if apart == "in threads":
+        with ThreadPoolExecutor(8) as pool:
+            assert len({id(field) for field in pool.map(lambda _: loaded.load(str(path), 48), range(8))}) == 1
+    else:
+        balls = {f"ball{i}": scenes.ball(path, resolution=48, to_world=mi.ScalarTransform4f().translate([0, 0, i]))
+                 for i in range(8)}
+        media = [shape.interior_medium() for shape in mi.load_dict({"type": "scene", **balls}).shapes()]
+        assert len({id(medium.field) for medium in media}) == 1 and len(media) == 8
+    assert len(baked) == 1
+
+
+def test_the_cache_is_of_many_threads(monkeypatch):
+    """All get their maps while others come and go, and nothing is kept of those that went."""
+    monkeypatch.setenv("MI_NTF_MAP_CACHE", "memory")
+    map_cache.forget()
+
+    def ask(number):
+        name, texels = str(number % 50), np.full(16, number % 50, np.float32)
+        made = SimpleNamespace(values=texels, texels=texels)
+        found = map_cache.cached(name, lambda *_: made, 16, 20 * texels.nbytes, each=[name], some=lambda rows: made)
+        return found.values[0] == number % 50
+
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(8) as pool:
+            assert all(pool.map(ask, range(3000)))
+    finally:
+        sys.setswitchinterval(interval)
+    assert len(map_cache._maps) <= 20 + 8 and set(map_cache._lights) <= set(map_cache._maps)
+    assert map_cache._used <= set(map_cache._maps)
+    map_cache.forget()
+    assert not map_cache._lights and not map_cache._used
 
 
 # --- keys ------------------------------------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ what was written counts as none. The environment variable ``MI_NTF_MAP_CACHE`` s
 
 import hashlib
 import os
+import threading
 from collections import OrderedDict
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -31,12 +32,15 @@ SEAL = hashlib.sha256().digest_size
 
 FULL = np.dtype("<f4")
 
+# Guards `_maps`, `_lights` and `_used`. Never held while a map is made: a thread that waits for its kernels may take up
+# the task of making another one.
+_lock = threading.Lock()
 _maps: OrderedDict[str, Any] = OrderedDict()
 _lights: dict[str, list] = {}
 """Of those that say it, what each of their lights is called (:func:`lights`)."""
 _written = True
 _used: set[str] = set()
-"""Names of maps since :func:`keep_used` was called last."""
+"""Names of maps in memory that were asked for since :func:`keep_used` was called last."""
 
 
 def mode() -> str:
@@ -101,10 +105,11 @@ def cached(name: str, make, count: int, limit: float, each: list | None = None, 
     size = dtype.itemsize * count
     if where == "off":
         return make()
-    _used.add(name)
-    if name in _maps:
-        _maps.move_to_end(name)
-        return _maps[name]
+    with _lock:
+        if name in _maps:
+            _maps.move_to_end(name)
+            _used.add(name)
+            return _maps[name]
     values = _read(name, count, dtype) if where == "on" else None
     known = _joined(each, some, count) if values is None and each and some else None
     _make_room(limit - size)
@@ -112,25 +117,26 @@ def cached(name: str, make, count: int, limit: float, each: list | None = None, 
     if where == "on" and values is None and _written and size <= LARGEST_FILE:
         _write(name, result.values, dtype)
     if size <= limit:
-        _maps[name] = result
-        if each:
-            _lights[name] = each
-    for gone in set(_lights) - set(_maps):
-        del _lights[gone]
+        with _lock:
+            _maps[name] = result
+            _used.add(name)
+            if each:
+                _lights[name] = each
     return result
 
 
 def _joined(each: list, some, count: int) -> np.ndarray | None:
     """The `count` numbers of a map of the lights `each`: from the map in memory that has most of them, and of the rest,
     if there is one, by ``some(rows)``; None where no map has any."""
-    places: dict[str, dict] = {name: {light: i for i, light in enumerate(has)} for name, has in _lights.items()
-                               if name in _maps}
+    with _lock:
+        maps, found = dict(_maps), dict(_lights)
+    places: dict[str, dict] = {name: {light: i for i, light in enumerate(has)} for name, has in found.items()}
     best = max(places, key=lambda name: sum(light in places[name] for light in each), default=None)
     if best is None or not any(light in places[best] for light in each):
         return None
     have = np.array([places[best].get(light, -1) for light in each])
     values = np.empty((len(each), count // len(each)), np.float32)
-    values[have >= 0] = _maps[best].values.reshape(-1, values.shape[1])[have[have >= 0]]
+    values[have >= 0] = maps[best].values.reshape(-1, values.shape[1])[have[have >= 0]]
     missing = np.flatnonzero(have < 0)
     if len(missing):
         values[missing] = some(missing).values.reshape(len(missing), -1)
@@ -150,22 +156,34 @@ def not_written() -> Iterator[None]:
 
 def forget() -> None:
     """Drop what is kept in memory."""
-    _maps.clear()
-    _lights.clear()
+    with _lock:
+        _maps.clear()
+        _forget_gone()
 
 
 def keep_used() -> None:
     """Drop from memory what was not used since the last call: of frames, lights that have moved on leave no maps
     behind, and all others keep theirs."""
-    for name in set(_maps) - _used:
-        del _maps[name]
-    _used.clear()
+    with _lock:
+        for name in set(_maps) - _used:
+            del _maps[name]
+        _used.clear()
+        _forget_gone()
 
 
 def _make_room(limit: float) -> None:
     """Drop the maps used longest ago until the others take `limit` bytes at most."""
-    while _maps and sum(m.texels.nbytes for m in _maps.values()) > limit:
-        _maps.popitem(last=False)
+    with _lock:
+        while _maps and sum(m.texels.nbytes for m in _maps.values()) > limit:
+            _maps.popitem(last=False)
+        _forget_gone()
+
+
+def _forget_gone() -> None:
+    """Drop what is known of maps that are no longer in memory; within the lock."""
+    _used.intersection_update(_maps)
+    for name in set(_lights) - set(_maps):
+        del _lights[name]
 
 
 def _folder() -> Path:

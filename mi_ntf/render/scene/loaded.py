@@ -1,10 +1,12 @@
 """Fields in memory: read and baked once, whoever asks."""
 
 import hashlib
+import threading
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -14,6 +16,12 @@ from ...infer.backend import module
 from ...infer.grid import GridField
 from ...infer.network import NetworkField
 from ...infer.skin import Softness
+
+QUEUED = 1 << 16
+"""Size of a kernel that is not run at once but queued: several blocks of Dr.Jit."""
+
+# Reentrant: a medium that begins during the baking all the same must not wait for its own thread.
+_one_at_a_time = threading.RLock()
 
 
 @dataclass(frozen=True)
@@ -40,7 +48,21 @@ def load(path: str, resolution: int | None) -> LoadedField:
     """Read `path` and bake it at `resolution`³, None for :func:`voxels`; cached by path, the file's identity and time,
     resolution and variant."""
     stat = Path(path).stat() if Path(path).is_file() else None
-    return _load(path, stat and (stat.st_mtime_ns, stat.st_size, stat.st_ino), resolution, mi.variant())
+    _begin_other_media(str(mi.variant()))
+    with _one_at_a_time:
+        return _load(path, stat and (stat.st_mtime_ns, stat.st_size, stat.st_ino), resolution, mi.variant())
+
+
+def _begin_other_media(variant: str) -> None:
+    """Let the other media of a scene that is being loaded begin, those of them that would begin during the baking.
+
+    Mitsuba makes them as tasks of Dr.Jit's threads, and a thread that waits for a kernel takes up any task: a medium
+    that began while this thread bakes its field could not wait for the result and would bake it again. A kernel at the
+    end of the queue is waited for after all of them, here, before anything is baked.
+    """
+    dj = module(variant)
+    dr.eval(dr.arange(dj.UInt32, QUEUED) + 1)
+    dr.sync_thread()
 
 
 @lru_cache(maxsize=4)
