@@ -1,11 +1,22 @@
-"""Pages in a browser that this machine alone serves (viser, the extra ``view``)."""
+"""Pages in a browser that this machine alone serves (viser, the extra ``view``), to who knows their address."""
+
+import http
+import secrets
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+from urllib.parse import urlsplit
 
 from mi_ntf.core.errors import MiNtfError
 
 
 def serve(label: str, host: str = "127.0.0.1", port: int = 8080):
     """``(server, address)`` of a page called `label`, at `port` or the next one that is free. Raises MiNtfError where
-    the extra is missing or the address is not this machine's."""
+    the extra is missing or the address is not this machine's.
+
+    The address ends in a random token. Requests without it are refused, and so are those of pages of other servers,
+    which a browser lets connect to this machine.
+    """
     try:
         import viser
     except ImportError:
@@ -17,10 +28,47 @@ def serve(label: str, host: str = "127.0.0.1", port: int = 8080):
         def request_share_url(self, verbose: bool = True) -> None:
             """None, whoever asks."""
 
+    token = secrets.token_urlsafe(16)
     try:
-        server = Server(host=host, port=port, label=label, verbose=False)
+        with _requests_pass(_gate(token)):
+            server = Server(host=host, port=port, label=label, verbose=False)
     except OSError as error:
         raise MiNtfError(f"cannot serve at {host}:{port} ({error}); choose another --host or --port") from None
     server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
     server.gui.main_panel.dock_right()
-    return server, f"http://{'localhost' if host == '0.0.0.0' else host}:{server.get_port()}"
+    return server, f"http://{'localhost' if host == '0.0.0.0' else host}:{server.get_port()}/{token}"
+
+
+def _gate(token: str) -> Callable[[Any, Any], Any]:
+    """Function ``(connection, request)`` that returns the response of a refused request. From the path of others it
+    takes `token`, its first part."""
+
+    def refuse(connection: Any, request: Any) -> Any:
+        origin = request.headers.get("Origin")
+        if origin is not None and urlsplit(origin).netloc != request.headers.get("Host"):
+            return connection.respond(http.HTTPStatus.FORBIDDEN, f"Pages of {origin} may not connect to this one.\n")
+        first, _, rest = request.path.removeprefix("/").partition("?")[0].partition("/")
+        if not secrets.compare_digest(first.encode(), token.encode()):
+            return connection.respond(http.HTTPStatus.FORBIDDEN, "Open the address that the command printed.\n")
+        request.path = "/" + rest
+        return None
+
+    return refuse
+
+
+@contextmanager
+def _requests_pass(refuse: Callable[[Any, Any], Any]) -> Iterator[None]:
+    """Within, servers that are started by the package websockets ask `refuse` first. viser starts its own by it and has
+    no option for the purpose."""
+    from websockets.asyncio import server
+
+    serve: Any = server.serve
+
+    def guarded(*args: Any, process_request: Callable[[Any, Any], Any], **options: Any) -> Any:
+        return serve(*args, process_request=lambda *request: refuse(*request) or process_request(*request), **options)
+
+    server.serve = guarded  # type: ignore[assignment,misc]
+    try:
+        yield
+    finally:
+        server.serve = serve  # type: ignore[misc]

@@ -1,7 +1,6 @@
 """A view's controls in a browser (viser): nothing is fetched from, or shared with, another machine."""
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from mi_ntf.page_server import serve
 from . import environments
 from .camera import Pose, three
 from .lights import Light
-from .save import save
+from .save import beside_scene, save
 from .session import SEEN, Session
 from .viewer import Viewer
 
@@ -170,11 +169,10 @@ class Controls:
         found = environments.beside(session)
         with self.server.gui.add_folder("Environment"):
             choice = self.server.gui.add_dropdown("file", tuple(p.name for p in found) or ("–",))
-            path = self.server.gui.add_text("or path", "")
             button = self.server.gui.add_button("Open")
 
         def do() -> None:
-            chosen = Path(path.value) if path.value else next((p for p in found if p.name == choice.value), None)
+            chosen = next((p for p in found if p.name == choice.value), None)
             if chosen is not None:
                 environments.swap_environment(session, chosen)
 
@@ -183,17 +181,15 @@ class Controls:
     def _file_folder(self) -> None:
         gui, path = self.server.gui, self.session.path
         with gui.add_folder("File"):
-            name = gui.add_text("path", str(path.with_name(f"{path.stem}_view.xml")))
+            name = gui.add_text("name", f"{path.stem}_view.xml", hint="of a file beside the scene")
             button = gui.add_button("Save XML")
         gui.add_button("See all lights", hint="step back until they are in view").on_click(self._step_back)
+        button.on_click(lambda _: self.viewer.change("save", lambda: self._save(name.value), "shown"))
 
-        def do() -> None:
-            out = Path(name.value)
-            save(self.session, out)
-            self._tell(f"Saved {out}")
-
-        button.on_click(lambda _: self.viewer.change("save", do, "shown"))
-
+    def _save(self, name: str) -> None:
+        out = beside_scene(self.session, name)
+        save(self.session, out)
+        self._tell(f"Saved {out}")
 
     def _step_back(self, event) -> None:
         """Move the camera away from the fields until all lights that have a place are in view."""

@@ -8,12 +8,21 @@ import numpy as np
 
 from mi_ntf import swap
 from mi_ntf.core import files
-from mi_ntf.core.errors import MiNtfError
+from mi_ntf.core.errors import MiNtfError, shown
 
 from .lights import POWER, Light
 from .session import Session
 
 CHANGED = ("emitter", "sensor", "integrator")
+
+
+def beside_scene(session: Session, name: str) -> Path:
+    """Path of the file that a page's user calls `name`. Raises MiNtfError unless it is an XML file beside the scene: a
+    page writes nowhere else."""
+    if Path(name).name != name or Path(name).suffix != ".xml":
+        raise MiNtfError(f"name is {shown(name)}; scenes are saved beside the opened one: give a name without folders, "
+                         "ending in .xml")
+    return session.path.with_name(name)
 
 
 def save(session: Session, out: Path, environment: Path | None = None) -> None:

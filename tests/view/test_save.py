@@ -11,6 +11,7 @@ from helpers.viewed import DIRECTIONAL, ENVIRONMENT, POINT, SECOND, SPOT
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.evaluate.metrics import relative_rmse
 from mi_ntf.view import environments
+from mi_ntf.view.controls import Controls
 from mi_ntf.view.save import save
 from mi_ntf.view.session import Session
 
@@ -115,3 +116,17 @@ def test_mistakes_are_told(scene, tmp_path):
     view = Session(scene(ENVIRONMENT), {}, 32)
     with pytest.raises(MiNtfError, match="is no picture that Mitsuba reads"):
         environments.swap_environment(view, view.path)
+
+
+def test_a_page_saves_beside_the_scene_alone(scene, tmp_path):
+    controls = Controls(Session(scene(POINT), {}, 32), port=8290)
+    try:
+        folder = controls.session.path.parent
+        for name in ("../out.xml", str(tmp_path / "out.xml"), "deep/out.xml", "blobs.safetensors", "out", ".", ""):
+            with pytest.raises(MiNtfError, match=r"name is .*; scenes are saved beside the opened one: give a name"):
+                controls._save(name)
+        controls._save("out.xml")
+        assert (folder / "out.xml").is_file()
+        assert not list(tmp_path.iterdir()) and not (folder.parent / "out.xml").exists()
+    finally:
+        controls.server.stop()
