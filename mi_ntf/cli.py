@@ -173,7 +173,8 @@ class Swap:
     def run(self) -> None:
         from mi_ntf.swap import swap
 
-        swap(self.scene, self.field_file, self.output)
+        for note in swap(self.scene, self.field_file, self.output):
+            print(f"mi-ntf: {note}", file=sys.stderr)
 
 
 @dataclass

@@ -5,24 +5,34 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 from xml.etree import ElementTree as ET
+from xml.parsers import expat
 
 from mi_ntf.core import files
-from mi_ntf.core.errors import MiNtfError
+from mi_ntf.core.errors import MiNtfError, shown
 from mi_ntf.core.field_file import load_header
 
 _PARAMETER = re.compile(r"(?<!\\)\$(\w+)")
+_CAMEL = re.compile(r"(?<=[a-z])[A-Z]+")
+_DEPTHS = dict.fromkeys(("path", "volpath", "volpathmis", "ptracer"), -1) | dict.fromkeys(
+    ("prb", "prb_basic", "prb_projective", "prbvolpath"), 6)
+"""`max_depth` of Mitsuba's integrators where it is not given: −1, no limit, or 6. That of ``nrf`` is 2."""
+_AOVS = {"depth": "depth", "albedo": "albedo", "sh_normal": "normal", "geo_normal": "normal"}
+"""Types of Mitsuba's integrator ``aov`` and the outputs of ``nrf`` that stand for them."""
 
 
-def swap(scene: Path, field: Path, out: Path) -> None:
+def swap(scene: Path, field: Path, out: Path) -> list[str]:
     """Write `out`: the scene `scene` with all shapes but emitters and sensors replaced by the field `field`.
 
     The field sits in one bounding ``sphere`` with a ``null`` BSDF; centre and radius, in scene units, are those of the
-    capture. The integrator becomes ``nrf`` with ``<default name="visibility" value="auto"/>`` and keeps `max_depth` and
-    `hide_emitters`. Sensors, films, emitters, parameters and includes stay; an include that holds shapes or the
-    integrator is inlined, with ``$parameters`` in its name at their defaults. BSDFs and textures that nothing uses any
-    more are dropped. Paths are rewritten for `out`'s folder, whose files come before those of the same name in the
-    working folder. Comments are lost.
+    capture. The integrator becomes ``nrf`` with ``<default name="visibility" value="auto"/>``. It keeps `max_depth`, be
+    it written or the old integrator's own default, `hide_emitters`, and those channels of ``aov`` that ``nrf`` has.
 
+    Sensors, films, emitters, parameters and includes stay; an include that holds shapes or the integrator is inlined,
+    with ``$parameters`` in its name at their defaults. BSDFs and textures that nothing uses any more are dropped. Paths
+    are rewritten for `out`'s folder, whose files come before those of the same name in the working folder. Comments are
+    lost.
+
+    Returns sentences about what else was left out.
     Raises :class:`MiNtfError` where `scene` is no Mitsuba XML, has no shape to replace, or an include is missing.
     """
     scene, field, out = Path(scene), Path(field), Path(out)
@@ -35,26 +45,46 @@ def swap(scene: Path, field: Path, out: Path) -> None:
            content.find("integrator") is not None)
     place = _remove_shapes(root, scene)
     root.insert(place, _bounding_sphere(similarity, os.path.relpath(field, out.parent)))
-    _replace_integrator(root)
+    notes = _replace_integrator(root, defaults)
     _drop_unused(root, scene.parent, defaults)
     move_paths(root, scene.parent, out.parent, defaults, root.find("shape/medium[@type='nrf']/string"))
     root.insert(0, ET.Comment(f" The meshes of {scene.name} as the field {field.name}; written by `mi-ntf swap`. "))
     ET.indent(root, "    ")
     files.make_folder(out.parent)
     files.write(out, ET.tostring(root, encoding="unicode") + "\n")
+    return notes
 
 
 def parse(path: Path) -> ET.Element:
-    """The <scene> of an XML file. Raises MiNtfError where there is none."""
+    """The <scene> of an XML file, names of properties as Mitsuba has them since version 2. Raises MiNtfError where
+    there is none, or where the file declares entities: Mitsuba knows none, and a few lines of them fill the memory."""
     if not path.is_file():
         raise MiNtfError(f"scene {path} does not exist; give the XML file of a mesh scene")
+
+    def refuse(name: str, *_: object) -> None:
+        raise MiNtfError(f"{path} declares the entity {shown(name)}, which Mitsuba does not read; write its text")
+
+    content, first = path.read_bytes(), expat.ParserCreate()
+    first.EntityDeclHandler = refuse
     try:
-        root = ET.parse(path).getroot()
-    except ET.ParseError as error:
+        first.Parse(content, True)
+        root = ET.fromstring(content)
+    except (expat.ExpatError, ET.ParseError) as error:
         raise MiNtfError(f"{path} is not XML ({error}); give the XML file of a Mitsuba scene") from None
     if root.tag != "scene":
         raise MiNtfError(f"{path}: root element is <{root.tag}>, expected <scene>; give the XML of a Mitsuba scene")
+    _rename(root)
     return root
+
+
+def _rename(root: ET.Element) -> None:
+    """Names of properties in a file for Mitsuba 0.6 or older, as ``maxDepth``, become those of later versions, as
+    ``max_depth``, by Mitsuba's own rule."""
+    if not re.match(r"[01]\.", root.get("version", "")):
+        return
+    for element in root.iter():
+        if element.tag != "default" and (name := element.get("name")):
+            element.set("name", _CAMEL.sub(lambda m: "_" + m[0].lower(), name))
 
 
 def _resolve(include: ET.Element, source: Path, folder: Path, defaults: dict[str, str]) -> Path:
@@ -133,14 +163,23 @@ def _bounding_sphere(similarity, filename: str) -> ET.Element:
     return shape
 
 
-def _replace_integrator(root: ET.Element) -> None:
-    """Put the ``nrf`` integrator where the old one stood, and the default of its parameter at the top."""
+def _replace_integrator(root: ET.Element, defaults: dict[str, str]) -> list[str]:
+    """Put the ``nrf`` integrator where the old one stood, and the default of its parameter at the top. Returns what
+    cannot be kept, in sentences."""
     new = ET.Element("integrator", type="nrf")
     ET.SubElement(new, "string", name="visibility", value="$visibility")
     old = root.findall("integrator")
     place = list(root).index(old[0]) if old else 0
     for tag, name in (("integer", "max_depth"), ("boolean", "hide_emitters")):
         new.extend([e for i in old for e in i.iter(tag) if e.get("name") == name][:1])
+    nested = [e for i in old for e in i.iter("integrator")]
+    types = [substitute(e.get("type", ""), defaults) for e in nested]
+    depths = [_DEPTHS[t] for t in types if t in _DEPTHS]
+    if depths and new.find("integer[@name='max_depth']") is None:
+        ET.SubElement(new, "integer", name="max_depth", value=str(depths[0]))
+    known, unknown = _outputs([e for e, t in zip(nested, types, strict=True) if t == "aov"], defaults)
+    if known:
+        ET.SubElement(new, "string", name="aovs", value=", ".join(known))
     for integrator in old:
         root.remove(integrator)
     root.insert(place, new)
@@ -148,6 +187,17 @@ def _replace_integrator(root: ET.Element) -> None:
         if default.get("name") == "visibility":
             root.remove(default)
     root.insert(0, ET.Element("default", name="visibility", value="auto"))
+    left = f"left out {', '.join(unknown)} of the integrator aov: nrf has {', '.join(dict.fromkeys(_AOVS.values()))}"
+    return [left] if unknown else []
+
+
+def _outputs(aov: list[ET.Element], defaults: dict[str, str]) -> tuple[list[str], list[str]]:
+    """Outputs of ``nrf`` for the channels of the integrators `aov`, and the channels that have none."""
+    texts = [substitute(e.get("value", ""), defaults) for i in aov for e in i.findall("string[@name='aovs']")]
+    channels = [word for text in texts for word in re.split(r"[,\s]+", text) if word]
+    kinds = [channel.rpartition(":")[2] for channel in channels]
+    known = list(dict.fromkeys(_AOVS[kind] for kind in kinds if kind in _AOVS))
+    return known, [channel for channel, kind in zip(channels, kinds, strict=True) if kind not in _AOVS]
 
 
 def _drop_unused(root: ET.Element, folder: Path, defaults: dict[str, str]) -> None:

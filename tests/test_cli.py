@@ -33,7 +33,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list:
     stand_in("mi_ntf.data.capture", capture=note())
     stand_in("mi_ntf.data.inspect", inspect=note(table), print_table=lambda values: print("table", values["psnr"]))
     stand_in("mi_ntf.train", train=note(table))
-    stand_in("mi_ntf.swap", swap=note())
+    stand_in("mi_ntf.swap", swap=note([]))
     stand_in("mi_ntf.view", view=note())
     stand_in("mi_ntf.evaluate.compare", compare=note(table), print_table=lambda values: print("table", values["psnr"]))
     stand_in("mi_ntf.render.commands.explain", explain=note(table),

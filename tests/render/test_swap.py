@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 from helpers.variants import VARIANT
 
+from mi_ntf import cli
 from mi_ntf.core import field_file
 from mi_ntf.core.architecture import Architecture, Encoding, Header, Network, Similarity
 from mi_ntf.core.errors import MiNtfError
-from mi_ntf.swap import swap
+from mi_ntf.render.transport import aovs
+from mi_ntf.swap import _DEPTHS, swap
 
 MESH = """<scene version="3.9.0">
     <default name="spp" value="64"/>
@@ -88,6 +90,62 @@ def test_integrator_is_replaced_and_keeps_depth_and_hide_emitters(folder):
     }
 
 
+def integrator(folder, *elements, version="3.9.0"):
+    """The integrator that takes the place of `elements`: ``[(name, value), …]``, and what is told."""
+    shape = '<shape type="cube"/>'
+    text = f'<scene version="{version}"><default name="i" value="path"/>{"".join(elements)}{shape}</scene>'
+    (folder / "mesh.xml").write_text(text)
+    notes = swap(folder / "mesh.xml", folder / "f.safetensors", folder / "scene.xml")
+    (found,) = ET.parse(folder / "scene.xml").getroot().findall("integrator")
+    return {e.get("name"): e.get("value") for e in found if e.get("name") != "visibility"}, notes
+
+
+def test_camel_case_of_old_versions_is_read(folder):
+    old = '<integrator type="path"><integer name="maxDepth" value="4"/><boolean name="hideEmitters" value="true"/>' \
+          '</integrator>'
+    assert integrator(folder, old, version="0.6.0") == ({"max_depth": "4", "hide_emitters": "true"}, [])
+    inner = '<scene version="0.5.0">' + old + "</scene>"
+    (folder / "inner.xml").write_text(inner)
+    assert integrator(folder, '<include filename="inner.xml"/>') == ({"max_depth": "4", "hide_emitters": "true"}, [])
+
+
+@pytest.mark.parametrize(("old", "depth"), [
+    ('<integrator type="path"/>', "-1"),
+    ('<integrator type="$i"/>', "-1"),
+    ('<integrator type="volpath"><integer name="rr_depth" value="3"/></integrator>', "-1"),
+    ('<integrator type="path"><integer name="max_depth" value="-1"/></integrator>', "-1"),
+    ('<integrator type="aov"><integrator type="path"/></integrator>', "-1"),
+    ('<integrator type="prb"/>', "6"),
+    ('<integrator type="direct"/>', None),  # 2, as nrf itself
+    ("", None),
+])
+def test_a_depth_that_is_not_written_stays_the_old_integrators(folder, old, depth):
+    assert integrator(folder, old)[0].get("max_depth") == depth
+
+
+def test_depths_without_a_number_are_those_of_mitsuba():
+    """Of the Python integrators; those of C++ do not tell theirs."""
+    mi = pytest.importorskip("mitsuba")
+    mi.set_variant(VARIANT)
+    for name in ("prb", "prb_basic", "prb_projective", "prbvolpath"):
+        assert mi.load_dict({"type": name}).max_depth == _DEPTHS[name] == 6
+
+
+def test_channels_of_aov_stay_where_nrf_has_them(folder):
+    channels = "dd.y:depth, nn:sh_normal,gn:geo_normal, pp:position,albedo:albedo,uv:uv"
+    old = f'<integrator type="aov"><string name="aovs" value="{channels}"/><integrator type="path" name="image">' \
+          '<integer name="max_depth" value="5"/></integrator></integrator>'
+    found, notes = integrator(folder, old)
+    assert found == {"max_depth": "5", "aovs": "depth, normal, albedo"}
+    assert notes == ["left out pp:position, uv:uv of the integrator aov: nrf has depth, albedo, normal"]
+    assert aovs.parse(found["aovs"]) == ("depth", "normal", "albedo")
+    with_parameter = '<default name="c" value="pp:position"/><integrator type="aov"><string name="aovs" value="$c"/>' \
+                     '</integrator>'
+    assert integrator(folder, with_parameter)[0] == {}
+    assert cli.main(["swap", *(str(folder / name) for name in ("mesh.xml", "f.safetensors")), "-o",
+                     str(folder / "o.xml")]) == 0
+
+
 def test_emitters_includes_and_what_they_use_stay(folder):
     root = _swap(folder, folder / "scene.xml")
     assert [e.get("filename") for e in root.findall("include")] == ["sensor.xml", "light_$light.xml"]
@@ -146,6 +204,7 @@ def test_the_shipped_scene(folder):
         ("no xml", r"mesh.xml is not XML .*give the XML file of a Mitsuba scene"),
         ("<shape/>", r"root element is <shape>, expected <scene>"),
         ('<scene><shape type="cube"><emitter type="area"/></shape></scene>', r"no shape that a field could replace"),
+        ('<!DOCTYPE scene [<!ENTITY a "b">]><scene>&a;</scene>', r"mesh.xml declares the entity 'a', which Mits"),
         ('<scene><include filename="gone.xml"/></scene>', r"included file 'gone.xml' does not exist beside it$"),
         (
             '<scene><include filename="a_$b.xml"/></scene>',
@@ -158,6 +217,14 @@ def test_errors(folder, text, message):
     with pytest.raises(MiNtfError, match=message):
         _swap(folder, folder / "scene.xml")
     assert not (folder / "scene.xml").exists()
+
+
+def test_entities_are_refused_before_they_fill_the_memory(folder):
+    """In includes as well. A few lines stand for a gigabyte."""
+    lines = "".join(f'<!ENTITY e{i} "{f"&e{i - 1};" * 10 if i else "x" * 10}">' for i in range(9))
+    (folder / "sensor.xml").write_text(f"<!DOCTYPE scene [{lines}]><scene><path value='&e8;'/></scene>")
+    with pytest.raises(MiNtfError, match=r"sensor.xml declares the entity 'e0'"):
+        _swap(folder, folder / "scene.xml")
 
 
 def test_errors_of_files(folder):
