@@ -35,6 +35,8 @@ class Submitit:
         self._work, self._count = work, workers.workers or 1
         self._folder = Path(folder).absolute() / f"submitit-{uuid.uuid4().hex[:8]}"
         files.make_folder(self._folder)
+        # Tasks, results and answers lie there as pickles: whoever writes them runs programs as this user.
+        self._folder.chmod(0o700)
         self._executor = submitit.AutoExecutor(self._folder)
         self._kind = self._executor.cluster
         slurm = self._kind == "slurm"

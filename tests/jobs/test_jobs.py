@@ -69,6 +69,13 @@ def test_one_error_names_what_failed(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["1-0", "2-0", "3-0", "4-0"]  # in this process: tried once
 
 
+def test_files_of_submitit_are_open_to_this_user_alone(tmp_path):
+    """They are pickles, which run what they say."""
+    list(jobs.each(chores.write, [(tmp_path, 3)], jobs.Workers("submitit", 1), folder=tmp_path / "jobs", quiet=True))
+    (kept,) = (tmp_path / "jobs").iterdir()  # since the task fails
+    assert kept.stat().st_mode & 0o777 == 0o700
+
+
 def test_submitit_leaves_nothing_where_all_went_well(tmp_path):
     assert jobs.run(chores.square, range(9), jobs.Workers("submitit", 2), folder=tmp_path, quiet=True) == \
         [n * n for n in range(9)]
