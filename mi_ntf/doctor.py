@@ -25,7 +25,7 @@ LLVM_MINIMUM = 17
 EXTRAS = {
     "train": ("torch", "tensorboard", "matplotlib", "PIL", "cv2"),
     "video": ("imageio_ffmpeg",),
-    "view": ("viser",),
+    "view": ("viser", "websockets"),
     "eval": ("skimage", "flip_evaluator", "matplotlib", "PIL"),
     "mesh": ("skimage", "scipy", "trimesh"),
     "watch": ("tevclient",),

@@ -30,10 +30,14 @@ def serve(label: str, host: str = "127.0.0.1", port: int = 8080):
 
     token = secrets.token_urlsafe(16)
     try:
-        with _requests_pass(_gate(token)):
+        with _requests_pass(_gate(token)) as guarded:
             server = Server(host=host, port=port, label=label, verbose=False)
     except OSError as error:
         raise MiNtfError(f"cannot serve at {host}:{port} ({error}); choose another --host or --port") from None
+    if not guarded:
+        server.stop()
+        raise MiNtfError(f"viser {viser.__version__} starts its server in an unknown way, which would answer every page "
+                         "of the browser; run pip install 'viser==1.1.1'")
     server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
     server.gui.main_panel.dock_right()
     return server, f"http://{'localhost' if host == '0.0.0.0' else host}:{server.get_port()}/{token}"
@@ -57,18 +61,20 @@ def _gate(token: str) -> Callable[[Any, Any], Any]:
 
 
 @contextmanager
-def _requests_pass(refuse: Callable[[Any, Any], Any]) -> Iterator[None]:
-    """Within, servers that are started by the package websockets ask `refuse` first. viser starts its own by it and has
-    no option for the purpose."""
+def _requests_pass(refuse: Callable[[Any, Any], Any]) -> Iterator[list]:
+    """Within, servers that are started by the package websockets ask `refuse` first; the list that is given holds an
+    entry for each. viser starts its own by it and has no option for the purpose."""
     from websockets.asyncio import server
 
     serve: Any = server.serve
+    started: list = []
 
     def guarded(*args: Any, process_request: Callable[[Any, Any], Any], **options: Any) -> Any:
+        started.append(options)
         return serve(*args, process_request=lambda *request: refuse(*request) or process_request(*request), **options)
 
     server.serve = guarded  # type: ignore[assignment,misc]
     try:
-        yield
+        yield started
     finally:
         server.serve = serve  # type: ignore[misc]

@@ -10,6 +10,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from mi_ntf import page_server
+from mi_ntf.core.errors import MiNtfError
 
 PROTOCOL = [f"viser-v{viser.__version__}"]
 
@@ -65,3 +66,13 @@ def test_other_servers_of_the_process_are_left_alone(address):
         assert b"</html>" in urllib.request.urlopen(f"http://127.0.0.1:{server.get_port()}/").read()
     finally:
         server.stop()
+
+
+def test_a_server_that_asks_nobody_is_not_left_running(monkeypatch):
+    """viser might start it otherwise some day."""
+    stopped = []
+    monkeypatch.setattr(viser, "ViserServer", type("Other", (), {
+        "__init__": lambda self, **options: None, "stop": lambda self: stopped.append(self)}))
+    with pytest.raises(MiNtfError, match=r"viser .* starts its server in an unknown way"):
+        page_server.serve("test")
+    assert len(stopped) == 1
