@@ -36,7 +36,7 @@ def serve(label: str, host: str = "127.0.0.1", port: int = 8080):
         raise MiNtfError(f"cannot serve at {host}:{port} ({error}); choose another --host or --port") from None
     if not guarded:
         server.stop()
-        raise MiNtfError(f"viser {viser.__version__} starts its server in an unknown way, which would answer every page "
+        raise MiNtfError(f"viser {viser.__version__} starts its server in an unknown way, which would answer any page "
                          "of the browser; run pip install 'viser==1.1.1'")
     server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
     server.gui.main_panel.dock_right()
