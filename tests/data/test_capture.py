@@ -5,6 +5,7 @@ import json
 import mitsuba as mi
 import numpy as np
 import pytest
+from helpers.programs import run_on_one_core
 from helpers.variants import VARIANT
 
 from mi_ntf.core.errors import MiNtfError
@@ -239,6 +240,14 @@ def test_radiance_beyond_half_precision_is_kept(tmp_path):
     small(of_albedo(tmp_path, 1e6), tmp_path / "out")
     images = load_dataset(tmp_path / "out")["train"].images
     assert np.isfinite(images).all() and images[..., :3].max() == pytest.approx(1.5e6, rel=0.5)
+
+
+def test_a_texture_is_read_on_one_core(tmp_path):
+    """Mitsuba alone waits for ever for an EXR file there."""
+    words = "--views 1 --test-views 1 --size 8 --spp 1".split()
+    done = run_on_one_core("mi-ntf", "capture", of_albedo(tmp_path, 0.5), tmp_path / "out", *words, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert list((tmp_path / "out").rglob("0000.*"))
 
 
 def test_photographs_that_are_not_finite_are_not_written(tmp_path):
