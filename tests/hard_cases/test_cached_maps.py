@@ -213,6 +213,16 @@ def test_keys_follow_the_march_and_the_libraries(medium, cache, monkeypatch):
     assert [len(names) for names in seen] == list(range(1, len(seen) + 1))
 
 
+def test_voxels_and_networks_of_one_field_have_maps_of_their_own(path, medium, cache):
+    """Also in one process, and from one folder."""
+    network = find_medium(path, representation="network")
+    voxels = texels(medium)
+    assert np.abs(texels(network) - voxels).max() > 0.01
+    map_cache.forget()
+    np.testing.assert_array_equal(texels(network), without_cache(network))
+    assert len(list(cache.iterdir())) == 2
+
+
 # --- memory ----------------------------------------------------------------------------------------------------------
 
 

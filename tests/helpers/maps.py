@@ -16,9 +16,9 @@ SIZE = 4 * 2 * 16**2
 """Bytes of one light's map."""
 
 
-def find_medium(path):
-    """The medium of a scene around the field file `path`."""
-    loaded = scenes.scene(path, {"type": "nrf"}, {"light": scenes.light("point")}, medium={"resolution": 48})
+def find_medium(path, **options):
+    """The medium of a scene around the field file `path`; `options`: parameters of the medium."""
+    loaded = scenes.scene(path, {"type": "nrf"}, {"light": scenes.light("point")}, medium={"resolution": 48, **options})
     return find_media(loaded)[0]
 
 

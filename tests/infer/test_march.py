@@ -12,7 +12,7 @@ from mi_ntf.infer import bundle, march
 from mi_ntf.infer.bundle import Strand
 from mi_ntf.infer.grid import GridField
 from mi_ntf.infer.network import NOTHING, NetworkField
-from mi_ntf.infer.visibility import raymarch
+from mi_ntf.infer.visibility import outside, raymarch
 
 BLOBS = [(-0.3, 0.0, 0.0), (0.35, 0.2, 0.1), (0.0, -0.45, 0.3)], [0.35, 0.25, 0.2]
 
@@ -155,6 +155,45 @@ def test_derivatives_of_optical_depth(grid, rng, far):
     error = np.abs(np.array(dr.grad(result)) - truth)
     scale = np.sqrt((truth**2).mean())
     assert np.quantile(error, 0.8) < 0.05 * scale  # 0.026; of the others, rays cross an edge within h
+
+
+def test_transmittance_from_outside_ends_at_the_light(slab):
+    """From points outside of the uniform sphere, to lights before, in and behind it, past it and away from it."""
+    march = raymarch.RayMarch(slab.density, slab, tuple(mi.Float(s) for s in raymarch.default_steps(2 / 384)))
+    x = np.array([[-3.0, 0, 0]] * 4 + [[-3.0, 1.5, 0], [3.0, 0, 0], [-0.5, 0, 0], [-0.5, 0, 0]])
+    distance = mi.Float([1.5, 2.5, 3.5, np.inf, np.inf, np.inf, 0.75, 1.0])
+    active = mi.Bool([True] * 7 + [False])
+    tau = outside.tau(march, arrays(x), arrays([[1.0, 0, 0]] * 8), distance, mi.UInt32(0), active)
+    # Voxels cut by the sphere, as above; rays that are not asked for are free.
+    np.testing.assert_allclose(-np.log(np.array(tau)), [0, 0.75, 2.25, 3, 0, 0, 1.125, 0], atol=0.013)
+
+
+def test_opaque_matter_lets_nothing_through(rng):
+    """The transmittance of rays that end in matter is 0, not what remains where they ended; that of others is whole."""
+    for sigma, truth in ((1000.0, 0.0), (1.0, np.exp(-2.0))):
+        ball = GridField(NetworkField(*fields.uniform(sigma), mi), 64, mi)
+        strand = Strand(ball.density, ball, arrays(np.tile([[0, 0, 3.0]], (64, 1))),
+                        arrays(np.tile([[0, 0, -1.0]], (64, 1))), mi.Float(2 / 384))  # fmt: skip
+        samples = march.camera_samples([strand], mi.Float(np.inf), mi.Float(rng.random(64)), mi.Float(rng.random(64)))
+        # Voxels cut by the sphere lose σ/64.
+        np.testing.assert_allclose(np.array(samples.transmittance), truth, rtol=0.02)
+
+
+@pytest.mark.parametrize("scale", [0.008, 0.012, 0.02])
+def test_light_out_of_a_skin_that_thins_out(scale, rng):
+    """Density exp(−z/scale)/scale, light from above: of points at which light from there is stopped, transmittances are
+    uniform in [0, 1], so their mean is ½, found within 0.07 %."""
+
+    class Grid:
+        clearance = dr.zeros(mi.Float, bundle.CELLS**3)
+
+    u = (np.arange(4096) + 0.5) / 4096
+    x = np.stack([rng.uniform(-0.3, 0.3, 4096), rng.uniform(-0.3, 0.3, 4096), -scale * np.log(-np.log(u) * 0.8)], 1)
+    found = raymarch.RayMarch(lambda p: dr.exp(-p[2] / scale) / scale, Grid,
+                              tuple(mi.Float(s) for s in raymarch.default_steps(2 / 384)))
+    tau = found.tau(arrays(x), arrays(np.tile([0.6, 0.0, 0.8], (4096, 1))), mi.Float(np.inf), mi.UInt32(0),
+                    dr.full(mi.Bool, True, 4096))
+    assert np.array(tau, np.float64).mean() == pytest.approx(0.5, rel=0.001)
 
 
 def means(log_density) -> np.ndarray:

@@ -149,6 +149,20 @@ def test_the_shadow_of_a_sun_is_sharp_where_skies_are_looked_up(blobs, monkeypat
     assert error[0] < 0.01 and error[1] > 0.03
 
 
+@pytest.mark.parametrize("kind", ["directional", "constant"])
+def test_shapes_far_off_hide_lights_from_afar(blobs, kind):
+    """A ceiling 100 radii above the field, of which a nested light knows nothing: the floor below it is dark, but for
+    what comes to it from less than 2° above the horizon, 0.06 % of a sky's light."""
+    up = mi.ScalarTransform4f().translate([0, 150, 0]).rotate([1, 0, 0], 90).scale(1e5)
+    ceiling = {"ceiling": {"type": "rectangle", "to_world": up}}
+
+    def mean(path, **shapes):
+        loaded = floor_scene({"type": "direct"}, light(kind, path), {"type": "diffuse"}, 8, **shapes)
+        return scenes.render(loaded)[..., :3].mean()
+
+    assert mean(blobs, **ceiling) < 0.002 * mean(blobs)
+
+
 @pytest.fixture
 def few_directions(monkeypatch):
     monkeypatch.setattr(transmittance_atlas, "SIDE", 8)
