@@ -2,7 +2,7 @@
 PYTHON ?= python3
 RUN := .venv/bin/python
 
-.PHONY: setup demo test hard-cases clean
+.PHONY: setup demo test hard-cases mutants clean
 
 setup:
 	@$(PYTHON) tools/setup_env.py
@@ -24,6 +24,13 @@ hard-cases:
 	@$(PYTHON) tools/setup_env.py dev
 	@$(RUN) -m pytest -n 2 --dist loadfile -q -m "slow and not gpu" --ignore tests/hard_cases
 	@$(RUN) -m pytest -n 2 --dist loadfile -q tests/hard_cases --catalogue
+
+# Single expressions changed at random, one at a time: which of them the quick tests notice. COUNT=60 takes an hour.
+SEED ?= 42
+COUNT ?= 60
+mutants:
+	@$(PYTHON) tools/setup_env.py dev
+	@$(RUN) tools/mutants.py --seed $(SEED) --count $(COUNT)
 
 clean:
 	rm -rf .venv build dist out .pytest_cache .ruff_cache .mypy_cache .hypothesis

@@ -214,7 +214,7 @@ def test_keys_follow_the_march_and_the_libraries(medium, cache, monkeypatch):
 
 
 def test_voxels_and_networks_of_one_field_have_maps_of_their_own(path, medium, cache):
-    """Also in one process, and from one folder."""
+    """Neither is taken for the other, in memory or on disk."""
     network = find_medium(path, representation="network")
     voxels = texels(medium)
     assert np.abs(texels(network) - voxels).max() > 0.01
