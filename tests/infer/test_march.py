@@ -245,6 +245,22 @@ def test_skipping_changes_nothing(grid, rng):
         np.testing.assert_allclose(np.array(a)[order[0]], np.array(b)[order[1]], atol=2e-5)
 
 
+def test_skipping_changes_no_flight(grid, rng):
+    """Rays end where those do that never skip, to float32's grain, in cells so long that a lost one shows."""
+
+    class Everywhere:
+        clearance = dr.zeros(mi.Float, len(grid.clearance))
+
+    o, d = (arrays(v) for v in rays(rng, 2000))
+    offset, depth = (mi.Float(rng.random(2000)) for _ in range(2))
+    strands = (Strand(grid.density, g, o, d, mi.Float(1 / 16)) for g in (grid, Everywhere))
+    (hit, t, _), (all_hit, all_t, _) = (
+        [np.array(a) for a in march.free_flight([s], mi.Float(1e9), offset, [-dr.log(1 - depth)])] for s in strands)
+    assert hit.any() and not hit.all()
+    np.testing.assert_array_equal(hit, all_hit)
+    np.testing.assert_allclose(t[hit], all_t[hit], atol=1e-4)
+
+
 def test_shared_samples_are_fair(grid, rng, monkeypatch):
     """Cells that share a sample are met as often as they weigh: over many numbers, sums over samples of any function of
     the place are those of finer shares; and there are as few samples as there are shares."""
