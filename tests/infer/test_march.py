@@ -217,6 +217,20 @@ def test_means_of_pieces(slab):
     assert (means(lambda t: NOTHING) == 0).all()
 
 
+@pytest.mark.parametrize("bend", [-1.5, -0.021, -0.019, 0.0, 0.019, 0.021, 1.5])
+def test_places_in_a_cell(variant, bend):
+    """The inverse of the optical depth of densities that are exponential across each piece, by the formula for small
+    slopes and the one for others: 1e-5 of a piece, float32's grain and the third power of a small slope."""
+    share = (np.arange(60) + 0.5) / 60 * bundle.PIECES
+    piece, u = np.floor(share), share % 1
+    part, sigmas = 0.1, 2.0 + np.arange(bundle.PIECES)
+    rise = np.expm1(bend * u) / np.expm1(bend) if bend else u
+    depth = part * (np.concatenate([[0], np.cumsum(sigmas)])[piece.astype(int)] + sigmas[piece.astype(int)] * rise)
+    cell = bundle.Cell(mi.Float(0.3), mi.Float(part), tuple((mi.Float(s),) for s in sigmas),
+                       (mi.Float(bend),) * bundle.PIECES, None, ())
+    np.testing.assert_allclose(np.array(cell.place(mi.Float(depth))), 0.3 + share * part, atol=1e-5 * part + 1e-7)
+
+
 def test_densities_by_their_logarithm(grid, rng):
     """A strand that knows ln σ finds what one does that asks for σ."""
     o, d = rays(rng, 200)
