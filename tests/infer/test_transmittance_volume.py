@@ -9,6 +9,7 @@ import pytest
 from helpers import fields
 from helpers.jit import arrays
 
+from mi_ntf.core.spheres import fibonacci
 from mi_ntf.infer.grid import CELLS, GridField
 from mi_ntf.infer.lights import LightTable
 from mi_ntf.infer.network import NetworkField
@@ -60,6 +61,18 @@ def test_uniform_ball_in_closed_form(lights, everywhere, k, rng):
     error = look(volume, lights, x, k) - np.exp(-4 * length)
     # Cells of 1/134 begin and end at the ball's surface by halves: 4/268 at most; on average nothing is left of it.
     assert abs(error.mean()) < 1.5e-3 and np.abs(error).max() < 0.03
+
+
+def test_matter_that_reaches_the_hull(rng):
+    """τ is linear from 1, where light enters the hull, through the first entries: e^(−1.5 s), off by (1.5 Δ)²/8 = 0.004
+    between them for cells of Δ = 0.11."""
+    radius, sun = 0.9, np.array([0.48, 0.6, 0.64])
+    grid = SimpleNamespace(hull=radius * fibonacci(400), clearance=dr.zeros(mi.Float, CELLS**3))
+    lights = LightTable(sun[None], np.ones((1, 3)), np.array([False]), 1.0, mi)
+    volume = TransmittanceVolume(lights, 64, 16, grid, lambda p: mi.Float(1.5), mi)
+    s = rng.uniform(0.03, 0.4, 500)
+    x = (radius - s)[:, None] * sun + rng.uniform(-0.02, 0.02, (500, 3))
+    np.testing.assert_allclose(look(volume, lights, x, 0), np.exp(-1.5 * (radius - x @ sun)), atol=0.008)
 
 
 def test_entries_fall_along_every_ray(lights, everywhere):
