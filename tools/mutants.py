@@ -1,7 +1,5 @@
 """Change single expressions of the package and see whether the quick tests notice: a seeded sample of such mutants.
 
-    python tools/mutants.py --seed 42 --count 60
-
 Each mutant runs in a copy of the package against its nearest quick tests, up to the first failure: those that
 ``mutants.toml`` names, else the test files that import the module. Results go to ``out/mutants.json`` after each
 mutant; a run that is started again goes on where it ended. What a survivor is stands in ``mutants.toml``, too:
@@ -29,6 +27,7 @@ ROOT = Path(__file__).parents[1]
 FOLDERS = "core", "infer", "render/transport", "render/lights"
 CHOOSER = {"choosing", "trials", "probing", "ranking", "omissions", "glints", "estimate", "choice", "passes"}
 """Modules of render/transport that choose a method; left out."""
+OUT = ROOT / "out" / "mutants.json"
 LIMIT = 180
 """CPU seconds for the tests of one mutant, about 150 s on two cores."""
 
@@ -46,69 +45,59 @@ SILENT = {"label", "strict", "summary", "mode", "match"}
 
 def skipped(node) -> bool:
     """True for nodes whose content is no behaviour: messages, types, texts."""
-    if isinstance(node, ast.Raise | ast.Assert | ast.JoinedStr | ast.arg | ast.Import | ast.ImportFrom):
-        return True
-    if isinstance(node, ast.keyword) and node.arg in SILENT:
-        return True
-    return isinstance(node, ast.Call) and ast.unparse(node.func) == "mi.Log"
+    return (isinstance(node, ast.Raise | ast.Assert | ast.JoinedStr | ast.arg | ast.Import | ast.ImportFrom)
+            or (isinstance(node, ast.keyword) and node.arg in SILENT)
+            or (isinstance(node, ast.Call) and ast.unparse(node.func) == "mi.Log"))  # fmt: skip
+
+
+def changes(node):
+    """``(kind, text)`` of each mutant of a node itself."""
+    text, other = ast.unparse, SWAPS.get(type(getattr(node, "op", None)))
+    if isinstance(node, ast.Compare) and len(node.ops) == 1:
+        yield "comparison", f"{text(node.left)} {SWAPS[type(node.ops[0])]} {text(node.comparators[0])}"
+    elif isinstance(node, ast.BinOp) and other:
+        yield "arithmetic", f"({text(node.left)}) {other} ({text(node.right)})"
+    elif isinstance(node, ast.BoolOp):
+        yield "boolean", f" {other} ".join(f"({text(v)})" for v in node.values)
+    elif isinstance(node, ast.UnaryOp):
+        yield "boolean" if isinstance(node.op, ast.Not | ast.Invert) else "arithmetic", f"({text(node.operand)})"
+    elif isinstance(node, ast.Constant) and isinstance(node.value, bool):
+        yield "boolean", str(not node.value)
+    elif isinstance(node, ast.Constant) and isinstance(node.value, int | float):
+        whole, up = float(node.value).is_integer() and abs(node.value) < 1e9, node.col_offset % 2
+        yield "constant", repr(node.value + (1 if up else -1) if whole else node.value * (1.25 if up else 0.8))
+    elif isinstance(node, ast.AugAssign) and other:
+        yield "arithmetic", f"{text(node.target)} {other}= {text(node.value)}"
+    elif isinstance(node, ast.Return) and isinstance(node.value, ast.Tuple) and len(node.value.elts) > 1:
+        first, second, *rest = (text(e) for e in node.value.elts)
+        yield "return", "return " + ", ".join([second, first, *rest])
+    elif isinstance(node, ast.Call):
+        called, arguments, keywords = text(node.func), [text(a) for a in node.args], [text(k) for k in node.keywords]
+        last = called.split(".")[-1]
+        if last in NAMES:
+            yield "function", f"{called.removesuffix(last)}{NAMES[last]}({', '.join([*arguments, *keywords])})"
+        k = 1 if last in ("select", "where") else 0  # the values, not the condition
+        pair = arguments[k : k + 2]
+        if len(set(pair)) == 2 and last not in ("dot", *NAMES) and not any(TYPES.fullmatch(a) for a in pair):
+            yield "arguments", f"{called}({', '.join([*arguments[:k], *pair[::-1], *arguments[k + 2 :], *keywords])})"
 
 
 def candidates(path: Path) -> list[dict]:
     """All mutants of a module: place, kind, text before and after."""
-    source = path.read_text()
-    found: list[dict] = []
-
-    def add(kind, node, text):
-        found.append({"file": str(path.relative_to(ROOT)), "line": node.lineno, "column": node.col_offset, "kind": kind,
-                      "before": ast.get_source_segment(source, node), "after": text,
-                      "statement": isinstance(node, ast.stmt)})
+    source, found = path.read_text(), []
 
     def visit(node):
         if skipped(node):
             return
-        if isinstance(node, ast.Compare) and len(node.ops) == 1:
-            left, right = ast.unparse(node.left), ast.unparse(node.comparators[0])
-            add("comparison", node, f"{left} {SWAPS[type(node.ops[0])]} {right}")
-        elif isinstance(node, ast.BinOp) and type(node.op) in SWAPS:
-            add("arithmetic", node, f"({ast.unparse(node.left)}) {SWAPS[type(node.op)]} ({ast.unparse(node.right)})")
-        elif isinstance(node, ast.BoolOp):
-            add("boolean", node, f" {SWAPS[type(node.op)]} ".join(f"({ast.unparse(v)})" for v in node.values))
-        elif isinstance(node, ast.UnaryOp):
-            add("boolean" if isinstance(node.op, ast.Not | ast.Invert) else "arithmetic", node,
-                f"({ast.unparse(node.operand)})")
-        elif isinstance(node, ast.Constant) and isinstance(node.value, bool):
-            add("boolean", node, str(not node.value))
-        elif isinstance(node, ast.Constant) and isinstance(node.value, int | float):
-            whole = float(node.value).is_integer() and abs(node.value) < 1e9
-            up = node.col_offset % 2
-            add("constant", node, repr(node.value + (1 if up else -1) if whole else node.value * (1.25 if up else 0.8)))
-        elif isinstance(node, ast.AugAssign) and type(node.op) in SWAPS:
-            add("arithmetic", node, f"{ast.unparse(node.target)} {SWAPS[type(node.op)]}= {ast.unparse(node.value)}")
-        elif isinstance(node, ast.Return) and isinstance(node.value, ast.Tuple) and len(node.value.elts) > 1:
-            first, second, *rest = (ast.unparse(e) for e in node.value.elts)
-            add("return", node, "return " + ", ".join([second, first, *rest]))
-        elif isinstance(node, ast.Call):
-            calls(node)
+        for kind, after in changes(node):
+            found.append({"file": str(path.relative_to(ROOT)), "line": node.lineno, "column": node.col_offset,
+                          "kind": kind, "before": ast.get_source_segment(source, node), "after": after,
+                          "statement": isinstance(node, ast.stmt)})  # fmt: skip
         for name, child in ast.iter_fields(node):
-            if name in ("annotation", "returns", "decorator_list", "type_params"):
-                continue
-            for each in child if isinstance(child, list) else [child]:
-                if isinstance(each, ast.AST):
-                    visit(each)
-
-    def calls(node):
-        arguments = [ast.unparse(a) for a in node.args]
-        name = ast.unparse(node.func)
-        last = name.split(".")[-1]
-        if last in NAMES:
-            inside = ", ".join(ast.unparse(a) for a in (*node.args, *node.keywords))
-            add("function", node, f"{name.removesuffix(last)}{NAMES[last]}({inside})")
-        k = 1 if last in ("select", "where") else 0  # the values, not the condition
-        pair = arguments[k : k + 2]
-        if len(set(pair)) == 2 and last not in ("dot", *NAMES) and not any(TYPES.fullmatch(a) for a in pair):
-            arguments[k], arguments[k + 1] = arguments[k + 1], arguments[k]
-            inside = ", ".join([*arguments, *(ast.unparse(kw) for kw in node.keywords)])
-            add("arguments", node, f"{name}({inside})")
+            if name not in ("annotation", "returns", "decorator_list", "type_params"):
+                for each in child if isinstance(child, list) else [child]:
+                    if isinstance(each, ast.AST):
+                        visit(each)
 
     visit(ast.parse(source))
     return [m for m in found if m["before"] is not None]
@@ -132,26 +121,18 @@ def tests_of(file: str, nearest: dict) -> list[str]:
     module = file.removeprefix("mi_ntf/").removesuffix(".py")
     if module in nearest:
         return [f"tests/{name}" for name in nearest[module]]
-    stem, dotted = Path(module).name, "mi_ntf." + module.replace("/", ".")
-    found = [f for f in sorted((ROOT / "tests").rglob("test_*.py")) if dotted in imports(f)]
+    package, _, stem = f"mi_ntf.{module.replace('/', '.')}".rpartition(".")
+    imported = re.compile(rf"from {package} import .*\b{stem}\b|from {package}\.{stem} import")
+    found = [f for f in sorted((ROOT / "tests").rglob("test_*.py")) if imported.search(f.read_text())]
     found.sort(key=lambda f: (f.stem != f"test_{stem}", f.parent.name != module.split("/")[0]))
     return [str(f.relative_to(ROOT)) for f in found[:3]] or ["tests/render/test_integrator.py"]
 
 
-def imports(path: Path) -> set[str]:
-    """Names of the modules that a test file imports from, and of what it imports from them."""
-    found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.ImportFrom):
-            found |= {str(node.module), *(f"{node.module}.{alias.name}" for alias in node.names)}
-    return found
-
-
 def changed(mutant: dict) -> str:
     """Text of the mutated module."""
-    lines = (ROOT / mutant["file"]).read_text().splitlines(keepends=True)
-    begin = sum(len(line.encode()) for line in lines[: mutant["line"] - 1]) + mutant["column"]
-    source, before = "".join(lines).encode(), mutant["before"].encode()
+    lines = (ROOT / mutant["file"]).read_bytes().splitlines(keepends=True)
+    begin = sum(map(len, lines[: mutant["line"] - 1])) + mutant["column"]
+    source, before = b"".join(lines), mutant["before"].encode()
     assert source[begin : begin + len(before)] == before, f"{mutant['file']} has changed since the sample was drawn"
     after = mutant["after"] if mutant["statement"] else f"({mutant['after']})"
     return (source[:begin] + after.encode() + source[begin + len(before) :]).decode()
@@ -174,16 +155,19 @@ def run(mutant: dict, tests: list[str]) -> dict:
         command = [sys.executable, "-B", "-m", "pytest", "-x", "-q", "-m", "not slow and not gpu", "-p",
                    "no:cacheprovider", "--no-header", "--tb=line", *tests]  # fmt: skip
         begin = time.monotonic()
-        with open(copy / "log", "w") as log:
-            process = subprocess.Popen(command, cwd=copy, stdout=log, stderr=log,
-                                       env={**os.environ, "PYTHONPATH": str(copy), "OMP_NUM_THREADS": "2"},
-                                       preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CPU, (LIMIT, LIMIT + 5)))
-            code = process.wait()
-        text = (copy / "log").read_text()
-    failures = [line for line in text.splitlines() if line.startswith(("FAILED", "ERROR"))]
-    status = {0: "survived", -signal.SIGXCPU: "stopped"}.get(code, "killed")
-    return {"status": status, "code": code, "seconds": round(time.monotonic() - begin), "tests": tests,
-            "by": (failures or text.splitlines()[-1:] or [""])[0][:160]}  # fmt: skip
+        found = subprocess.run(command, cwd=copy, env=os.environ | {"PYTHONPATH": str(copy)}, capture_output=True,
+                               preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CPU, (LIMIT, LIMIT + 5)))
+    lines = found.stdout.decode(errors="replace").splitlines()
+    failures = [line for line in lines if line.startswith(("FAILED", "ERROR"))]
+    status = {0: "survived", -signal.SIGXCPU: "stopped"}.get(found.returncode, "killed")
+    return {"status": status, "code": found.returncode, "seconds": round(time.monotonic() - begin), "tests": tests,
+            "by": [*failures, *lines[-1:], ""][0][:160]}  # fmt: skip
+
+
+def name(mutant: dict) -> str:
+    """Name of a mutant in tables: place, text before and after, on one line."""
+    before, after = (" ".join(mutant[key].split()) for key in ("before", "after"))
+    return f"{mutant['file'].removeprefix('mi_ntf/')}: {before} → {after}"
 
 
 def table(done: list[dict], classes: dict) -> str:
@@ -198,36 +182,24 @@ def table(done: list[dict], classes: dict) -> str:
                       f"killed: {killed} of {changing} that change results, {killed / max(changing, 1):.0%}"])
 
 
-def name(mutant: dict) -> str:
-    """Name of a mutant in tables: place, text before and after, on one line."""
-    before, after = (" ".join(mutant[key].split()) for key in ("before", "after"))
-    return f"{mutant['file'].removeprefix('mi_ntf/')}: {before} → {after}"
-
-
-def place(mutant: dict) -> tuple:
-    """Key of a mutant in a file of results."""
-    return mutant["line"], mutant["column"], name(mutant)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--seed", type=int, default=42)
     parser.add_argument("--count", type=int, default=60)
-    parser.add_argument("--out", type=Path, default=ROOT / "out" / "mutants.json")
     parser.add_argument("--again", action="store_true", help="run those that were not killed once more")
     given = parser.parse_args()
     lists = tomllib.loads(Path(__file__).with_suffix(".toml").read_text())
-    known = {place(m): m for m in (json.loads(given.out.read_text()) if given.out.exists() else [])}
+    OUT.parent.mkdir(exist_ok=True)
+    known = {(m["line"], name(m)): m for m in (json.loads(OUT.read_text()) if OUT.exists() else [])}
     done = []
     for m in sample(given.seed, given.count):
-        found = known.get(place(m))
+        found = known.get((m["line"], name(m)))
         if found is None or (given.again and found["status"] != "killed"):
             found = {**m, **run(m, tests_of(m["file"], lists["nearest"]))}
             print(f"{len(done) + 1:3} {found['status']:8} {found['seconds']:4} s  {name(m)}", flush=True)
         done.append(found)
-        known[place(m)] = found
-        given.out.parent.mkdir(exist_ok=True)
-        given.out.write_text(json.dumps(list(known.values()), indent=1, ensure_ascii=False))
+        known[m["line"], name(m)] = found
+        OUT.write_text(json.dumps(list(known.values()), indent=1, ensure_ascii=False))
     print(table(done, {m["mutant"]: m["class"] for m in lists.get("survivor", [])}))
 
 
