@@ -27,16 +27,19 @@ class Recent(dict):
 
 
 class Version:
-    """An emitter at one moment, as a key: equal to another while no parameter has been assigned a new value.
+    """Mitsuba objects at one moment, as a key: equal to another while no parameter has been assigned a new value.
 
     Arrays are compared by their Dr.Jit variables, not by their contents: a map of 4096 × 2048 texels takes 0.4 s to
-    read. They are kept, so that no other variable gets the same index meanwhile."""
+    read. They are kept, so that no other variable gets the same index meanwhile. `owners`: the type of the objects,
+    they themselves and those in them, whose parameters count."""
 
-    def __init__(self, emitter):
-        self._emitter = emitter
-        # Copies: the emitter's own tensor, held by reference, would be written to in place.
-        self._values = [type(value)(value) if dr.is_tensor_v(value) else value for _, value in mi.traverse(emitter)]
-        self._key = (id(emitter), *map(_identity, self._values))
+    def __init__(self, *objects, owners: type = object):
+        self._objects = objects
+        values = [value for parameters in map(mi.traverse, objects) for name, value in parameters
+                  if isinstance(parameters.properties[name][2], owners)]
+        # Copies: an object's own array, held by reference, would be written to in place.
+        self._values = [type(value)(value) if _is_large(value) else value for value in values]
+        self._key = (*map(id, objects), *map(_identity, self._values))
 
     def __eq__(self, other) -> bool:
         return isinstance(other, Version) and self._key == other._key
@@ -45,7 +48,13 @@ class Version:
         return hash(self._key)
 
 
+def _is_large(value) -> bool:
+    """Whether `value` is a tensor, or an array of numbers whose width is not known beforehand."""
+    return dr.is_tensor_v(value) or (dr.is_array_v(value) and dr.is_dynamic_v(value) and dr.depth_v(value) == 1)
+
+
 def _identity(value) -> tuple | bytes:
-    if dr.is_tensor_v(value):
-        return value.shape, value.array.index, value.array.index_ad
-    return np.array(dr.detach(getattr(value, "matrix", value))).tobytes()
+    if not _is_large(value):
+        return np.array(dr.detach(getattr(value, "matrix", value))).tobytes()
+    array = value.array if dr.is_tensor_v(value) else value
+    return dr.shape(value), array.index, array.index_ad

@@ -1,0 +1,42 @@
+"""The scene of ordinary shapes that rays are traced in: kept while no shape changes."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers import scenes
+
+from mi_ntf.render.transport import surfaces
+
+
+def room() -> dict:
+    """A floor as a mesh and two instances of a ball."""
+    floor = mi.Mesh("floor", 4, 2)
+    parameters = mi.traverse(floor)
+    parameters["vertex_positions"] = np.float32([[-4, -1.5, -4], [4, -1.5, -4], [4, -1.5, 4], [-4, -1.5, 4]]).ravel()
+    parameters["faces"] = np.uint32([[0, 2, 1], [0, 3, 2]]).ravel()
+    parameters.update()
+    group = {"type": "shapegroup", "ball": {"type": "sphere", "radius": 0.4}}
+    places = {f"instance_{i}": {"type": "instance", "group": {"type": "ref", "id": "group"},
+                                "to_world": mi.ScalarTransform4f().translate([1.6 - 3 * i, -0.9, 1])} for i in range(2)}
+    return {"floor": floor, "group": group, **places}
+
+
+@pytest.mark.parametrize("name", ["floor.vertex_positions", "group.ball.to_world", "instance_0.to_world"])
+def test_shapes_are_built_again_when_one_moves(blobs, monkeypatch, name):
+    built = []
+    monkeypatch.setattr(surfaces, "_built", lambda shapes, make=surfaces._built: built.append(shapes) or make(shapes))
+    scene = scenes.scene(blobs, scenes.nrf(samples=64), {"light": scenes.light("point")}, spp=4, size=16, shapes=room())
+    parameters = mi.traverse(scene)
+    first = scenes.render(scene)
+    assert list(mi.traverse(scene).keys()) == list(parameters.keys())  # no shape has got another name
+    for key in (k for k in parameters.keys() if k.endswith("reflectance.value")):
+        parameters[key] = 0.3
+    parameters.update()
+    assert len(built) == 1 and scenes.render(scene)[..., :3].mean() < 0.99 * first[..., :3].mean()
+    assert len(built) == 1
+    key = next(k for k in parameters.keys() if k.endswith(name))
+    value = parameters[key]
+    parameters[key] = value + 0.3 if "positions" in key else value @ type(value)().translate([0.5, 0.3, 0])
+    parameters.update()
+    moved = scenes.render(scene)
+    assert len(built) == 2 and np.abs(moved - first).max() > 0.1
