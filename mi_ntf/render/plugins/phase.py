@@ -25,7 +25,7 @@ def phase_class() -> type:
         Value: f = ρ(R(x), ω_o, ω_i, n(x)) (⟨n,ω_i⟩ + ⟨n,ω_o⟩), less at grazing angles of curved skins, between
         directions on the normal's side, linear RGB, 1/sr, which makes an opaque skin reflect like a surface of the
         microfacet ρ (:func:`mi_ntf.core.microfacet.scattering`). Its integral is no probability. Stock ``volpath`` and
-        ``prbvolpath`` at `max_depth` 2 solve the same equation as the ``nrf`` integrator (Bi et al. 2020, eq. 2).
+        ``volpathmis`` at `max_depth` 2 solve the same equation as the ``nrf`` integrator (Bi et al. 2020, eq. 2).
 
         Does not support: use outside an ``nrf`` medium; polarised and spectral variants; adjoint (importance)
         transport.
