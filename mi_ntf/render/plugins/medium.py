@@ -45,8 +45,8 @@ def medium_class(phase_class: type) -> type:
         The medium fills the sphere around the captured object (the file's similarity: centre and radius in capture
         units). It belongs inside one bounding shape with a ``null`` BSDF that encloses the object. Extinction is in
         inverse scene units; every collision scatters (single-scattering albedo 1) with the field's reflectance as phase
-        function. Several may overlap: the ``nrf`` integrator adds their densities, which stock volumetric integrators,
-        who know one medium at a time, do not.
+        function. Media may overlap: the ``nrf`` integrator adds their densities. Stock volumetric integrators know one
+        medium at a time, and are no reference there.
 
         Does not support: several bounding shapes for one medium; shearing or non-uniform transforms; spectral
         extinction. Source: neural reflectance fields, Bi et al. 2020.
