@@ -10,7 +10,6 @@ from mi_ntf.render.scene.media import find_media, ordinary_shapes
 
 PLACES = [(1.4, 1.1, 1.3), (0.3, 0.9, 1.6), (-0.9, 0.6, 1.4)]
 BSDF = {"type": "twosided", "nested": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.7, 0.4, 0.2]}}}
-AWAITS_ONE_SCENE = pytest.mark.xfail(reason="ordinary shapes are traced in a scene without their groups", strict=True)
 
 
 def ball(**more) -> dict:
@@ -36,7 +35,6 @@ def scene(blobs, integrator: dict, shapes: dict, **options):
     return scenes.scene(blobs, integrator, {"light": scenes.light("point")}, shapes=shapes, **options)
 
 
-@AWAITS_ONE_SCENE
 @pytest.mark.parametrize("options", [{}, {"max_depth": 4}, {"max_error": 0.05, "visibility": "auto"}])
 def test_instances_are_what_is_written_out(blobs, options):
     """They hide the field, shade it and the floor, and reflect."""
@@ -49,7 +47,6 @@ def test_instances_are_what_is_written_out(blobs, options):
     np.testing.assert_allclose(pictures[0].mean((0, 1)), pictures[1].mean((0, 1)), rtol=0.002)
 
 
-@AWAITS_ONE_SCENE
 @pytest.mark.parametrize("depth", [2, 4])
 def test_instances_beside_stock_volpath(blobs, depth):
     ours = scene(blobs, scenes.nrf(max_depth=depth), instances(), size=16)
