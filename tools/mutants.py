@@ -85,6 +85,7 @@ def changes(node):
 def candidates(path: Path) -> list[dict]:
     """All mutants of a module: place, kind, text before and after."""
     source, found = path.read_text(), []
+    lines = source.splitlines()
 
     def visit(node):
         if skipped(node):
@@ -92,7 +93,7 @@ def candidates(path: Path) -> list[dict]:
         for kind, after in changes(node):
             found.append({"file": str(path.relative_to(ROOT)), "line": node.lineno, "column": node.col_offset,
                           "kind": kind, "before": ast.get_source_segment(source, node), "after": after,
-                          "statement": isinstance(node, ast.stmt)})  # fmt: skip
+                          "text": lines[node.lineno - 1].strip(), "statement": isinstance(node, ast.stmt)})  # fmt: skip
         for name, child in ast.iter_fields(node):
             if name not in ("annotation", "returns", "decorator_list", "type_params"):
                 for each in child if isinstance(child, list) else [child]:
@@ -165,9 +166,14 @@ def run(mutant: dict, tests: list[str]) -> dict:
 
 
 def name(mutant: dict) -> str:
-    """Name of a mutant in tables: place, text before and after, on one line."""
+    """Name of a mutant in tables: module and line of text, and what of it is changed into what."""
     before, after = (" ".join(mutant[key].split()) for key in ("before", "after"))
-    return f"{mutant['file'].removeprefix('mi_ntf/')}: {before} → {after}"
+    return f"{mutant['file'].removeprefix('mi_ntf/')}: {mutant['text']}: {before} → {after}"
+
+
+def place(mutant: dict) -> tuple:
+    """Key of a mutant among results."""
+    return tuple(mutant[key] for key in ("file", "line", "column", "after"))
 
 
 def table(done: list[dict], classes: dict) -> str:
@@ -190,15 +196,15 @@ def main() -> None:
     given = parser.parse_args()
     lists = tomllib.loads(Path(__file__).with_suffix(".toml").read_text())
     OUT.parent.mkdir(exist_ok=True)
-    known = {(m["line"], name(m)): m for m in (json.loads(OUT.read_text()) if OUT.exists() else [])}
+    known = {place(m): m for m in (json.loads(OUT.read_text()) if OUT.exists() else [])}
     done = []
     for m in sample(given.seed, given.count):
-        found = known.get((m["line"], name(m)))
-        if found is None or (given.again and found["status"] != "killed"):
-            found = {**m, **run(m, tests_of(m["file"], lists["nearest"]))}
+        found = known.get(place(m), {}) | m
+        if "status" not in found or (given.again and found["status"] != "killed"):
+            found |= run(m, tests_of(m["file"], lists["nearest"]))
             print(f"{len(done) + 1:3} {found['status']:8} {found['seconds']:4} s  {name(m)}", flush=True)
         done.append(found)
-        known[m["line"], name(m)] = found
+        known[place(m)] = found
         OUT.write_text(json.dumps(list(known.values()), indent=1, ensure_ascii=False))
     print(table(done, {m["mutant"]: m["class"] for m in lists.get("survivor", [])}))
 

@@ -96,6 +96,22 @@ def test_texel_centre_returns_its_own_ray(grid, network, reader, name, source, r
 
 
 @pytest.mark.parametrize("name", LIGHTS)
+def test_places_on_the_rays_around_a_point(grid, name, rng):
+    """The plane through a point across its light's direction cuts the four nearest rays there, also in large cells."""
+    rays = LightRays(table(name), grid.hull, 12, mi)
+    x = rng.uniform(-0.25, 0.25, (500, 3))
+    wi, distance = towards(x, name)
+    inside, _, found = rays.nearest(mi.UInt32(0), arrays(x), arrays(wi), mi.Float(distance), True)
+    assert np.array(inside).all()
+    o, d = (np.array([np.broadcast_to(np.array(c, np.float64), 144) for c in v]).T for v in rays.all_rays(0, 1)[1:3])
+    np.testing.assert_allclose(sum(np.array(weight) for weight, _, _ in found), 1, atol=1e-5)
+    for _, texel, t in found:
+        start, along = o[np.array(texel)], d[np.array(texel)]
+        truth = (start * along).sum(1) + ((x - start) * wi).sum(1) / (along * wi).sum(1)
+        np.testing.assert_allclose(np.array(t), truth, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", LIGHTS)
 def test_interpolation_reproduces_a_smooth_map(grid, name, rng):
     """b linear in the ray's place and a = 5: bilinear τ differs from the truth by second order in the texel only."""
 
