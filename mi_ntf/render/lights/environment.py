@@ -24,7 +24,7 @@ ROWS = 512
 """Rows of blocks that a map is summed to at most, and twice as many columns; more only where more lights are wanted."""
 FLOOR = 1e-2
 """Share of an even sky that cells are cut by: dark regions too get a few, whose texels then have useful gradients."""
-_kept, _kept_of_emitters, _drawable = Recent(), Recent(4), Recent(2)
+_kept, _kept_of_emitters, _copies = Recent(), Recent(4), Recent(2)
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(6)
 
 
@@ -148,7 +148,7 @@ def cells(image: np.ndarray, limit: int) -> Cells:
 
 def cells_of(emitter, kind: str, limit: int) -> Cells:
     """Return the :func:`cells` of an ``envmap`` or ``constant``."""
-    return _kept_of_emitters.of((Version(emitter), limit), lambda: cells(image(emitter, kind), limit))
+    return Version(emitter).once(_kept_of_emitters, lambda: cells(image(emitter, kind), limit), limit)
 
 
 def _cells(image: np.ndarray, limit: int) -> Cells:
@@ -259,7 +259,8 @@ def drawable(emitter):
     points of fields do not draw."""
     if emitter.class_name() != "EnvironmentMapEmitter":
         return emitter
-    return _drawable.of(Version(emitter), lambda: _uncompensated(emitter) if _is_compensated(emitter) else emitter)
+    copy = Version(emitter).once(_copies, lambda: _uncompensated(emitter) if _is_compensated(emitter) else None)
+    return copy or emitter
 
 
 PROBES = 64

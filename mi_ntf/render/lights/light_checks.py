@@ -21,7 +21,7 @@ def check(emitter, kind: str, drawn: bool = False) -> None:
             "an envmap of the average over several"
         )
     if kind == "envmap":  # whose texels take long to read
-        _checked.of((Version(emitter), drawn), lambda: _check(emitter, kind, drawn))
+        Version(emitter).once(_checked, lambda: _check(emitter, kind, drawn), drawn)
     else:
         _check(emitter, kind, drawn)
 

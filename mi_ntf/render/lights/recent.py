@@ -27,19 +27,21 @@ class Recent(dict):
 
 
 class Version:
-    """Mitsuba objects at one moment, as a key: equal to another while no parameter has been assigned a new value.
+    """The parameters of Mitsuba objects at one moment, as a key: equal to another while none has been assigned a new
+    value.
 
     Arrays are compared by their Dr.Jit variables, not by their contents: a map of 4096 × 2048 texels takes 0.4 s to
-    read. They are kept, so that no other variable gets the same index meanwhile. `owners`: the type of the objects,
-    they themselves and those in them, whose parameters count."""
+    read. They are kept, so that no other variable gets the same index meanwhile. The objects are not kept, and nothing
+    that carries gradients (`attached`: a parameter does), which would outlive its scene. `owners`: the type of the
+    objects, they themselves and those in them, whose parameters count."""
 
     def __init__(self, *objects, owners: type = object):
-        self._objects = objects
         values = [value for parameters in map(mi.traverse, objects) for name, value in parameters
                   if isinstance(parameters.properties[name][2], owners)]
+        self.attached = any(dr.grad_enabled(value) for value in values)
         # Copies: an object's own array, held by reference, would be written to in place.
-        self._values = [type(value)(value) if _is_large(value) else value for value in values]
-        self._key = (*map(id, objects), *map(_identity, self._values))
+        self._arrays = [type(value)(dr.detach(value)) for value in values if _is_large(value)]
+        self._key = (*(o.class_name() for o in objects), *map(_identity, values))
 
     def __eq__(self, other) -> bool:
         return isinstance(other, Version) and self._key == other._key
@@ -47,14 +49,18 @@ class Version:
     def __hash__(self) -> int:
         return hash(self._key)
 
+    def once(self, kept: Recent, make: Callable[[], Any], *more):
+        """Return what `make()` returned for this version and `more`, if `kept` has it; else call it."""
+        return make() if self.attached else kept.of((self, *more), make)
+
 
 def _is_large(value) -> bool:
-    """Whether `value` is a tensor, or an array of numbers whose width is not known beforehand."""
-    return dr.is_tensor_v(value) or (dr.is_array_v(value) and dr.is_dynamic_v(value) and dr.depth_v(value) == 1)
+    """Whether `value` is a tensor or an array of many numbers."""
+    return dr.is_tensor_v(value) or (dr.is_array_v(value) and dr.depth_v(value) == 1 and dr.width(value) > 1)
 
 
 def _identity(value) -> tuple | bytes:
     if not _is_large(value):
         return np.array(dr.detach(getattr(value, "matrix", value))).tobytes()
     array = value.array if dr.is_tensor_v(value) else value
-    return dr.shape(value), array.index, array.index_ad
+    return dr.shape(value), array.index

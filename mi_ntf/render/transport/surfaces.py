@@ -1,5 +1,7 @@
 """Ordinary shapes around the fields: what hides them, what shades them, and how they reflect the scene's light."""
 
+from weakref import WeakKeyDictionary
+
 import drjit as dr
 import mitsuba as mi
 
@@ -8,7 +10,7 @@ from ..lights.emitter_samples import sharp
 from ..lights.recent import Recent, Version
 from ..scene.media import shape_groups, transmits
 
-_scenes = Recent(2)
+_scenes: WeakKeyDictionary = WeakKeyDictionary()
 
 
 class Surfaces:
@@ -27,9 +29,9 @@ class Surfaces:
         environment.check_unscaled(scene.environment())
         self.scene, self.transmittance = scene, transmittance
         groups = shape_groups(scene)
-        self._all = _scene_of(groups + shapes)
+        self._all = _scene_of(groups + shapes, scene.integrator())
         seen = [s for s in shapes if not (hide_emitters and s.is_emitter())]
-        self._seen = self._all if len(seen) == len(shapes) else _scene_of(groups + seen)
+        self._seen = self._all if len(seen) == len(shapes) else _scene_of(groups + seen, scene.integrator())
         self.transmitting = transmits(groups + shapes)
         self.shining = any(s.is_emitter() for s in seen)
         deltas = (mi.has_flag(e.flags(), mi.EmitterFlags.Delta) for e in scene.emitters())
@@ -107,10 +109,16 @@ class Surfaces:
         return dr.select(active, value * self.transmittance(ray.o, ray.d, si.t, active), 0)
 
 
-def _scene_of(shapes: list):
+def _scene_of(shapes: list, integrator):
     """Return a scene of these very shapes alone, for the rays' intersections: the last one as long as no shape has
-    changed, since its acceleration structure takes longer than a small picture (a million triangles: 1.7 s)."""
-    return _scenes.of(Version(*shapes, owners=mi.Shape), lambda: _built(shapes))
+    changed, since its acceleration structure takes longer than a small picture (a million triangles: 1.7 s). It lives
+    as long as `integrator`, that of the shapes' scene; Mitsuba's own cannot say when they end, so nothing is kept."""
+    try:
+        kept = _scenes.setdefault(integrator, Recent(2))
+    except TypeError:
+        return _built(shapes)
+    # What is kept holds the shapes, so no others get their addresses.
+    return kept.of((*(s.ptr for s in shapes), Version(*shapes, owners=mi.Shape)), lambda: _built(shapes))
 
 
 def _built(shapes: list):
