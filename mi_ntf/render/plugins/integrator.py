@@ -70,9 +70,10 @@ def integrator_class() -> type:
 
         Any number of ``nrf`` media, which may overlap, and ordinary shapes with any BSDF: all hide, shade and, from
         `max_depth` 3 on, light each other. Where media overlap, densities add; stock ``volpath`` knows one medium at a
-        time and is no reference there. Shadow rays of surfaces are marched where `visibility` is a method of maps or
-        volumes. With ``none`` fields cast no shadows and receive none, and light that one scatters meets no field
-        again.
+        time and is no reference there. Light crosses surfaces whose BSDF has a null component (``null``, ``mask``,
+        ``thindielectric``), as under ``volpath``. Shadow rays of surfaces are marched where `visibility` is a method of
+        maps or volumes. With ``none`` fields cast no shadows and receive none, and light that one scatters meets no
+        field again.
 
         The image can be differentiated by the lights: power, an environment's texels, and, of at most 32 lights in the
         scene, position and direction, whose shadows are then marched whatever the method; and by the reflectance of
