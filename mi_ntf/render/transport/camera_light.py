@@ -77,6 +77,8 @@ class _CameraLight:
         """Add what the rays that cross surfaces meet behind them: ``(radiance, opacity)`` of all rays."""
         pixel = paths.pixel
         quadrature = tuple(dr.gather(mi.Float, a, pixel) for a in (self.offset, self.depth))
+        # Now, so that rays behind any number of surfaces are traced by the same kernels.
+        dr.eval(quadrature, paths.ray, paths.weight, paths.way, pixel, radiance, opacity, transmittance)
         sums = self.sums and self.sums.of_rays(dr.width(pixel))
         one: Any = dr.opaque(mi.UInt32, 1)
         stream = mi.sample_tea_32(self.stream, one)[0]
