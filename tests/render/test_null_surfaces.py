@@ -1,9 +1,12 @@
 """Surfaces that let light through: in front of lights, of fields and of the camera, against stock ``volpath``."""
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import scenes, ztest
+
+from mi_ntf.core.errors import MiNtfError
 
 SEEDS = 4
 CENTER = np.array(scenes.SIMILARITY.center)
@@ -107,3 +110,16 @@ def test_runs_of_lights_behind_a_pane(blobs):
         return [scenes.render(loaded, seed) for seed in range(SEEDS)]
 
     ztest.check(pictures(1024.0), pictures(0.05), "runs of lights", block=4)
+
+
+def test_places_of_lights_have_no_derivatives_through_surfaces(blobs):
+    """The slope of a mask's own opacity would be missing."""
+    scene = scenes.scene(blobs, scenes.nrf(), {"light": scenes.light("point")}, size=4, spp=1,
+                         shapes={"leaf": sheet(TO_LIGHT, 1.2, LEAF)})
+    parameters = mi.traverse(scene)
+    place = mi.Point3f(parameters["light.position"])
+    dr.enable_grad(place)
+    parameters["light.position"] = place
+    parameters.update()
+    with pytest.raises(MiNtfError, match=r"gradients by light\.position: not supported beside surfaces that let light"):
+        scene.integrator().render(scene)

@@ -4,6 +4,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ...core.errors import MiNtfError
+from .media import ordinary_shapes, shape_groups, transmits
 
 POWERS = {
     "PointLight": ("intensity",),
@@ -32,6 +33,10 @@ def check(scene, light) -> bool:
                 "radiance, texture of a spot, data and scale of an envmap), the reflectance of diffuse BSDFs and, of "
                 "lights that are not drawn at random, the position of a point and the to_world of a spot or directional"
             )
+        place = key.rpartition(".")[2] in ("position", "to_world")
+        if place and transmits(shape_groups(scene) + ordinary_shapes(scene)):
+            raise MiNtfError(f"gradients by {key}: not supported beside surfaces that let light through (null, mask, "
+                             "thindielectric), whose own slopes would be missing; detach it or take these surfaces out")
     return bool(attached)
 
 

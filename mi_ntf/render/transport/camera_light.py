@@ -183,7 +183,7 @@ class _CameraLight:
         met: Any = dr.compress(self.hit.is_valid())
         if not dr.width(met) or not (lit or surfaces.shining or surfaces.transmitting):
             return []
-        paths = replace(camera.take(met), rng=self._random(met + dr.width(camera.pixel)))
+        paths = replace(camera.take(met), rng=self._random(met + dr.opaque(mi.UInt32, dr.width(camera.pixel))))
         hit = dr.gather(type(self.hit), self.hit, met)
         si = hit.compute_surface_interaction(mi.Ray3f(paths.ray))
         if surfaces.shining and self.first_run:

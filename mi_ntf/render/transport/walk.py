@@ -53,7 +53,7 @@ def join(parts: list[Paths]) -> Paths:
     whole = next(p for p in parts if dr.width(p.pixel)).take(dr.zeros(mi.UInt32, ends[-1]))
     for paths, end in zip(parts, ends, strict=True):
         count = dr.width(paths.pixel)
-        whole.put(paths, dr.arange(mi.UInt32, count) + (end - count))
+        whole.put(paths, dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, end - count))
     return whole
 
 
