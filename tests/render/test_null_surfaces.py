@@ -123,3 +123,15 @@ def test_places_of_lights_have_no_derivatives_through_surfaces(blobs):
     parameters.update()
     with pytest.raises(MiNtfError, match=r"gradients by light\.position: not supported beside surfaces that let light"):
         scene.integrator().render(scene)
+
+
+def test_no_kernel_depends_on_how_many_rays_cross(blobs):
+    """Another seed, and so other numbers of rays behind each of four masks: every kernel comes from the cache."""
+    sheets = {str(i): sheet((1 - 0.1 * i) * np.array(TO_CAMERA), 0.9, {**LEAF, "opacity": 0.3}) for i in range(4)}
+    lights = {"light": scenes.light("point")}
+    scene = scenes.scene(blobs, scenes.nrf(samples=64), lights, size=16, spp=16, shapes=sheets)
+    scenes.render(scene, 0)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        scenes.render(scene, 1)
+        assert all(kernel["cache_hit"] for kernel in dr.kernel_history([dr.KernelType.JIT]))

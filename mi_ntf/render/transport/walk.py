@@ -81,7 +81,8 @@ class Walk:
     def add(self, paths: Paths, light) -> None:
         """Add `light` times the paths' weights to their pixels."""
         for total, value in zip(self.total, paths.weight * light, strict=True):
-            dr.scatter_reduce(dr.ReduceOp.Add, total, value, paths.pixel)
+            # By default Dr.Jit sums copies for each thread, and the number of pixels would be part of the kernel.
+            dr.scatter_reduce(dr.ReduceOp.Add, total, value, paths.pixel, mode=dr.ReduceMode.Direct)
 
     def _flight(self, paths: Paths, depth: int, last: bool) -> tuple[Paths, Paths | None]:
         """Follow paths to their next vertices, in fields or on surfaces, and add the light there. Return those that
