@@ -571,13 +571,13 @@ def _report(result: Any, as_json: bool, print_table: Any) -> None:
 
 
 def _print_training(report: dict[str, Any]) -> None:
-    """How long a training run took and how good the field is, of the report in the field's provenance."""
+    """Return the length of a training run and the quality of its field, from the report in the field's provenance."""
     wanted = ("steps_done", "seconds", "kept", "faults", "val", "test", "transmittance")
     _print_pairs({key: report[key] for key in wanted if report.get(key)})
 
 
 def _print_pairs(values: dict[str, Any], indent: str = "") -> None:
-    """One `key  value` a line; nested mappings indented."""
+    """Print a mapping, one `key  value` a line, nested mappings indented."""
     width = max((len(str(key)) for key in values), default=0)
     for key, value in values.items():
         if isinstance(value, dict):

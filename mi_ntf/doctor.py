@@ -54,7 +54,7 @@ print(".".join(map(str, dr.detail.cuda_version())))
 
 @dataclass(frozen=True)
 class Check:
-    """One finding. `needed`: rendering is impossible without it. `remedy`: empty if nothing is to be done."""
+    """Result of one check. `needed`: rendering is impossible without it. `remedy`: empty if nothing is to be done."""
 
     name: str
     ok: bool
@@ -64,7 +64,9 @@ class Check:
 
 
 def examine() -> dict[str, Any]:
-    """All findings as plain data: `ok` (every needed check passed), `version`, `checks` (list of Check fields)."""
+    """Run all checks and return the results as plain data.
+
+    Keys: `ok` (every needed check passed), `version`, `checks` (list of the fields of :class:`Check`)."""
     checks = [check_python(), check_cores(), *check_mitsuba(), check_llvm(), check_cuda()]
     checks += [check_bridge(), check_libpython()]
     checks += [check_extra(name) for name in EXTRAS]

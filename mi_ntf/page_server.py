@@ -26,7 +26,7 @@ def serve(label: str, host: str = "127.0.0.1", port: int = 8080):
         """viser offers whoever looks a public address, by way of a company's machines: not here."""
 
         def request_share_url(self, verbose: bool = True) -> None:
-            """None, whoever asks."""
+            """Disable the public share link of viser."""
 
     token = secrets.token_urlsafe(16)
     try:
@@ -44,8 +44,9 @@ def serve(label: str, host: str = "127.0.0.1", port: int = 8080):
 
 
 def _gate(token: str) -> Callable[[Any, Any], Any]:
-    """Function ``(connection, request)`` that returns the response of a refused request. From the path of others it
-    takes `token`, its first part."""
+    """Return a function ``(connection, request)`` that answers requests without `token` or of a foreign origin.
+
+    It returns their refusal. For all others it returns None and removes the token, the first part of their path."""
 
     def refuse(connection: Any, request: Any) -> Any:
         origin = request.headers.get("Origin")
@@ -62,8 +63,9 @@ def _gate(token: str) -> Callable[[Any, Any], Any]:
 
 @contextmanager
 def _requests_pass(refuse: Callable[[Any, Any], Any]) -> Iterator[list]:
-    """Within, servers that are started by the package websockets ask `refuse` first; the list that is given holds an
-    entry for each. viser starts its own by it and has no option for the purpose."""
+    """Let `refuse` see each request to servers that the package websockets starts within the context.
+
+    The context's value is a list with an entry for each such server. viser has no option for this purpose."""
     from websockets.asyncio import server
 
     serve: Any = server.serve

@@ -83,7 +83,7 @@ def changes(node):
 
 
 def candidates(path: Path) -> list[dict]:
-    """All mutants of a module: place, kind, text before and after."""
+    """Return all mutants of a module: place, kind, text before and after."""
     source, found = path.read_text(), []
     lines = source.splitlines()
 
@@ -177,7 +177,7 @@ def place(mutant: dict) -> tuple:
 
 
 def table(done: list[dict], classes: dict) -> str:
-    """All mutants, a line each, and how many there are of each status and class."""
+    """Print all mutants, a line each, and the number of each status and class."""
     for m in done:
         m["class"] = "" if m["status"] == "killed" else classes.get(name(m), "not classified")
     lines = [f"{m['status']:8} {m['class']:14} {m['seconds']:4} s  {m['kind']:10} {name(m)}" for m in done]

@@ -1,4 +1,4 @@
-"""What a data set leaves open and its files decide, settled once for all photographs, with a sentence for each.
+"""Assumptions about a data set that its files decide, made once for all photographs, with a sentence for each.
 
     lights    a split whose frames all lack what the training split's have is left out
     names     a photograph may have another extension than the data set says (`file_names`)
@@ -16,15 +16,15 @@ from mi_ntf.data.file_names import SUFFIXES
 from mi_ntf.data.schema import View
 
 PREFIX = "assumed: "
-"""Begins every sentence on an assumption that `load_dataset` says."""
+"""Beginning of each sentence by which `load_dataset` tells an assumption."""
 UNSCALED = (0.9, 1.1)
-"""Factors between these are no scaled copies: such photographs were cropped, or are others."""
+"""Photographs whose size differs by a factor between these bounds count as cropped or foreign, not as scaled copies."""
 
 Views = dict[str, list[View]]
 
 
 class Assumed:
-    """What was assumed of photographs: each sentence once, with how many it holds for."""
+    """Assumptions about photographs: each sentence once, with the number of photographs that it holds for."""
 
     def __init__(self):
         self._found: dict[str, list[Path]] = {}
@@ -59,7 +59,7 @@ def settle(views: Views) -> tuple[Views, list[str]]:
 
 
 def _lights(views: Views) -> tuple[Views, list[str]]:
-    """`views` without the splits that say nothing of the lights which all frames for training have."""
+    """Remove the splits without light entries, if all frames for training have these entries."""
     kept, notes = dict(views), []
     for key, name in (("light_pos", "pl_pos"), ("light_intensity", "pl_intensity")):
         if any(getattr(view, key) is None for view in views["train"]):
@@ -72,12 +72,12 @@ def _lights(views: Views) -> tuple[Views, list[str]]:
 
 
 def _scaled(views: Views) -> tuple[Views, list[str]]:
-    """`views` whose cameras are scaled to the photographs, if all of these are copies scaled by one factor."""
+    """Scale the cameras to the photographs, if all photographs are copies scaled by one factor."""
     sized = [view for view in every(views) if view.size is not None and not view.rescaled]
     if not sized or _size(sized[0]) in (None, sized[0].size):
         return views, []
     sizes = [size for view in sized if (size := _size(view))]
-    if len(sizes) < len(sized):  # told when it is read
+    if len(sizes) < len(sized):  # reading it raises the error
         return views, []
     old, new = (np.array(s, np.float64) for s in ([view.size for view in sized], sizes))
     factor = float(np.median(np.sqrt(new.prod(1) / old.prod(1))))
@@ -95,5 +95,5 @@ def _size(view: View) -> tuple[int, int] | None:
 
 
 def said(sentences: Iterable[str]) -> list[str]:
-    """The sentences among all that were said which tell of an assumption."""
+    """Return those of the `sentences` that tell an assumption."""
     return [sentence for sentence in sentences if sentence.startswith(PREFIX)]

@@ -162,7 +162,7 @@ def _plan(counts: dict[str, int], center: np.ndarray, radius: float, offset: np.
 
 @dataclass(frozen=True)
 class Request:
-    """What :func:`capture` was asked for. `variant`: Mitsuba's; `object`: the fingerprint of what is photographed."""
+    """Settings of :func:`capture`. `variant`: Mitsuba's; `object`: the fingerprint of what is photographed."""
 
     scene: Path
     out: Path

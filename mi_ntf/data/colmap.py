@@ -47,7 +47,8 @@ def _largest(folder: Path) -> tuple[Path, list[str]]:
 
 
 def read(folder: Path) -> Found:
-    """All posed photographs of the folder's model as one split, `train`, by name, and its points. Raises MiNtfError."""
+    """Read all posed photographs of the folder's model as one split, `train`, by name, and its points. Raises
+    MiNtfError."""
     model, assumed = _largest(folder)
     cameras, images, points, noted = colmap_files.read(model)
     root = next((p for p in (folder, folder / "colmap", *list(folder.absolute().parents)[:3]) if (p / "images").is_dir()

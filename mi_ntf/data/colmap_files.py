@@ -66,13 +66,13 @@ def read(folder: Path) -> Model:
 
 
 def count(folder: Path) -> int:
-    """How many images the model in `folder` has. Raises MiNtfError."""
+    """Return the number of images of the model in `folder`. Raises MiNtfError."""
     form = suffix(folder)
     return len(_whole(folder / f"images{form}", _images_bin if form == ".bin" else _images_txt, []))
 
 
 def _whole(path: Path, reader, assumed: list[str]):
-    """What `reader` makes of the file; what is assumed of its text is added to `assumed`."""
+    """Read the file by `reader`; assumptions about its text are added to `assumed`."""
     try:
         if path.suffix == ".bin":
             return reader(path.read_bytes())
@@ -138,7 +138,7 @@ def _cameras_txt(text: str) -> dict[int, Camera]:
 
 
 def _images_txt(text: str) -> list[Image]:
-    """Every image's line. The line of its points that follows may be empty, or missing, as some programs leave it."""
+    """Read the line of each image. The line of points after it may be empty or missing, as some programs leave it."""
     images, points_may_follow = [], False
     for line in text.split("\n"):
         if points_may_follow and _is_points(line):
@@ -151,7 +151,7 @@ def _images_txt(text: str) -> list[Image]:
 
 
 def _is_points(line: str) -> bool:
-    """Whether the line is empty or consists of triples of numbers: x, y, number of the point.
+    """Return True if the line is empty or consists of triples of numbers: x, y, number of the point.
 
     The line of an image does not: its tenth word is a name.
     """

@@ -48,7 +48,7 @@ def to_srgb(image, path: Path):
 
 
 def check_linear(profile: bytes, path: Path) -> None:
-    """Raise MiNtfError if numbers in the ICC `profile` are no linear light in Rec. 709."""
+    """Raise MiNtfError unless the ICC `profile` is that of linear light with the primaries of Rec. 709."""
     from PIL import ImageCms
 
     lattice = _lattice(16)
@@ -70,7 +70,7 @@ def _lattice(step: int):
 
 
 def _transform(profile: bytes, grey: bool, path: Path):
-    """``(transform to sRGB, the profile's name, whether it changes nothing)``; `grey`: of a grey image."""
+    """Return ``(transform to sRGB, the profile's name, True if it changes nothing)``; `grey`: the image is grey."""
     from PIL import ImageCms
 
     try:

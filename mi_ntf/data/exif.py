@@ -1,4 +1,4 @@
-"""What the heads of image files say: size, alpha, Exif orientation; and pixels turned by the last.
+"""Headers of image files (size, alpha, Exif orientation), and pixels turned by their orientation.
 
 Sizes and pixels are those that are stored. Pillow turns TIFF as it loads them, and no other files: they are refused.
 """
@@ -17,7 +17,7 @@ UNDONE = (0, 1, 2, 3, 4, 5, 8, 7, 6)
 
 
 class Head(NamedTuple):
-    """What the head of an image file says."""
+    """Header of an image file."""
 
     orientation: int
     size: tuple[int, int]
@@ -34,7 +34,7 @@ def turned(pixels: np.ndarray, orientation: int) -> np.ndarray:
 
 
 def head(path: Path) -> Head | None:
-    """What the head of the file says, None where Pillow cannot read it."""
+    """Read the header of the file; None where Pillow cannot read it."""
     from PIL import Image
 
     try:
@@ -42,7 +42,7 @@ def head(path: Path) -> Head | None:
             tags = getattr(image, "tag_v2", {}) if image.format == "TIFF" else {}
             size = (tags[WIDTH], tags[LENGTH]) if tags else image.size
             return Head(_orientation(image), size, "A" in image.getbands() or "transparency" in image.info)
-    except Exception:  # told when it is read
+    except Exception:  # reading the pixels raises the error
         return None
 
 

@@ -11,11 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from mi_ntf.core.errors import MiNtfError, shown
+from mi_ntf.data.colour import PRIMARIES
 
 PICTURES = ("combined", "beauty", "rgba")
 """Last part of the names of layers that hold the rendered picture, in lower case."""
-PRIMARIES = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06)
-"""x and y of red, green and blue of Rec. 709."""
 LARGEST = 1 << 16
 """Pixels of a display window's side."""
 

@@ -14,7 +14,7 @@ MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 
 
 def is_file_name(name: object) -> bool:
-    """Whether `name` is text that a file could be called by and that one line can show, in any folder."""
+    """Return True if `name` could be the name of a file and can be shown in one line."""
     if not isinstance(name, str) or not name.isprintable():  # half a character is not printable either
         return False
     parts = [len(part.encode()) for part in name.split("/")]
@@ -57,8 +57,10 @@ def first(places: Iterable[Path]) -> Path | None:
 
 
 def mask_places(masks: Path, name: str) -> list[Path]:
-    """Where in the folder `masks` the mask of photograph `name` may lie: the same name as PNG, as COLMAP writes it
-    (name.jpg.png), or with another suffix. A leading folder `images` (`images_4`) is left out."""
+    """Return the possible paths of the mask of photograph `name` in the folder `masks`.
+
+    A mask has the photograph's name as a PNG file, the name that COLMAP writes (name.jpg.png), or another suffix. A
+    leading folder `images` (`images_4`) is left out."""
     relative = Path(name)
     if relative.is_absolute() or not relative.name:
         return []

@@ -93,8 +93,8 @@ def _zoomed(camera: Camera, factor: float) -> Camera:
 
 
 def _filled(camera: Camera, pinhole: Camera, size: tuple[int, int]) -> bool:
-    """Whether every pixel of the pinhole's picture of `size` comes from one place of the photograph, and no two from
-    the same: looked at on a grid from the first pixels' centres to the last ones'."""
+    """Return True if every pixel of the pinhole's picture of `size` comes from one place of the photograph, and no
+    two from the same. It is tested on a grid from the first pixels' centres to the last ones'."""
     cells = 65
     x, y = _map(camera, pinhole, size, (cells, cells))
     if not (np.isfinite(x).all() and np.isfinite(y).all()):
@@ -108,7 +108,7 @@ def _filled(camera: Camera, pinhole: Camera, size: tuple[int, int]) -> bool:
 
 
 def _map(camera: Camera, pinhole: Camera, size: tuple[int, int], cells: tuple[int, int]):
-    """Where in the photograph, in OpenCV's pixels, `cells` (across, down) places of the pinhole's picture come from:
+    """Map `cells` (across, down) places of the pinhole's picture to the photograph, in OpenCV's pixels:
     places that spread evenly from the first to the last pixel's centre of `size` (width, height)."""
     cv2 = opencv("undoing the lens distortion")
     sx, sy = ((n - 1) / max(s - 1, 1) for n, s in zip(cells, size, strict=True))

@@ -20,7 +20,7 @@ FORM = "LLFF data set (poses_bounds.npy)"
 
 
 def read(folder: Path) -> Found:
-    """All photographs as one split, `train`. Raises MiNtfError."""
+    """Read all photographs as one split, `train`. Raises MiNtfError."""
     path, images = folder / "poses_bounds.npy", folder / "images"
     rows = _rows(path)
     if not images.is_dir():

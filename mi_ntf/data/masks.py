@@ -20,7 +20,7 @@ BRIGHT = 0.75
 LABELS, COLOURS = 16, 256
 """Levels, and colours, of a mask of labels at most."""
 BLACK = 16
-"""Brightest channel of a coloured mask's black, and unlikeness of the channels that passes for grey: JPEG's noise."""
+"""Levels of noise that JPEG may add: up to this level a channel counts as black, and channels this close as grey."""
 
 
 def read(path: Path) -> tuple[np.ndarray, str | None]:
@@ -57,7 +57,7 @@ def _decoded(image, path: Path) -> tuple[np.ndarray, str | None]:
 
 
 def _coloured(image, pixels: np.ndarray, path: Path) -> tuple[np.ndarray, str]:
-    """Labels of a coloured mask."""
+    """Return the object's share of each pixel of a coloured mask of labels, 0 or 255."""
     shows = pixels.max(-1) > BLACK
     if image.getcolors(COLOURS) is None or shows.all():
         fault = "nothing in it is black" if shows.all() else f"it has more than {COLOURS} colours"
@@ -67,7 +67,7 @@ def _coloured(image, pixels: np.ndarray, path: Path) -> tuple[np.ndarray, str]:
 
 
 def _grey(levels: np.ndarray, white: int, path: Path) -> tuple[np.ndarray, str | None]:
-    """Shares, or labels, of the grey `levels` (H, W)."""
+    """Return the object's share of each pixel from the grey `levels` (H, W), read as shares or as labels."""
     there = np.flatnonzero(np.bincount(levels.ravel(), minlength=2))  # raises for negative ones
     brightest = int(there.max(initial=0))
     if brightest >= BRIGHT * white or (len(there) == 1 and brightest != 1):  # one level alone is a share

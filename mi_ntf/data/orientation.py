@@ -53,7 +53,7 @@ def _looked_at(view: View, told: Head, masked: bool) -> Turned:
 
 
 def _is_turned(size: tuple[int, int] | None, told: Head) -> bool | None:
-    """Whether (width, height) `size`, or a multiple of it, is that of the picture turned."""
+    """Return True if (width, height) `size`, or a multiple of it, is that of the turned picture."""
     if size is None or told.orientation < 5:
         return None
     width, height = told.size
@@ -62,7 +62,7 @@ def _is_turned(size: tuple[int, int] | None, told: Head) -> bool | None:
 
 
 def _common(votes: list[bool | None]) -> bool | None:
-    """What all say that say anything."""
+    """Return the value that all known entries share; None where they differ or nothing is known."""
     said = {vote for vote in votes if vote is not None}
     return said.pop() if len(said) == 1 else None
 

@@ -170,7 +170,7 @@ def _with_options(views: dict[str, list[View]], masks: Path | None, flash_offset
 
 
 def _summary(found: Found, folder: Path, size: int | None, background: str | None) -> str:
-    """What the data set is, in one line."""
+    """Describe the data set in one line."""
     every = [view for split in found.views.values() for view in split]
     pixels, told = images.size_of(every[0].image), ""
     if pixels is not None:

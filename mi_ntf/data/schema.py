@@ -34,7 +34,7 @@ SPLITS = ("train", "val", "test")
 
 @dataclass(frozen=True)
 class Frame:
-    """One photograph to be written: where the file is and where camera and light were (world units)."""
+    """Frame of a photograph to be written: its file, and the places of camera and light (world units)."""
 
     file: str
     c2w: np.ndarray
@@ -44,7 +44,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Transforms:
-    """What one `transforms_<split>.json` says; `angle_x` in radians, `center` and `radius` in world units."""
+    """Content of one `transforms_<split>.json`: `angle_x` in radians, `center` and `radius` in world units."""
 
     angle_x: float
     w: int
@@ -68,7 +68,7 @@ class Camera:
 
 @dataclass(frozen=True)
 class View:
-    """One photograph as a reader found it, pixels not yet read. `None`: the data set does not say."""
+    """Photograph as a reader found it, pixels not yet read. `None`: the data set does not say."""
 
     where: str
     """File and frame, for messages."""
@@ -99,7 +99,7 @@ class View:
 
 @dataclass(frozen=True)
 class Found:
-    """What a reader found in a folder, pixels not yet read. World units; `sphere` is (center (3,), radius)."""
+    """Data set that a reader found in a folder, pixels not yet read. World units; `sphere` is (center (3,), radius)."""
 
     form: str
     """What the data set is and where it lies, for messages."""

@@ -23,7 +23,7 @@ from mi_ntf.data.schema import SPLITS, Camera, Found, View
 
 
 def read(folder: Path) -> Found:
-    """Every split that `folder` has; `train` must be there. Raises MiNtfError."""
+    """Read every split that `folder` has; `train` must be there. Raises MiNtfError."""
     views, spheres, notes = {}, {}, []
     for split in SPLITS:
         path = folder / f"transforms_{split}.json"
@@ -43,7 +43,7 @@ def read(folder: Path) -> Found:
 
 
 def _dialect(views: list[View], sphere: tuple[np.ndarray, float] | None) -> str:
-    """What the data set is by what it says."""
+    """Return the name of the data set's form, judged by its entries."""
     if sphere is not None:
         return "photographs of `mi-ntf capture`"
     if any(isinstance(view.camera, Camera) or view.light_pos is not None for view in views):

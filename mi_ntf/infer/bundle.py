@@ -30,7 +30,7 @@ INSET = 0.001
 
 
 def clear_distance(grid, p, inverse_d):
-    """How far a ray from `p` runs before it leaves the empty cube around `p`; 0 in an occupied cell.
+    """Return the distance that a ray from `p` runs within the empty cube around `p`; 0 in an occupied cell.
 
     `inverse_d`: componentwise 1/direction (finite). In field units.
     """
@@ -180,7 +180,7 @@ class Bundle:
         return tuple(a + along * b for a, b in zip(s.o, s.d, strict=True))
 
     def clear(self, t) -> list:
-        """How far the ray is clear of each field's matter from `t` on, 0 in an occupied cell."""
+        """Return the distance from `t` on that the ray is clear of each field's matter; 0 in an occupied cell."""
         skips = []
         for i, (s, inverse, (begin, end)) in enumerate(zip(self.strands, self.inverse, self.intervals, strict=True)):
             skip = clear_distance(s.grid, self.point(i, t), inverse)
@@ -240,7 +240,7 @@ class Cell:
         return sum(totals[1:], totals[0]) * self.part
 
     def place(self, depth):
-        """Where the optical depth from the cell's begin on is `depth`."""
+        """Return the place at which the optical depth, counted from the beginning of the cell, is `depth`."""
         t, passed = self.begin, 0
         for sigma, bend in zip(self.totals, self.bends, strict=True):
             share = dr.clip((depth - passed) * dr.rcp(dr.maximum(sigma * self.part, 1e-6)), 0, 1)

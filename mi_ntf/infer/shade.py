@@ -76,7 +76,7 @@ def _tau(visibility, x, wi, distance, index, lit, fixed: bool):
 
 
 def _lobes(wi, points, skin: bool, specular: bool):
-    """Whether the light shines on the normal's side; the diffuse lobe, to be multiplied by the albedo, and the specular
+    """Return a mask of light on the normal's side, the diffuse lobe, to be multiplied by the albedo, and the specular
     one (None without), each with its weight, which may be 0."""
     if not specular:
         cos = dr.maximum(dot(points.normal, wi), 0)
@@ -92,7 +92,7 @@ def _lobes(wi, points, skin: bool, specular: bool):
 
 
 class Reflectance(NamedTuple):
-    """What field points reflect: ranges as in :mod:`mi_ntf.core.microfacet`, softness as in :mod:`mi_ntf.core.skin`.
+    """Reflectance of field points: ranges as in :mod:`mi_ntf.core.microfacet`, softness as in :mod:`mi_ntf.core.skin`.
     `fresnel`: whether the specular weight is that at normal incidence alone."""
 
     normal: tuple

@@ -124,7 +124,7 @@ class _Job:
         return found
 
     def lost(self) -> Answer:
-        """That of the task which it was at when it ended."""
+        """Return the error of the task that the job was working on when it ended."""
         index = next(iter(self.share))
         del self.share[index]
         said = ""

@@ -1,4 +1,6 @@
-"""What runs in a worker: its set-up, once, and tasks one after the other. Nothing heavy is imported before the set-up.
+"""Code that runs in a worker: its set-up, once, and tasks one after the other.
+
+Nothing heavy is imported before the set-up.
 """
 
 import importlib.util
@@ -23,7 +25,7 @@ THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"
 
 @dataclass(frozen=True)
 class Setup:
-    """Of a worker. `threads`: None leaves them as they are; `gpu`: CUDA_VISIBLE_DEVICES, None leaves it."""
+    """Set-up of a worker. `threads`: None leaves them as they are; `gpu`: CUDA_VISIBLE_DEVICES, None leaves it."""
 
     threads: int | None = None
     gpu: str | None = None
@@ -36,7 +38,7 @@ class Setup:
 
 @dataclass(frozen=True)
 class Answer:
-    """What became of one attempt at task `index`: `value`, pickled, or `error`, a sentence that is not empty. `where`:
+    """Outcome of one attempt at task `index`: `value`, pickled, or `error`, a sentence that is not empty. `where`:
     who tried; `lost`: the worker ended; `last`: another attempt is of no use."""
 
     index: int

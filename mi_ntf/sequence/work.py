@@ -1,4 +1,4 @@
-"""One frame: what renders it, in this process or another.
+"""Rendering of one frame, in this process or another.
 
 :func:`render` takes one :class:`Task`, which can be pickled, and writes one file. What frames have in common, fields,
 maps, light between patches, kernels, stays in the process for the next; what only the last frame but one used does not.
@@ -142,7 +142,7 @@ def _for_many(state, count: int):
 
 
 def _precision(state) -> type:
-    """Of the film's numbers, which only its file has: ``component_format`` of the first one."""
+    """Return the ``component_format`` of the film, which only its file holds."""
     films = [node.props for node in state.nodes if node.type == mi.ObjectType.Film]
     name = films[0].get("component_format", "float16") if films else ""
     return np.float16 if str(name).lower() == "float16" else np.float32

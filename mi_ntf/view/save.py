@@ -146,5 +146,5 @@ def _matrix(value: np.ndarray) -> ET.Element:
 
 
 def _text(value: float) -> str:
-    """As many digits as float32 has."""
+    """Format a number with the digits of a float32."""
     return f"{float(value):.9g}"

@@ -1,4 +1,4 @@
-"""What a visibility method is to the rest of the renderer: how it is built, what it serves, what it costs.
+"""Interface of a visibility method: its construction, the lights that it serves, its cost.
 
 Every method's file ends with its own :class:`Method`; :data:`mi_ntf.infer.visibility.REGISTRY` lists them.
 """

@@ -254,9 +254,11 @@ def radiance(emitter, towards: np.ndarray) -> np.ndarray:
 
 
 def drawable(emitter):
-    """Return an emitter of the same light whose own sampling finds all of it: `emitter` itself, or a copy of an
-    ``envmap`` whose `mis_compensation` leaves the light below its mean to BSDF samples (Karlík et al. 2019), which
-    points of fields do not draw."""
+    """Return an emitter of the same light whose own sampling finds all of it.
+
+    It is `emitter` itself, unless that is an ``envmap`` with `mis_compensation` (Karlík et al. 2019): this one never
+    samples the light below its mean, which is left to BSDF samples. Points of fields have emitter samples alone, so a
+    copy without `mis_compensation` is returned."""
     if emitter.class_name() != "EnvironmentMapEmitter":
         return emitter
     copy = Version(emitter).once(_copies, lambda: _uncompensated(emitter) if _is_compensated(emitter) else None)
@@ -264,11 +266,14 @@ def drawable(emitter):
 
 
 PROBES = 64
-"""Rows and columns of an environment, at most, that tell how it is sampled."""
+"""Rows and columns of an environment, at most, at which its sampling density is looked up."""
 
 
 def _is_compensated(emitter) -> bool:
-    """Whether the density of an ``envmap`` is not in proportion to its luminance, at the centres of texels."""
+    """Return True if the sampling density of an ``envmap`` is not in proportion to its luminance.
+
+    At the centres of texels it is, to rounding, unless `mis_compensation` has subtracted the mean luminance. The
+    density is then 0 wherever the luminance is below the mean, so any threshold between 0 and 1 separates the two."""
     height, width = mi.traverse(emitter)["data"].shape[:2]
     row, column = (np.unique(np.linspace(a, n - 1 - a, PROBES).astype(int)) for a, n in ((1, height), (0, width - 2)))
     theta, phi = np.meshgrid(row * np.pi / (height - 1), (column + 0.5) * 2 * np.pi / (width - 2), indexing="ij")
@@ -280,10 +285,11 @@ def _is_compensated(emitter) -> bool:
     density = np.array(emitter.pdf_direction(dr.zeros(mi.Interaction3f, len(towards)), ds), np.float64)
     lit = luminance > 1e-3 * luminance.max()
     ratio = density[lit] / luminance[lit]
-    return bool(lit.any() and ratio.min() < 0.9 * ratio.max())
+    return bool(lit.any() and ratio.min() < 0.5 * ratio.max())
 
 
 def _uncompensated(emitter):
+    """Return an ``envmap`` of the same parameters, without `mis_compensation`."""
     copy = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(np.ones((2, 2, 3), np.float32))})
     ours, theirs = mi.traverse(copy), mi.traverse(emitter)
     for key in ("data", "scale", "to_world"):
@@ -300,7 +306,7 @@ def seen(emitter, d):
 
 
 def scale(emitter) -> float:
-    """That of an environment's `to_world`: Mitsuba leaves it in the directions that it looks up and samples."""
+    """Return the scale of an environment's `to_world`, which Mitsuba leaves in the directions that it looks up."""
     return placement(emitter, "envmap")[1] if emitter.class_name() == "EnvironmentMapEmitter" else 1.0
 
 
@@ -334,5 +340,5 @@ def placement(emitter, kind: str) -> tuple[np.ndarray, float]:
 
 
 def name(emitter, kind: str) -> str:
-    """How errors call an emitter."""
+    """Display name used in error messages."""
     return f"{kind} emitter ({emitter.id()})" if emitter.id() else f"{kind} emitter"

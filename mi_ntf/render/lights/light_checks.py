@@ -1,4 +1,4 @@
-"""What emitters must not be: of a kind that cannot be drawn, or with numbers that no picture can come of."""
+"""Checks of emitters: kinds that cannot be sampled, and non-finite or negative values, are refused."""
 
 import drjit as dr
 import mitsuba as mi
@@ -20,13 +20,14 @@ def check(emitter, kind: str, drawn: bool = False) -> None:
             f"{called}: Mitsuba cannot sample timed_sunsky in a loop over shading points; use sunsky at one moment, or "
             "an envmap of the average over several"
         )
-    if kind == "envmap":  # whose texels take long to read
+    if kind == "envmap":  # its texels take long to read
         Version(emitter).once(_checked, lambda: _check(emitter, kind, drawn), drawn)
     else:
         _check(emitter, kind, drawn)
 
 
 def _check(emitter, kind: str, drawn: bool) -> None:
+    """Raise MiNtfError if a parameter has values that :func:`check` refuses."""
     called = name(emitter, kind)
     for key, value in mi.traverse(emitter):
         numbers = _numbers(value)

@@ -46,13 +46,13 @@ class Rows:
         return np.where(self.is_point, light / np.maximum(squares, 1e-12), light)
 
     def part(self, kept: np.ndarray) -> "Rows":
-        """Those lights alone for which `kept` (n,) holds."""
+        """Return the lights for which the mask `kept` (n,) is True."""
         cones = None if self.cones is None else self.cones[kept]
         return Rows(self.where[kept], self.power[kept], self.is_point[kept], cones)
 
 
 def join(parts: list[Rows], dark: bool = False) -> Rows:
-    """All of them, in order, without those that have no power unless `dark`."""
+    """Return the rows of all `parts` in order, without those of zero power unless `dark`."""
     if not parts:
         return Rows(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, bool))
     where, power, is_point = (

@@ -11,14 +11,14 @@ KEPT = 8
 
 
 class Recent(dict):
-    """The `kept` results that were asked for last, by what they were made of."""
+    """Cache of the `kept` results that were asked for last, by their inputs."""
 
     def __init__(self, kept: int = KEPT):
         super().__init__()
         self._kept = kept
 
     def of(self, key, make: Callable[[], Any]):
-        """Return that of `key`, from `make()` if it is not kept."""
+        """Return the result of `key`; it is `make()` if none is kept."""
         found = self.pop(key) if key in self else make()
         while len(self) >= self._kept:
             del self[next(iter(self))]
@@ -30,10 +30,13 @@ class Version:
     """The parameters of Mitsuba objects at one moment, as a key: equal to another while none has been assigned a new
     value.
 
-    Arrays are compared by their Dr.Jit variables, not by their contents: a map of 4096 × 2048 texels takes 0.4 s to
-    read. They are kept, so that no other variable gets the same index meanwhile. The objects are not kept, and nothing
-    that carries gradients (`attached`: a parameter does), which would outlive its scene. `owners`: the type of the
-    objects, they themselves and those in them, whose parameters count."""
+    Arrays are compared by their Dr.Jit variables, since reading all texels of a large map takes long. A copy of each
+    array is kept, so that no other variable gets its index meanwhile. Neither the objects nor anything that carries
+    gradients is kept, since these would outlive their scene.
+
+    owners    type of the objects, given or nested, whose parameters count
+    attached  whether a parameter carries gradients
+    """
 
     def __init__(self, *objects, owners: type = object):
         values = [value for parameters in map(mi.traverse, objects) for name, value in parameters
@@ -50,12 +53,12 @@ class Version:
         return hash(self._key)
 
     def once(self, kept: Recent, make: Callable[[], Any], *more):
-        """Return what `make()` returned for this version and `more`, if `kept` has it; else call it."""
+        """Return the result in `kept` for this version and the inputs `more`; it is `make()` if there is none."""
         return make() if self.attached else kept.of((self, *more), make)
 
 
 def _is_large(value) -> bool:
-    """Whether `value` is a tensor or an array of many numbers."""
+    """Return True if `value` is a tensor or an array of more than one number."""
     return dr.is_tensor_v(value) or (dr.is_array_v(value) and dr.depth_v(value) == 1 and dr.width(value) > 1)
 
 

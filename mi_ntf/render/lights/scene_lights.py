@@ -79,12 +79,12 @@ class Lights:
         self.rows = every.part(self._bright(dimmest)) if dimmest else every
         pairs = [(e, w) for e, w in zip(emitters, outer, strict=True) if light_samples or not is_discrete(e)]
         self.sampled = [_drawable(e, scene) for e, _ in pairs if _shines(e)]
-        # One of weight 0, which Mitsuba leaves to BSDF samples, shines as well: points of fields have emitter samples
-        # alone.
+        # Mitsuba leaves emitters of weight 0 to BSDF samples. Points of fields have emitter samples alone, so these
+        # emitters get a weight.
         self._weights = [w.sampling_weight() or 1.0 for e, w in pairs if _shines(e)]
 
     def _bright(self, dimmest: float) -> np.ndarray:
-        """Which of all rows remain."""
+        """Mask of the rows that remain without the dimmest ones."""
         order = np.argsort(self._strength)
         sums = np.empty(len(order))
         sums[order] = np.cumsum(self._strength[order])
@@ -100,11 +100,11 @@ class Lights:
         return found
 
     def brighter(self, dimmest: float) -> int:
-        """How many rows there are without the dimmest."""
+        """Number of rows without the dimmest ones."""
         return int(self._bright(dimmest).sum()) if dimmest else len(self._strength)
 
     def _unwrap(self, emitter, scene, media):
-        """What an ``ntf`` emitter wraps, where its medium is one of `media`; any other emitter itself."""
+        """Return the light that an ``ntf`` emitter wraps, if its medium is one of `media`; any other emitter itself."""
         bare, inner = emitter, emitter
         while hasattr(inner, "attached"):
             outer, inner = inner, inner.attached()
@@ -135,9 +135,11 @@ class Lights:
 
     def sources(self, table: LightTable, frame: Frame, points, seed, draws: int, resampled: int,
                 gradients: bool = False) -> list:
-        """What to sum over at `points` (in the coordinates of `frame`): pairs of a source, which has ``count`` and
-        ``sample``, and whether its index is a row of `table`, which is what maps are made for. `draws`: least number
-        of lights drawn; `resampled`: candidates of each; `gradients`: lights are attached (:class:`EmitterSamples`)."""
+        """Return the light sources to sum over at `points`, in the coordinates of `frame`.
+
+        They are pairs of a source, which has ``count`` and ``sample``, and a flag: its index is a row of `table`, which
+        maps are made for. `draws`: least number of lights drawn; `resampled`: candidates of each; `gradients`: lights
+        are attached (:class:`EmitterSamples`)."""
         result: list[tuple[Any, bool]] = [(table, True)] if table.count else []
         if self.sampled:
             drawn = EmitterSamples(self.sampled, self._weights, frame, points, seed, self.light_samples, draws,
@@ -152,8 +154,8 @@ def kind(emitter) -> str:
 
 
 def is_discrete(emitter) -> bool:
-    """Whether the light is a finite set of points and directions: a spot without texture; an environment by texels.
-    What hides behind an ``ntf`` emitter is not."""
+    """Return True if the light is a finite set of points and directions, such as a spot without texture or the cells of
+    an environment. A light inside an ``ntf`` emitter is not."""
     known = light_rows.KINDS.get(emitter.class_name())
     return bool(known and known.rows) and not _is_textured_spot(emitter)
 
@@ -163,8 +165,9 @@ def _is_textured_spot(emitter) -> bool:
 
 
 def _is_found(emitter) -> bool:
-    """False for a light of one point or direction whose `sampling_weight` is 0: no ray meets it, so the stock
-    integrators never see it."""
+    """Return False for a light of one point or direction whose `sampling_weight` is 0.
+
+    No ray can hit such a light, so the stock integrators never find it."""
     return emitter.sampling_weight() > 0 or not mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta)
 
 
@@ -188,7 +191,7 @@ def _shines(emitter) -> bool:
 
 
 def _same(medium, other) -> bool:
-    """One medium, or two of one field in one place."""
+    """Return True if both are one medium, or two media of one field in one place."""
     if medium is other:
         return True
     if medium is None or medium.path != other.path:

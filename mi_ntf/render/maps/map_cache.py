@@ -32,8 +32,8 @@ SEAL = hashlib.sha256().digest_size
 
 FULL = np.dtype("<f4")
 
-# Guards `_maps`, `_lights` and `_used`. Never held while a map is made: a thread that waits for its kernels may take up
-# the task of making another one.
+# Guards `_maps`, `_lights` and `_used`. It is not held while a map is made, since a thread that waits for the map's
+# kernels may execute a task that makes another map.
 _lock = threading.Lock()
 _maps: OrderedDict[str, Any] = OrderedDict()
 _lights: dict[str, list] = {}
@@ -79,7 +79,7 @@ def key(medium, table, options, width: int, step: float) -> str:
 
 
 def _facts(medium, options, width: int, step: float) -> tuple:
-    """What texels depend on besides the lights and the hull, which is the field's."""
+    """Return the inputs of the texels besides the lights and the hull, which is the field's."""
     return (
         _program(), _libraries(), medium.field.digest, medium.representation, medium.field.grid.resolution,
         options.step, step, options.map_resolution, options.map_source, options.map_components, width, mi.variant(),
@@ -180,7 +180,7 @@ def _make_room(limit: float) -> None:
 
 
 def _forget_gone() -> None:
-    """Drop what is known of maps that are no longer in memory; within the lock."""
+    """Drop the entries of maps that are no longer in memory. The caller holds the lock."""
     _used.intersection_update(_maps)
     for name in set(_lights) - set(_maps):
         del _lights[name]

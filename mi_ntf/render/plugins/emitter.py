@@ -106,7 +106,7 @@ def emitter_class() -> type:
             distance = mi.Float(dr.inf) if _is_far(self.inner) else ds.dist / frame.length
             x, d = frame.point_to_field(it.p), frame.direction_to_field(ds.d)
             sun = ds.pdf > SHARP  # never that of one light, whose map has the number 0
-            # Maps and networks stay where lights were.
+            # Maps and networks belong to the light's former place, so attached places are marched.
             method = self._march if dr.grad_enabled(x, d, distance) else self._method
             return outside.tau(method, x, d, distance, mi.UInt32(sun), active)
 
@@ -171,7 +171,7 @@ def _visibility(name: str, inner, medium):
 
 
 def _is_one(inner) -> bool:
-    """Whether a light shines from one point or direction."""
+    """Return True if a light shines from one point or direction."""
     return light_rows.kind(inner).single and scene_lights.is_discrete(inner)
 
 
@@ -185,7 +185,7 @@ def _attached_place(inner) -> str:
 
 
 def _is_far(emitter) -> bool:
-    """Whether its light comes from infinity: an environment or a directional light."""
+    """Return True for lights at infinity: environments and directional lights."""
     return bool(mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite))
 
 

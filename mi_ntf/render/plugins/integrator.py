@@ -127,7 +127,7 @@ def integrator_class() -> type:
                              '"aovs" (depth, normal, albedo, …)')
 
         def aov_names(self):
-            """Of the last render: a layer for each light is known from then on."""
+            """Return the names of the further channels of the last render, which tells the number of lights."""
             known = [name for name in self.aovs if name not in aovs.OF_LIGHTS or self.lights_seen]
             return aovs.channel_names(tuple(known), self.lights_seen)
 

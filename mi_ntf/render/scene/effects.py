@@ -1,4 +1,4 @@
-"""What a scene calls for: one look at it, a frozen description, and everything after it branches on that."""
+"""Effects that a scene calls for, as a frozen description that the later code branches on."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from ...core.errors import MiNtfError
 from ...infer.visibility import REGISTRY
 from ..cost import model
 from . import gradient_checks
-from .media import ordinary_shapes, shape_groups, transmits
+from .media import lets_light_through, ordinary_shapes
 from .settings import Settings
 
 PINHOLES = ("PerspectiveCamera",)
@@ -24,7 +24,7 @@ NEAR = 1e-3
 
 @dataclass(frozen=True)
 class Effects:
-    """What takes part in a render; what does not is neither traced into a kernel nor built.
+    """Effects of a render. An effect that is absent is neither traced into a kernel nor built.
 
     emitters    their kinds
     lit         a light has power, and `max_depth` lets it scatter
@@ -56,7 +56,7 @@ class Effects:
 
     @property
     def needs_visibility(self) -> bool:
-        """Whether a visibility method has to be built."""
+        """True if a visibility method has to be built."""
         return self.lit and (not self.collocated or self.surfaces or bool(self.bounces))
 
 
@@ -68,12 +68,11 @@ def describe(scene, settings: Settings, sensor, spp: int, media: list, light) ->
     lit = bool(light.rows.power.size or light.sampled) and not 0 <= depth < 2
     exhaustive = settings.light_samples == 0
     gradients = gradient_checks.check(scene, light)
-    shapes = ordinary_shapes(scene)
-    surfaces = len(shapes) > 0
-    # Derivatives by a light's place need the light's own transmittance. A camera ray crosses a surface or does not,
-    # where light is dimmed.
+    surfaces = len(ordinary_shapes(scene)) > 0
+    # Derivatives by a light's place need the light's own transmittance. A camera ray either crosses a surface or ends
+    # there, at random, while a shadow ray is dimmed.
     collocated = (lit and not gradients and settings.visibility != "none" and _at_camera(light, sensor, media)
-                  and not transmits(shape_groups(scene) + shapes))
+                  and not lets_light_through(scene))
     width, height = sensor.film().crop_size()
     bounces = _bounces(settings, media, surfaces, gradients) if lit and not 0 <= depth <= 2 else ""
     method, reason = _method(settings, width * height * spp, media, light, surfaces, bounces)
@@ -102,7 +101,7 @@ UNLIMITED = 4
 
 
 def _bounces(integrator, media: list, surfaces: bool, gradients: bool) -> str:
-    """How further bounces are found: as told, or the fast way where it knows all that takes part."""
+    """Return the way of further bounces: the chosen one, or with ``auto`` radiosity where it covers the whole scene."""
     name = integrator.bounces
     unknown = [what for what, there in (
         ("surfaces", surfaces), ("derivatives", gradients), ("visibility=none", integrator.visibility == "none"),
@@ -142,7 +141,7 @@ def _method(integrator, rays: int, media: list, light, surfaces: bool, bounces: 
 
 
 def _at_camera(light, sensor, media) -> bool:
-    """Whether all lights are points at the pinhole of the camera."""
+    """Return True if all lights are points at the pinhole of the camera."""
     if light.sampled or sensor.class_name() not in PINHOLES or not light.rows.is_point.all():
         return False
     eye = _eye(sensor)
@@ -151,7 +150,7 @@ def _at_camera(light, sensor, media) -> bool:
 
 
 def _in_view(sensor, media) -> tuple[bool, ...]:
-    """Of each medium, whether its sphere reaches into the pinhole camera's pyramid and holds matter."""
+    """Return for each medium if its sphere reaches into the pinhole camera's pyramid and holds matter."""
     held = [m.field.grid.majorant > 0 for m in media]
     if sensor.class_name() not in PINHOLES:
         return tuple(held)
@@ -184,5 +183,5 @@ def on_film(sensor, frame):
 
 
 def _eye(sensor) -> np.ndarray:
-    """Where the pinhole of a camera is."""
+    """Position of a camera's pinhole."""
     return np.array(sensor.world_transform().translation(), np.float64).ravel()

@@ -1,10 +1,10 @@
-"""Which scene parameters the picture can be differentiated by. The others would have derivatives of zero."""
+"""Checks of the scene parameters that carry gradients. Those that derivatives leave out are refused."""
 
 import drjit as dr
 import mitsuba as mi
 
 from ...core.errors import MiNtfError
-from .media import ordinary_shapes, shape_groups, transmits
+from .media import lets_light_through
 
 POWERS = {
     "PointLight": ("intensity",),
@@ -22,8 +22,10 @@ PLACES = {"PointLight": ("position",), "SpotLight": ("to_world",), "DirectionalE
 
 
 def check(scene, light) -> bool:
-    """Whether a parameter of `scene` carries gradients; `light`: its :class:`mi_ntf.render.lights.scene_lights.Lights`.
-    Raises MiNtfError where it is one that derivatives of the picture leave out."""
+    """Return True if a parameter of `scene` carries gradients.
+
+    `light`: the scene's :class:`mi_ntf.render.lights.scene_lights.Lights`. Raises MiNtfError if derivatives of the
+    picture leave the parameter out."""
     parameters = mi.traverse(scene)
     attached = [key for key, value in parameters if dr.grad_enabled(value)]
     for key in attached:
@@ -34,7 +36,7 @@ def check(scene, light) -> bool:
                 "lights that are not drawn at random, the position of a point and the to_world of a spot or directional"
             )
         place = key.rpartition(".")[2] in ("position", "to_world")
-        if place and transmits(shape_groups(scene) + ordinary_shapes(scene)):
+        if place and lets_light_through(scene):
             raise MiNtfError(f"gradients by {key}: not supported beside surfaces that let light through (null, mask, "
                              "thindielectric), whose own slopes would be missing; detach it or take these surfaces out")
     return bool(attached)

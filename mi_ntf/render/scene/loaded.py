@@ -18,9 +18,9 @@ from ...infer.network import NetworkField
 from ...infer.skin import Softness
 
 QUEUED = 1 << 16
-"""Size of a kernel that is not run at once but queued: several blocks of Dr.Jit."""
+"""Width of a kernel that Dr.Jit queues instead of running it at once: several blocks."""
 
-# Reentrant: a medium that begins during the baking all the same must not wait for its own thread.
+# Reentrant, since a thread that waits for a kernel of the bake may start to load the next medium.
 _one_at_a_time = threading.RLock()
 
 
@@ -54,11 +54,11 @@ def load(path: str, resolution: int | None) -> LoadedField:
 
 
 def _begin_other_media(variant: str) -> None:
-    """Let the other media of a scene that is being loaded begin, those of them that would begin during the baking.
+    """Start the constructors of the scene's other media before a field is baked.
 
-    Mitsuba makes them as tasks of Dr.Jit's threads, and a thread that waits for a kernel takes up any task: a medium
-    that began while this thread bakes its field could not wait for the result and would bake it again. A kernel at the
-    end of the queue is waited for after all of them, here, before anything is baked.
+    Mitsuba constructs media as tasks of Dr.Jit's thread pool, and a thread that waits for a kernel executes other tasks
+    meanwhile. Another medium would then start within the bake, on the same thread, and bake the field again, since it
+    cannot wait for its own thread. Waiting for a kernel at the end of the queue makes all of them start here.
     """
     dj = module(variant)
     dr.eval(dr.arange(dj.UInt32, QUEUED) + 1)

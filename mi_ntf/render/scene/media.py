@@ -53,15 +53,14 @@ def shape_groups(scene) -> list:
     return [node for node in mi.traverse(scene).hierarchy if node.class_name() == "ShapeGroupPlugin"]
 
 
-def transmits(objects: list) -> bool:
-    """Whether light may cross one of `objects`, shapes and groups, without being scattered: at the null component of a
-    BSDF."""
+def lets_light_through(scene) -> bool:
+    """Return True if light may cross an ordinary shape of `scene` at the null component of its BSDF."""
     return any(isinstance(node, mi.BSDF) and mi.has_flag(node.flags(), mi.BSDFFlags.Null)
-               for shape in objects for node in mi.traverse(shape).hierarchy)
+               for shape in shape_groups(scene) + ordinary_shapes(scene) for node in mi.traverse(shape).hierarchy)
 
 
 def _is_absent(shape) -> bool:
-    """Whether a shape neither scatters light nor emits it."""
+    """Return True if a shape neither scatters light nor emits it."""
     simple = shape.class_name() != "Instance" and not shape.is_medium_transition() and not shape.is_emitter()
     return simple and shape.bsdf().class_name() == "Null"
 

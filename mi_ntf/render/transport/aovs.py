@@ -87,11 +87,11 @@ class Sums:
 
     @property
     def needs_points(self) -> bool:
-        """Whether there is more to know than what :meth:`add_opacity` is told."""
+        """True if an output needs more than :meth:`add_opacity` receives."""
         return any(name != "opacity" for name in self.wanted)
 
     def add_field(self, i: int, part, points, samples, kept, distance, shadow) -> None:
-        """What the camera's samples are in the field `part`, strand `i`.
+        """Add the camera's samples in the field `part`, strand `i`.
 
         `points`: those of the `samples` that lie in this field, in order; `kept`: which these are, None: all of them;
         `distance`: theirs from the rays' origins, scene units. `shadow`: visibility method of the run's lights, None
@@ -118,8 +118,10 @@ class Sums:
         return Sums(self.wanted, self.lights, rays, self.first, self.later)
 
     def add_behind(self, other: "Sums", transmittance, index) -> None:
-        """Add the sums of rays that go on where the rays `index` cross a surface; `transmittance`: what is left of the
-        latter there."""
+        """Add the sums `other` of the rays that continue where the rays `index` cross a surface.
+
+        `transmittance`: of the fields before that surface, one number for each of `index`."""
+
         def add(sums, values, where, weight) -> None:
             for total, value in zip(sums, values, strict=True):
                 dr.scatter_reduce(dr.ReduceOp.Add, total, value * weight, where, mode=dr.ReduceMode.NoConflicts)
@@ -138,8 +140,10 @@ class Sums:
             dr.scatter(self.opacity, opacity, index)
 
     def add_surface(self, ray, hit, transmittance, way) -> None:
-        """What lies behind the fields: preliminary intersections `hit` of the rays; `transmittance`: how much of each
-        ray ends there; `way`: distance from the camera to the rays' origins."""
+        """Add the surfaces behind the fields.
+
+        `hit`: preliminary intersections of the rays; `transmittance`: the share of each ray that ends there; `way`:
+        distance from the camera to the rays' origins."""
         if self.later:
             return
         si, hit = hit.compute_surface_interaction(mi.Ray3f(ray)), hit.is_valid()
@@ -248,7 +252,7 @@ class Picture:
         self._pixels = Reconstruction(self.block, camera)
 
     def seen_by(self, camera: Camera) -> "Picture":
-        """This picture, for the samples of another pass."""
+        """Return this picture, for the samples of another pass."""
         self._pixels = Reconstruction(self.block, camera)
         return self
 

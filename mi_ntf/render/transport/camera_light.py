@@ -178,7 +178,7 @@ class _CameraLight:
         return mi.PCG32(dr.width(sequence), mi.UInt64(start), mi.UInt64(sequence))
 
     def _surface_paths(self, surfaces: Surfaces, walk: Walk, camera: Paths, lit: bool) -> list[Paths]:
-        """What goes on from the surfaces that camera rays meet, whose light is added: nothing unless they are `lit`.
+        """Add the light of the surfaces that camera rays meet. Return the paths that scatter there, none unless `lit`.
         Sets `crossing`."""
         met: Any = dr.compress(self.hit.is_valid())
         if not dr.width(met) or not (lit or surfaces.shining or surfaces.transmitting):
@@ -194,7 +194,7 @@ class _CameraLight:
         return [paths] if lit else []
 
     def _field_paths(self, walk: Walk, camera: Paths):
-        """What matter scatters on of camera rays: from one of a ray's shading points, drawn by their weights."""
+        """Yield paths from one shading point of each camera ray, sampled by the points' weights."""
         samples, unit = self.met
         t, strand, weight = samples.draw(camera.rng.next_float32())
         t = (samples.bundle.base + t) * unit

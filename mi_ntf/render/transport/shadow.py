@@ -1,4 +1,4 @@
-"""What dims a light on its way to points of a field: that field, others, surfaces."""
+"""Transmittance from a light to points of a field, through that field, other fields and surfaces."""
 
 import drjit as dr
 
@@ -6,9 +6,13 @@ from ...infer.visibility import outside
 
 
 class Shadow:
-    """All that dims a light on its way to points of one field: that field (`own`, a visibility method in the
-    coordinates of `frame`), the others (pairs of frame and method) and `surfaces`; `far`: the light lies outside of
-    that field's sphere, which might as well be infinitely far away for it. A visibility method itself."""
+    """Product of all transmittances on the way from a light to points of one field; a visibility method itself.
+
+    own       visibility method of that field, in the coordinates of `frame`
+    others    pairs of frame and visibility method of the other fields
+    surfaces  :class:`mi_ntf.render.transport.surfaces.Surfaces`, or None
+    far       the light lies outside of the field's sphere, so for this field it may count as infinitely far away
+    """
 
     def __init__(self, frame, own, others: list, surfaces, far: bool = False):
         self.frame, self.own, self.others, self.surfaces, self.far = frame, own, others, surfaces, far

@@ -8,7 +8,7 @@ import mitsuba as mi
 from ..lights import environment
 from ..lights.emitter_samples import sharp
 from ..lights.recent import Recent, Version
-from ..scene.media import shape_groups, transmits
+from ..scene.media import lets_light_through, shape_groups
 
 _scenes: WeakKeyDictionary = WeakKeyDictionary()
 
@@ -32,7 +32,7 @@ class Surfaces:
         self._all = _scene_of(groups + shapes, scene.integrator())
         seen = [s for s in shapes if not (hide_emitters and s.is_emitter())]
         self._seen = self._all if len(seen) == len(shapes) else _scene_of(groups + seen, scene.integrator())
-        self.transmitting = transmits(groups + shapes)
+        self.transmitting = lets_light_through(scene)
         self.shining = any(s.is_emitter() for s in seen)
         deltas = (mi.has_flag(e.flags(), mi.EmitterFlags.Delta) for e in scene.emitters())
         self.lights_can_be_hit = not all(deltas)
@@ -110,9 +110,11 @@ class Surfaces:
 
 
 def _scene_of(shapes: list, integrator):
-    """Return a scene of these very shapes alone, for the rays' intersections: the last one as long as no shape has
-    changed, since its acceleration structure takes longer than a small picture (a million triangles: 1.7 s). It lives
-    as long as `integrator`, that of the shapes' scene; Mitsuba's own cannot say when they end, so nothing is kept."""
+    """Return a scene of these very shapes alone, for the rays' intersections.
+
+    It is built again only when a shape has changed: its acceleration structure may take longer than the picture. It is
+    kept as long as `integrator`, the one of the shapes' scene, exists. Nothing is kept for Mitsuba's own integrators,
+    which weak references cannot refer to."""
     try:
         kept = _scenes.setdefault(integrator, Recent(2))
     except TypeError:
@@ -122,8 +124,9 @@ def _scene_of(shapes: list, integrator):
 
 
 def _built(shapes: list):
-    # Mitsuba refuses a scene all of whose emitters have the weight 0, as these shapes may. It names what it is given by
-    # the keys, but these names are the user's.
+    """Return a new scene of `shapes`, which keep their names."""
+    # Mitsuba refuses a scene in which all emitters have the weight 0, as those of these shapes may. It also renames
+    # the objects of a dictionary by its keys.
     names = [shape.id() for shape in shapes]
     objects = {"unused": {"type": "point"}, **{f"shape_{i}": s for i, s in enumerate(shapes)}}
     try:
