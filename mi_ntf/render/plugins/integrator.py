@@ -77,7 +77,8 @@ def integrator_class() -> type:
 
         The image can be differentiated by the lights: power, an environment's texels, and, of at most 32 lights in the
         scene, position and direction, whose shadows are then marched whatever the method; and by the reflectance of
-        diffuse surfaces. Other parameters with gradients are refused.
+        diffuse surfaces. Other parameters with gradients are refused, and so are places of lights beside surfaces that
+        let light through.
 
         Does not support: media other than ``nrf``; fields in a ``shapegroup``; a place inside another integrator, such
         as ``aov`` or ``moment``, since it has `aovs` of its own; spectral and polarised variants; derivatives by the
