@@ -111,6 +111,8 @@ class Train:
     """Folder for TensorBoard events: losses, validation, speed, preview pictures."""
     view: bool = False
     """Show the field in a browser while it learns; needs the extra `view`."""
+    baked: bool = False
+    """Put the field's voxels into the file as well, so that it loads without a bake or a cache."""
     json: bool = False
     """Print the whole report as JSON in place of a summary."""
 
@@ -129,6 +131,10 @@ class Train:
                        visibility_mlp=self.visibility_mlp, bounces=not self.no_bounces,
                        fresnel=not self.no_fresnel, view=self.view)
         if report:  # under torchrun, only the first process has one
+            if self.baked:
+                from mi_ntf.render.commands.bake import bake_fields
+
+                bake_fields(self.output, {})
             _report(report, self.json, _print_training)
 
 
@@ -350,12 +356,15 @@ class View:
 
 @dataclass
 class Bake:
-    """Write the transmittance maps of a scene's lights, one part of an EXR file each."""
+    """Write the transmittance maps of a scene's lights into an EXR file, or the fields' voxels into their files."""
 
     scene: Positional[Path]
-    """Scene with an nrf medium and integrator; the integrator's property map_file reads the result."""
-    output: Output
+    """Scene with an nrf medium and integrator; the integrator's property map_file reads the result. With --baked: also
+    a field file."""
+    output: Annotated[Path | None, arg(aliases=("-o",), metavar="FILE")] = None
     """EXR to write."""
+    baked: bool = False
+    """Put the voxels of the scene's fields into their files, so that they load without a bake or a cache."""
     define: Annotated[UseAppendAction[tuple[str, ...]], arg(aliases=("-D",), metavar="KEY=VALUE")] = field(
         default_factory=tuple
     )
@@ -364,9 +373,28 @@ class Bake:
     """Print JSON in place of a table."""
 
     def run(self) -> None:
-        from mi_ntf.render.commands.bake import bake
+        if self.baked == (self.output is not None):
+            raise UsageError("give -o FILE for maps, or --baked for the fields' voxels")
+        from mi_ntf.render.commands.bake import bake, bake_fields
 
-        _report(bake(self.scene, self.output, _definitions(self.define)), self.json, _print_pairs)
+        parameters = _definitions(self.define)
+        done = bake(self.scene, self.output, parameters) if self.output else bake_fields(self.scene, parameters)
+        _report(done, self.json, _print_pairs)
+
+
+@dataclass
+class Cache:
+    """Show what is kept for later renders: baked fields, patches between which light bounces, transmittance maps."""
+
+    clear: bool = False
+    """Remove it."""
+    json: bool = False
+    """Print JSON in place of a table."""
+
+    def run(self) -> None:
+        from mi_ntf.render.commands.cache import report
+
+        _report(report(self.clear), self.json, _print_pairs)
 
 
 @dataclass
@@ -502,6 +530,7 @@ Command = (
     | Annotated[Reproduce, subcommand("reproduce")]
     | Annotated[View, subcommand("view")]
     | Annotated[Bake, subcommand("bake")]
+    | Annotated[Cache, subcommand("cache")]
     | Annotated[Export, subcommand("export")]
     | Annotated[Sequence_, subcommand("sequence")]
     | Annotated[Info, subcommand("info")]

@@ -5,7 +5,7 @@ import os
 import numpy as np
 import pytest
 
-os.environ.setdefault("MI_NTF_MAP_CACHE", "off")  # tests neither read nor fill the user's cache
+os.environ.setdefault("MI_NTF_CACHE", "off")  # tests neither read nor fill the user's cache
 
 
 @pytest.fixture

@@ -45,7 +45,8 @@ def folder(tmp_path_factory):
 
 
 def check(*words, folder):
-    done = run_program(*words, cwd=folder)
+    own = {"XDG_CACHE_HOME": str(folder / "cache")} if words[1] == "cache" else {}  # not the user's
+    done = run_program(*words, cwd=folder, **own)
     assert done.returncode == 0, f"{words}\n{done.stdout}\n{done.stderr}"
     return done.stdout
 
@@ -122,7 +123,7 @@ def test_command(folder, words):
 def test_every_command_is_shown():
     shown = {words[1] if words[0] == "mi-ntf" else words[0] for words in COMMANDS}
     assert shown == {"capture", "inspect", "train", "swap", "mitsuba", "info", "compare", "explain", "bake", "make",
-                     "tradeoff", "reproduce", "export", "render", "sequence", "view"}
+                     "tradeoff", "reproduce", "export", "render", "sequence", "view", "cache"}
 
 
 def test_readme_is_short():

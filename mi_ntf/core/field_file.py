@@ -12,6 +12,8 @@ from .architecture import Header, Network, header_from_json
 from .errors import MiNtfError
 
 _KEY = "mi_ntf"
+_BAKED = "baked."
+"""Begin of the names of arrays that were baked from the tensors (:func:`add_baked`), and their key in the metadata."""
 _LARGEST = 1e36
 """What no sum of a network may reach: then no order of summation leaves single precision."""
 
@@ -33,11 +35,33 @@ def load(path: str | Path) -> tuple[Header, dict[str, np.ndarray]]:
     """Read a field: header and float32 tensors. Every mismatch with the header's skeleton is named in one error."""
     header = load_header(path)
     try:
-        tensors = safetensors.numpy.load_file(path)
+        with safetensors.safe_open(path, "np") as file:
+            tensors = {k: file.get_tensor(k) for k in file.keys() if not k.startswith(_BAKED)}
     except (safetensors.SafetensorError, TypeError, AttributeError) as error:  # the latter two of types NumPy lacks
         raise MiNtfError(f"{path} is no field file ({str(error)[:200]}); make it anew with `mi-ntf train`") from None
     _check(str(path), header, tensors)
     return header, {k: v.astype(np.float32) for k, v in tensors.items()}
+
+
+def add_baked(path: str | Path, arrays: dict[str, np.ndarray], stamp: str) -> None:
+    """Put `arrays` that were baked from a field into its file, in place of any that are there.
+
+    `stamp` names what they were made from and how (:func:`load_baked`). Tensors keep their number formats.
+    """
+    load(path)
+    with safetensors.safe_open(path, "np") as file:
+        data = {k: file.get_tensor(k) for k in file.keys() if not k.startswith(_BAKED)}
+        metadata = file.metadata()
+    data |= {_BAKED + k: np.ascontiguousarray(v) for k, v in arrays.items()}
+    files.write(path, safetensors.numpy.save(data, metadata=metadata | {_BAKED: stamp}))
+
+
+def load_baked(path: str | Path, stamp: str) -> dict[str, np.ndarray] | None:
+    """Return the baked arrays of a field file; None where it has none, or they have another stamp."""
+    with safetensors.safe_open(path, "np") as file:
+        if (file.metadata() or {}).get(_BAKED) != stamp:
+            return None
+        return {k.removeprefix(_BAKED): file.get_tensor(k) for k in file.keys() if k.startswith(_BAKED)}
 
 
 def load_header(path: str | Path) -> Header:

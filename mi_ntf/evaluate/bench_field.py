@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core import spheres
+from ..infer.grid import NetworkVolume
 from ..render.commands import calibration
 from ..render.commands.calibration import seconds, table_of
 from ..render.maps import building
@@ -67,7 +68,8 @@ def setting_rows(medium, sizes: Sizes) -> list[Row]:
     paper = bench_paper.random_network(sizes.hidden)
     settings = {
         "field of voxels": (_like(medium, grid, network), sizes.setting_points[0], True),
-        "field of the shipped networks": (_like(medium, network, network), sizes.setting_points[1], True),
+        "field of the shipped networks": (_like(medium, NetworkVolume(network, grid, grid.majorant), network),
+                                          sizes.setting_points[1], True),
         # Its map would ask millions of queries; a lookup costs what it costs above.
         "field of networks of the paper's size": (_like(medium, bench_paper.PaperField(grid, paper), paper),
                                          max(1, sizes.setting_points[1] // 8), False),

@@ -87,7 +87,7 @@ def in_own_process(size: int, columns: int, rows: int, repeats: int, home: Path 
     environment = dict(os.environ)
     if home is not None:
         words.append("--first")
-        environment |= {"HOME": str(home), "XDG_CACHE_HOME": str(home / ".cache"), "MI_NTF_MAP_CACHE": "on"}
+        environment |= {"HOME": str(home), "XDG_CACHE_HOME": str(home / ".cache"), "MI_NTF_CACHE": "on"}
     start = time.perf_counter()
     done = subprocess.run(words, capture_output=True, text=True, check=False, env=environment)
     process = time.perf_counter() - start

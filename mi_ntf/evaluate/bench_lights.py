@@ -25,8 +25,7 @@ class Picture:
         o, d, far = view_rays(scene.sensors()[0], medium.frame, 2 * side)
         rng = np.random.default_rng(0)
         offset, depth = (mi.Float(rng.random(4 * side**2, np.float32)) for _ in range(2))
-        grid = medium.field.grid
-        found = march.camera_samples([Strand(grid.density, grid, o, d, dr.opaque(mi.Float, STEP))], far, offset, depth)
+        found = march.camera_samples([Strand(medium.field.grid, o, d, dr.opaque(mi.Float, STEP))], far, offset, depth)
         x, along = found.place(0, found.ray, found.t)
         self._found, self._side = found, side
         self._points = shade.Points(x, tuple(-c for c in along), medium.reflectance(x))

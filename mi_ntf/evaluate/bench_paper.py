@@ -22,7 +22,7 @@ import numpy as np
 from ..core import spheres
 from ..core.architecture import PAPER, Architecture, Header
 from ..infer import march, ops, shade
-from ..infer.bundle import Strand, clear_distance, safe_inverse
+from ..infer.bundle import Strand, safe_inverse
 from ..infer.network import NetworkField
 from ..infer.profile import DepthProfile
 from ..infer.visibility.raymarch import MAX_OPTICAL_DEPTH
@@ -55,10 +55,23 @@ class PaperField:
 
     def __init__(self, shape, network: NetworkField):
         self.shape, self.network = shape, network
+        self.hull = shape.hull
 
     def density(self, p):
         """σ at `p`."""
         return self.shape.density(p) + VANISHING * self.network.density(p)
+
+    def place(self, p):
+        """Return the points and their places in the shape."""
+        return tuple(p), self.shape.place(p)
+
+    def log_density(self, place):
+        """Return ln σ at a place."""
+        return self.shape.log_density(place[1]) + VANISHING * self.network.density(place[0])
+
+    def clear_distance(self, place, inverse_d):
+        """Return what the shape's does."""
+        return self.shape.clear_distance(place[1], inverse_d)
 
     def reflectance(self, p):
         """As :meth:`mi_ntf.infer.network.NetworkField.reflectance`."""
@@ -110,7 +123,7 @@ def culled_shares(grid, sizes: Sizes) -> dict[str, float]:
         o, d = light_rays(LIGHTS, max(LIGHTS, sizes.queries // 8))
         p, step = samples_of(o, d, n)
         inverse = safe_inverse(tuple(dr.repeat(c, n) for c in d))
-        occupied = dr.select(clear_distance(grid, p, inverse) <= 0, mi.Float(1), 0)
+        occupied = dr.select(grid.clear_distance(grid.place(p), inverse) <= 0, mi.Float(1), 0)
         before = dr.block_prefix_reduce(dr.ReduceOp.Add, grid.density(p) * step, n, exclusive=True)
         asked = dr.select(before < MAX_OPTICAL_DEPTH, occupied, 0)
         shares[f"share/{n}"] = float(dr.mean(asked)[0])
@@ -124,7 +137,7 @@ def stage_costs(medium, network: NetworkField, sizes: Sizes) -> dict[str, float]
     either side. ``query``: seconds to ask for a point's reflectance, and with it for its density, which the paper's
     network gives at once. ``voxels``: seconds to bake such a grid from the paper's field."""
     grid = medium.field.grid
-    profile = DepthProfile(grid.density, grid, dr.opaque(mi.Float, 2 / 384))
+    profile = DepthProfile(grid, dr.opaque(mi.Float, 2 / 384))
     many = light_rays(sizes.slow_lights, sizes.queries)
     counts = {n: max(1, sizes.queries // n) for n in (STAGE_SAMPLES, IMAGE_SAMPLES)}
     few = {n: light_rays(sizes.slow_lights, count) for n, count in counts.items()}
@@ -151,7 +164,7 @@ def camera_cost(sensor, medium, paper: PaperField, sizes: Sizes):
     o, d, far = view_rays(sensor, medium.frame, sizes.pixels)
     middle = dr.full(mi.Float, 0.5, dr.width(far))
     step = dr.opaque(mi.Float, 2 / IMAGE_SAMPLES)
-    strand = Strand(paper.density, medium.field.grid, o, d, step)
+    strand = Strand(paper, o, d, step)
     last: list[shade.Points] = []
 
     def view():

@@ -50,7 +50,7 @@ def program() -> tuple[list[str], str]:
 def environment() -> dict[str, str]:
     """That of every process whose seconds are shown: this one's, but no transmittance map comes from a cache or goes
     into one."""
-    return {**os.environ, "MI_NTF_MAP_CACHE": "off"}
+    return {**os.environ, "MI_NTF_CACHE": "off"}
 
 
 def render(command: list[str], scene: Path, light: str, visibility: str, spp: int, size: int, out: Path) -> Shot:

@@ -41,7 +41,7 @@ def stock(values: dict[str, str], folder: Path) -> float:
     words = [word for name, value in values.items() for word in ("-D", f"{name}={value}")]
     begin = time.perf_counter()
     subprocess.run([program, "-m", "llvm_ad_rgb", *words, "-o", folder / "stock.exr", SCENE], check=True,
-                   capture_output=True, env={**os.environ, "MI_NTF_MAP_CACHE": "off"})
+                   capture_output=True, env={**os.environ, "MI_NTF_CACHE": "off"})
     return time.perf_counter() - begin
 
 

@@ -166,7 +166,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=192)
     parser.add_argument("--spp", type=int, default=8)
     args = parser.parse_args()
-    os.environ.setdefault("MI_NTF_MAP_CACHE", "memory")
+    os.environ.setdefault("MI_NTF_CACHE", "memory")
     mi.set_variant(*VARIANTS)
     from ..render import register
 

@@ -65,7 +65,7 @@ def query_time(medium, count: int = 1 << 20) -> float:
     low, high = medium.field.grid.bounds
     place = (low + rng.uniform(size=(count, 3)) * (high - low)).T
     x, d = (tuple(mi.Float(c.astype(np.float32)) for c in v) for v in (place, way))
-    profile = DepthProfile(medium.source.density, medium.field.grid, dr.opaque(mi.Float, FOR_NETWORKS * 2 / 384))
+    profile = DepthProfile(medium.source, dr.opaque(mi.Float, FOR_NETWORKS * 2 / 384))
     times = []
     for _ in range(6):
         start = time.perf_counter()

@@ -30,9 +30,18 @@ def floats(values: np.ndarray, dj: ModuleType):
     """`values`, raveled, as a ``Float`` of the module `dj`. Dr.Jit takes NumPy's memory as it lies on a processor, and
     kernels that fetch from it differ by whether it is aligned, which is chance: they were compiled again now and then,
     for a light that moved."""
-    flat = np.asarray(values, np.float32).ravel()
+    return dj.Float(_aligned(values, np.float32))
+
+
+def words(values: np.ndarray, dj: ModuleType):
+    """Return `values`, raveled, as a ``UInt32`` of the module `dj`; see :func:`floats`."""
+    return dj.UInt32(_aligned(values, np.uint32))
+
+
+def _aligned(values: np.ndarray, kind: type) -> np.ndarray:
+    flat: np.ndarray = np.asarray(values, kind).ravel()
     raw = np.empty(flat.nbytes + ALIGNMENT, np.uint8)
     first = -raw.ctypes.data % ALIGNMENT
-    aligned = raw[first : first + flat.nbytes].view(np.float32)
+    aligned: np.ndarray = raw[first : first + flat.nbytes].view(kind)
     aligned[:] = flat
-    return dj.Float(aligned)
+    return aligned

@@ -1,11 +1,10 @@
 """Rays through one or several fields, in cells of a march.
 
-They skip empty space by the grid's clearance: inside the empty cube around a cell, no step has density. Positions stay
+They skip empty space by the volume's bricks: inside the empty cube around a brick, no step has density. Positions stay
 on one lattice per ray, so that skipping changes no value.
 """
 
 import itertools
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import reduce
 from typing import Any
@@ -14,7 +13,6 @@ import drjit as dr
 
 from ..core import spheres
 from . import ops
-from .grid import CELLS
 from .network import NOTHING, density_of
 
 PIECES = 3
@@ -29,26 +27,14 @@ INSET = 0.001
 """Of a piece: densities are asked so far before its end, within the sphere where a ray leaves it."""
 
 
-def clear_distance(grid, p, inverse_d):
-    """Return the distance that a ray from `p` runs within the empty cube around `p`; 0 in an occupied cell.
+def density_where(active, volume, place):
+    """Return the density of `volume` at its `place` where `active`, 0 elsewhere.
 
-    `inverse_d`: componentwise 1/direction (finite). In field units.
+    Of rays that march side by side often none is in matter: they are spared the fetches.
     """
-    uint = dr.uint32_array_t(type(p[0]))
-    cell = [dr.clip(dr.floor(c * (CELLS / 2) + CELLS / 2), 0, CELLS - 1) for c in p]
-    n = dr.gather(type(p[0]), grid.clearance, (uint(cell[2]) * CELLS + uint(cell[1])) * CELLS + uint(cell[0]))
-    exits = []
-    for c, k, inv in zip(p, cell, inverse_d, strict=True):
-        face = dr.select(inv > 0, k + n, k - n + 1) * (2 / CELLS) - 1
-        exits.append((face - c) * inv)
-    exit_ = dr.minimum(dr.minimum(exits[0], exits[1]), exits[2])
-    return dr.select(n > 0, dr.maximum(exit_, 0), 0)
-
-
-def density_where(active, density, p):
-    """The density at `p` where `active`, 0 elsewhere. Of rays that march side by side often none is in matter: they are
-    spared the fetches."""
-    return dr.if_stmt((*p,), active, lambda *p: density(p), lambda *p: type(p[0])(0), label="density")
+    floats = dr.float32_array_t(type(active))
+    return dr.if_stmt((place,), active, lambda place: density_of(volume.log_density(place)), lambda place: floats(0),
+                      label="density")
 
 
 def slope_where(active, density, p):
@@ -74,21 +60,17 @@ def safe_inverse(d):
 class Strand:
     """A ray in the coordinates of one field that it may cross.
 
-    density  callable, field density at a point
-    grid     whose empty space is skipped
+    volume   the field's :class:`mi_ntf.infer.grid.Volume`
     o, d     origin and unit direction, 3-tuples, field coordinates
     step     length of the march's cells, field units
     rate     field units per unit of the ray's parameter t; None: t is in these field units (a ray of one strand)
-    logs     callable, ln σ at a point, NOTHING where there is none and wherever `grid` is clear; None: by `density`
     """
 
-    density: Callable
-    grid: object
+    volume: Any
     o: tuple
     d: tuple
-    step: object
-    rate: object = None
-    logs: Callable | None = None
+    step: Any
+    rate: Any = None
 
 
 class Bundle:
@@ -154,7 +136,8 @@ class Bundle:
         """The cell at `t`, cut off where the ray begins and ends (a surface may be there). `before`: ln σ of each field
         there, which the last cell knows."""
         begin = dr.maximum(t, 0)
-        part = (dr.minimum(t + step, self.end) - begin) * (1 / PIECES)
+        # Rounding may end the first cell before the ray begins.
+        part = dr.maximum(dr.minimum(t + step, self.end) - begin, 0) * (1 / PIECES)
         skip = reduce(dr.minimum, self.clear(begin))
         count = len(self.strands)
 
@@ -183,7 +166,7 @@ class Bundle:
         """Return the distance from `t` on that the ray is clear of each field's matter; 0 in an occupied cell."""
         skips = []
         for i, (s, inverse, (begin, end)) in enumerate(zip(self.strands, self.inverse, self.intervals, strict=True)):
-            skip = clear_distance(s.grid, self.point(i, t), inverse)
+            skip = s.volume.clear_distance(s.volume.place(self.point(i, t)), inverse)
             if s.rate is not None:
                 skip = skip / s.rate
             if not self.single:
@@ -195,13 +178,8 @@ class Bundle:
     def logs(self, t) -> list:
         """ln σ of each field at `t`, per unit of t."""
         found = []
-        for i, (s, inverse, (begin, end)) in enumerate(zip(self.strands, self.inverse, self.intervals, strict=True)):
-            p = self.point(i, t)
-            if s.logs is not None:
-                value = s.logs(p)
-            else:
-                sigma = dr.select(clear_distance(s.grid, p, inverse) <= 0, s.density(p), 0)
-                value = dr.select(sigma > 0, dr.log(sigma), NOTHING)
+        for i, (s, (begin, end)) in enumerate(zip(self.strands, self.intervals, strict=True)):
+            value = s.volume.log_density(s.volume.place(self.point(i, t)))
             if not self.single:  # a strand that misses its field's sphere has no place there
                 value = dr.select((t >= begin) & (t < end), value, NOTHING)
             if s.rate is not None:

@@ -87,9 +87,10 @@ def _gather(bundle, depth, channels: int, size, most: int):
     ray, rays = dr.arange(uint, n), dr.opaque(uint, n)
 
     def put(count, ray, sample, weight):
+        room = count < most
         for target, value in zip(found, _weighted(sample, weight), strict=False):  # the view only where wanted
-            dr.scatter(target, value, count * rays + ray)
-        return count + 1
+            dr.scatter(target, value, count * rays + ray, room)
+        return count + dr.select(room, uint(1), 0)
 
     def put_here(count, ray, here, light, weight):
         return put(count, ray, here.sample(here.quantile(light)), weight)

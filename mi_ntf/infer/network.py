@@ -29,14 +29,18 @@ NOTHING = -60.0
 """ln σ where there is no matter."""
 
 
-def cut_log_density(log_sigma, p):
-    """`log_sigma`, but ``NOTHING`` outside the unit sphere and below ``MIN_DENSITY``."""
-    inside = p[0] * p[0] + p[1] * p[1] + p[2] * p[2] < 1
-    return dr.select(inside & (log_sigma > LOG_MIN_DENSITY), log_sigma, NOTHING)
+def cut(log_sigma):
+    """Return `log_sigma`, but ``NOTHING`` below ``MIN_DENSITY``."""
+    return dr.select(log_sigma > LOG_MIN_DENSITY, log_sigma, NOTHING)
+
+
+def inside(log_sigma, p):
+    """Return `log_sigma`, but ``NOTHING`` outside the unit sphere."""
+    return dr.select(p[0] * p[0] + p[1] * p[1] + p[2] * p[2] < 1, log_sigma, NOTHING)
 
 
 def density_of(log_sigma):
-    """σ of what :func:`cut_log_density` returns."""
+    """Return σ, 0 where ln σ is ``NOTHING``."""
     return dr.select(log_sigma > NOTHING, dr.exp(log_sigma), 0)
 
 
@@ -58,7 +62,7 @@ class NetworkField:
         self.has_visibility = baseline is not None
         self._least_specular = arch.least_specular
         self.quick = arch.reflectance.encoding.kind == "planes"
-        """Whether reflectance costs no more than some fetches."""
+        """True if reflectance costs no more than some fetches."""
 
     def log_density(self, p):
         """ln σ at `p`, clipped to the legal range; without the cuts of :meth:`density`."""
@@ -67,7 +71,7 @@ class NetworkField:
 
     def density(self, p):
         """σ at `p`, 1/(unit-sphere radius)."""
-        return density_of(cut_log_density(self.log_density(p), p))
+        return density_of(inside(cut(self.log_density(p)), p))
 
     def reflectance(self, p):
         """``(normal, albedo, roughness, specular)``: two 3-tuples and two scalars, ranges as in core.reference."""

@@ -7,7 +7,8 @@ import drjit as dr
 from ..core import spheres
 from ..core.depth_profile import LEVELS
 from . import ops
-from .bundle import clear_distance, onward, safe_inverse
+from .bundle import onward, safe_inverse
+from .network import density_of
 
 FOR_NETWORKS = 0.93
 """Steps of the march that networks read, in cells of the camera's march: with 1.1 of them `statue` is 2.6 % off, with
@@ -19,14 +20,14 @@ FOR_MAPS = 0.97
 
 def of(medium, step: float, dj: ModuleType) -> "DepthProfile":
     """The march through `medium` in steps of `step`, field units."""
-    return DepthProfile(medium.source.density, medium.field.grid, dr.opaque(dj.Float, step))
+    return DepthProfile(medium.source, dr.opaque(dj.Float, step))
 
 
 class DepthProfile:
-    """`density`: callable, σ at a point; `grid`: whose empty space is skipped; `step`: opaque float, field units."""
+    """`volume`: a :class:`mi_ntf.infer.grid.Volume`; `step`: opaque float, field units."""
 
-    def __init__(self, density, grid, step):
-        self.density, self.grid, self.step = density, grid, step
+    def __init__(self, volume, step):
+        self.volume, self.step = volume, step
 
     def __call__(self, o, d, levels=LEVELS, begin=None):
         """``(places, total)`` of the rays through `o` along `d` towards the light, as in
@@ -48,8 +49,8 @@ class DepthProfile:
         floats = type(o[0])
         step = self.step
 
-        def cross(s, depth, before, last, p, *places):
-            sigma = self.density(p)
+        def cross(s, depth, before, last, place, *places):
+            sigma = density_of(self.volume.log_density(place))
             after = depth + sigma * step
             rate = dr.rcp(dr.maximum(sigma * step, 1e-6))
             bend = dr.clip(0.5 * (sigma - before) * step * rate, -1, 1)
@@ -60,14 +61,14 @@ class DepthProfile:
             )
             return after, sigma, dr.select(sigma > 0, s + step, last), *places
 
-        def pass_by(s, depth, before, last, p, *places):
+        def pass_by(s, depth, before, last, place, *places):
             return depth, type(before)(0), last, *places
 
         def body(s, depth, before, places, last, active):
-            p = tuple(mi + (h - s - 0.5 * step) * di for mi, di in zip(m, d, strict=True))
-            skip = clear_distance(self.grid, p, inverse)
+            place = self.volume.place(tuple(mi + (h - s - 0.5 * step) * di for mi, di in zip(m, d, strict=True)))
+            skip = self.volume.clear_distance(place, inverse)
             depth, before, last, *places = dr.if_stmt(
-                (s, depth, before, last, p, *places), active & (skip <= 0), cross, pass_by, label="cross"
+                (s, depth, before, last, place, *places), active & (skip <= 0), cross, pass_by, label="cross"
             )
             s = s + onward(skip, step)
             return s, depth, before, tuple(places), last, active & (s < 2 * h) & (depth < levels[-1])

@@ -6,35 +6,46 @@ import drjit as dr
 import numpy as np
 
 from ..core import skin
+from ..core.ops import dot
 from . import ops
-from .bundle import clear_distance, density_where, onward, safe_inverse
-from .grid import REFLECTANCE_RESOLUTION
+from .bake import REFLECTANCE_RESOLUTION
+from .bricks import of_dense
+from .bundle import density_where, onward, safe_inverse
+from .grid import bricks_of
 
 OPAQUE = 0.5
 """Fields with fewer opaque skins than this share are smoke."""
 
 
 class Softness:
-    """The softness of the skins of `grid` (a :class:`mi_ntf.infer.grid.GridField`), at its reflectance's voxel centres,
-    trilinear between; 0 for flat skins, and for smoke. `solid`: the share of them that are opaque; `opaque`: whether
-    most are."""
+    """Softness of a field's skins at any point, trilinear; 0 for flat skins, for smoke, and away from matter.
 
-    def __init__(self, grid, dj: ModuleType):
-        self.dj = dj
-        values, self.solid = _measure(grid, min(grid.resolution, REFLECTANCE_RESOLUTION), dj)
-        self._texture = dj.Texture3f(dj.TensorXf(values[..., None]), use_accel=False, wrap_mode=dr.WrapMode.Clamp)
+    `arrays`: result of :func:`measure`. `solid`: fraction of the skins that are opaque; `opaque`: True if most are.
+    """
 
-    @property
-    def opaque(self) -> bool:
-        return self.solid >= OPAQUE
+    def __init__(self, arrays: dict[str, np.ndarray], dj: ModuleType):
+        self._bricks, self.solid = bricks_of(arrays, "softness", dj), float(arrays["solid"][0])
+        self.opaque = self.solid >= OPAQUE
 
     def __call__(self, p):
-        """At the field points `p`."""
-        return self._texture.eval(self.dj.Array3f(*(0.5 * c + 0.5 for c in p)))[0]
+        """Return the softness at the field points `p`."""
+        return self._bricks.at(self._bricks.place(p))[0]
+
+
+def measured(grid, dj: ModuleType) -> Softness:
+    """Return the softness of `grid` (a :class:`mi_ntf.infer.grid.GridField`)."""
+    return Softness(measure(grid, dj), dj)
+
+
+def measure(grid, dj: ModuleType) -> dict[str, np.ndarray]:
+    """Return the arrays of a :class:`Softness` of `grid` (a :class:`mi_ntf.infer.grid.GridField`)."""
+    values, solid = _measure(grid, min(grid.resolution, REFLECTANCE_RESOLUTION), dj)
+    arrays = of_dense(values[..., None], values > 0)
+    return {f"softness.{name}": array for name, array in arrays.items()} | {"solid": np.array([solid])}
 
 
 def _measure(grid, n: int, dj: ModuleType) -> tuple[np.ndarray, float]:
-    """Softness (z, y, x), float32, and the share of skins that are opaque."""
+    """Return the softness (z, y, x), float32, and the fraction of skins that are opaque."""
     solid = 0.0
     result, known = np.zeros((n, n, n), np.float32), np.zeros((n, n, n), bool)
 
@@ -85,8 +96,9 @@ def _depth(grid, x, d, most):
 
     def body(t, depth, active):
         p = tuple(a + (t + 0.5 * step) * b for a, b in zip(x, d, strict=True))
-        skip = clear_distance(grid, p, inverse)
-        depth = depth + density_where(active & (skip <= 0), grid.density, p) * step
+        place = grid.place(p)
+        skip = grid.clear_distance(place, inverse)
+        depth = depth + density_where(active & (skip <= 0) & (dot(p, p) < 1), grid, place) * step
         t = t + onward(skip, step)
         return t, depth, active & (t < length) & (depth < most)
 

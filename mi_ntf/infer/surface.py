@@ -12,7 +12,8 @@ import numpy as np
 
 from ..core.architecture import LOG_FLOOR, MAX_LOG_DENSITY
 from ..core.errors import MiNtfError
-from .grid import baked_log_density
+from .bake import sampled_bricks
+from .bricks import SIDE
 from .network import NetworkField
 
 LEVEL = 10.0
@@ -49,7 +50,7 @@ def surface(field: NetworkField, resolution: int, level: float | None, dj: Modul
     the highest density where that is less. Raises MiNtfError where there is no such density."""
     from skimage.measure import marching_cubes
 
-    values = np.maximum(baked_log_density(field, resolution, dj), LOG_FLOOR)
+    values = _log_density(field, resolution, dj)
     highest = float(np.exp(values.max()))
     level = min(LEVEL, highest / 2) if level is None else level
     if not level < highest:
@@ -61,6 +62,16 @@ def surface(field: NetworkField, resolution: int, level: float | None, dj: Modul
     vertices = (places[:, ::-1] + corner[::-1] + 0.5) * (2 / resolution) - 1
     normals = _from_faces(vertices, faces)
     return Surface(level, vertices, faces, *_seen(field, vertices, normals, dj))
+
+
+def _log_density(field: NetworkField, n: int, dj: ModuleType) -> np.ndarray:
+    """Return ln σ at the centres of n³ voxels (z, y, x), ``LOG_FLOOR`` at least and away from density."""
+    values = np.full((n, n, n), LOG_FLOOR, np.float32)
+    for places, samples in sampled_bricks(field, n, (0, SIDE), dj):
+        for (z, y, x), brick in zip(SIDE * places, samples, strict=True):
+            part = values[z : z + SIDE, y : y + SIDE, x : x + SIDE]
+            part[:] = brick[tuple(slice(size) for size in part.shape)]
+    return values
 
 
 def _cropped(values: np.ndarray, threshold: float) -> tuple[np.ndarray, np.ndarray]:

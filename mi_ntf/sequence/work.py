@@ -18,6 +18,7 @@ import numpy as np
 from .. import __version__, bridge
 from ..core.errors import MiNtfError, sentence
 from ..core.variants import VARIANTS
+from ..render import user_cache
 from ..render.maps import map_cache
 from ..render.scene import changed, environment_option, scene_file
 from ..render.scene.environment_option import Environment
@@ -60,7 +61,7 @@ def render(task: Task) -> dict[str, Any]:
         ready(task.variant)
         state, name = _parsed(task)
         scene = changed.instantiated(Path(task.scene), _for_many(state, task.count))
-        with map_cache.not_written():
+        with user_cache.film():
             # Parts keep the digits that their sum needs.
             channels = _render(scene, task, _precision(state) if task.parts == 1 else np.float32)
         record: dict[str, Any] = {"number": task.frame.number, "of": task.frame.told(), "key": name}

@@ -20,7 +20,7 @@ def view(scene: Path, define: dict[str, str], size: int = 256, samples: int = 64
         if not 1 <= value <= most:
             raise MiNtfError(f"--{name} is {value}, expected 1 to {most}")
     # A dragged light makes maps by the dozen: none is worth a file.
-    os.environ.setdefault("MI_NTF_MAP_CACHE", "memory")
+    os.environ.setdefault("MI_NTF_CACHE", "memory")
     from .controls import Controls
     from .session import Session
 

@@ -133,6 +133,6 @@ def test_shares_of_a_ball():
     grid = hard_cases.baked(*fields.blobs([(0, 0, 0)], [0.5], log_density=6.0), resolution=64).field.grid
     shares = bench_paper.culled_shares(grid, bench_measure.FULL)
     half = float(np.abs(np.array(grid.bounds)).mean())
-    assert (0.8 * half / 0.9) ** 2 < shares["share/rays"] < ((half + 0.06) / 0.9) ** 2
+    assert (0.8 * half / 0.9) ** 2 < shares["share/rays"] < ((half + 0.125) / 0.9) ** 2  # an octant of a brick
     assert 0 < shares["share/256"] < 0.5 * shares["share/rays"]
     assert shares["share/192"] == pytest.approx(shares["share/256"], rel=0.05)

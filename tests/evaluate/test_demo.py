@@ -19,7 +19,7 @@ from mi_ntf.evaluate.tradeoff.points import Point
 FAKE = """
 import os, sys, numpy as np, OpenEXR
 words = sys.argv[1:]
-assert os.environ["MI_NTF_MAP_CACHE"] == "off"
+assert os.environ["MI_NTF_CACHE"] == "off"
 assert words[:2] == ["-m", "llvm_ad_rgb"] and words[-1].endswith("scene.xml"), words
 defined = dict(words[i + 1].split("=") for i, w in enumerate(words) if w == "-D")
 assert defined["res"] == "64"
@@ -38,7 +38,7 @@ def fake(tmp_path):
 
 
 def test_render_passes_parameters_and_times_the_process(fake, tmp_path, monkeypatch):
-    monkeypatch.setenv("MI_NTF_MAP_CACHE", "on")  # of the user: renders have theirs off
+    monkeypatch.setenv("MI_NTF_CACHE", "on")  # of the user: renders have theirs off
     shot = demo.render(fake, tmp_path / "scene.xml", "env", "raymarch", 3, 64, tmp_path / "o.exr")
     assert (shot.light, shot.visibility, shot.image.shape) == ("env", "raymarch", (4, 6, 4))
     assert (shot.image == 3).all() and shot.seconds > 0
@@ -69,7 +69,7 @@ print(found[0])
 
 def test_a_full_cache_of_maps_makes_no_difference(tmp_path, monkeypatch):
     """What would be read from the user's cache, were it on, is made anew in the demo's renders."""
-    monkeypatch.setenv("MI_NTF_MAP_CACHE", "on")
+    monkeypatch.setenv("MI_NTF_CACHE", "on")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     program = [sys.executable, "-c", CACHED]
     alone = [subprocess.run([*program, "-o", str(tmp_path / "o.exr")], capture_output=True, text=True, check=True)
@@ -224,7 +224,7 @@ def check_demo(folder: Path, ssim: float, rmse: float, to_march: float) -> None:
 
 
 COARSE = (('name="interior">', 'name="interior"><integer name="resolution" value="96"/>'),
-          ('<default name="map" value="192"/>', '<default name="map" value="64"/>'))
+          ('<default name="map" value="0"/>', '<default name="map" value="64"/>'))
 """What makes the statue's scene quick to load: most of a render on few pixels is the field's grid and the maps."""
 
 
@@ -241,11 +241,11 @@ def test_the_demo_on_few_pixels(tmp_path):
     (scene / "scene.xml").write_text(text)
     command = [sys.executable, "-m", "mi_ntf.evaluate.demo", "--size", "32", "--spp", "16", "--environment-spp", "4",
                "--budget", "5s", "--scene", str(scene), "--out", str(out)]  # fmt: skip
-    environment = {**os.environ, "MI_NTF_MAP_CACHE": "on", "XDG_CACHE_HOME": str(cache)}
+    environment = {**os.environ, "MI_NTF_CACHE": "on", "XDG_CACHE_HOME": str(cache)}
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False, timeout=600)
     assert done.returncode == 0, done.stdout + done.stderr
     check_demo(out, 0.8, 0.3, 0.15)
-    assert not list(cache.rglob("*.map"))
+    assert not list(cache.rglob("*.safetensors"))
     assert "reference:" in done.stderr and str(out / "tradeoff" / "index.html") in done.stdout
     result = json.loads((out / "tradeoff" / "tradeoff.json").read_text())
     assert result["parameters"] == {"light": "env", "res": "32", "spp": "4"} and result["budget_seconds"] == 5

@@ -15,7 +15,7 @@ import json, os, sys
 from pathlib import Path
 words = sys.argv[1:]
 out = Path(words[words.index("-o") + 1])
-assert os.environ["MI_NTF_MAP_CACHE"] == "off"
+assert os.environ["MI_NTF_CACHE"] == "off"
 assert words[:2] == ["tradeoff", "scene.xml"], words
 assert words[2:10] == ["-D", "light=env", "-D", "res=64", "-D", "spp=3", "--budget", "2m"], words
 left = sorted(str(f.relative_to(out)) for f in out.rglob("*") if f.is_file())
@@ -27,7 +27,7 @@ if result is None:
 
 
 def _study(tmp_path, monkeypatch, result):
-    monkeypatch.setenv("MI_NTF_MAP_CACHE", "on")
+    monkeypatch.setenv("MI_NTF_CACHE", "on")
     monkeypatch.setenv("RESULT", json.dumps(result))
     command = [sys.executable, "-c", STUDY]
     return demo.study(command, Path("scene.xml"), tmp_path, "2m", 64, 3)

@@ -15,7 +15,7 @@ def small(monkeypatch):
     mi_ntf.render.register()
     monkeypatch.setattr(transmittance_atlas, "SIDE", 8)
     monkeypatch.setattr(transmittance_atlas, "RESOLUTION", 16)
-    monkeypatch.setenv("MI_NTF_MAP_CACHE", "memory")
+    monkeypatch.setenv("MI_NTF_CACHE", "memory")
 
 
 @pytest.mark.slow  # its scene is read at full size

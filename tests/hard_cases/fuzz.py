@@ -281,13 +281,13 @@ def maps(folder: Path):
     import mi_ntf.render
     from mi_ntf.render.maps import map_file
 
-    os.environ |= {"XDG_CACHE_HOME": str(folder / "cache"), "MI_NTF_MAP_CACHE": "on"}
+    os.environ |= {"XDG_CACHE_HOME": str(folder / "cache"), "MI_NTF_CACHE": "on"}
     mi.set_variant(VARIANT)
     mi.set_log_level(mi.LogLevel.Error)
     mi_ntf.render.register()
     medium = find_medium(scenes.write_blobs(folder, log_density=3.0))
     map_file.write(folder / "maps.exr", medium, table(), OPTIONS, [build(medium)])
-    (cached,) = (folder / "cache").rglob("*.map")
+    (cached,) = (folder / "cache").rglob("maps/*.safetensors")
     baked = folder / "maps.exr"
     return medium, baked, map_file.read(baked, medium, table(), OPTIONS, 2), cached, texels(medium)
 

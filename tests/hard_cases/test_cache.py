@@ -111,7 +111,7 @@ def render(path, tmp_path):
         out = tmp_path / f"{name}.exr"
         command = [sys.executable, "-m", "mi_ntf", "render", "-m", "llvm_ad_rgb", str(scene), "-o", str(out)]
         return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-                                env=os.environ | {"MI_NTF_MAP_CACHE": "on"} | environment), out
+                                env=os.environ | {"MI_NTF_CACHE": "on"} | environment), out
 
     return start
 
@@ -139,7 +139,7 @@ def test_the_program_renders_with_a_file_in_place_of_the_cache(render, tmp_path)
 def test_three_processes_on_one_cache(render, tmp_path):
     """Started together on an empty cache: the same bits as without one; afterwards the cache serves a fourth."""
     home = tmp_path / "home"
-    alone, reference = render("reference", MI_NTF_MAP_CACHE="off")
+    alone, reference = render("reference", MI_NTF_CACHE="off")
     finish(alone)
     together = [render(f"p{k}", XDG_CACHE_HOME=str(home)) for k in range(3)]
     for process, out in together:

@@ -10,11 +10,13 @@ from types import SimpleNamespace
 import mitsuba as mi
 import numpy as np
 import pytest
+import safetensors.numpy
 from helpers import scenes
 from helpers.maps import OPTIONS, SIZE, build, find_medium, table, texels, without_cache
 from helpers.variants import VARIANT
 
 from mi_ntf.infer import profile
+from mi_ntf.render import user_cache
 from mi_ntf.render.maps import map_cache
 from mi_ntf.render.scene import loaded
 
@@ -32,11 +34,24 @@ def as_npy(array):
 def floats(change):
     """Numbers changed behind the seal."""
     def apply(file, data):
-        values = np.frombuffer(data, "<f4", offset=map_cache.SEAL).copy()
+        begin = 8 + int.from_bytes(data[:8], "little")
+        values = np.frombuffer(data, "<f4", offset=begin).copy()
         change(values)
-        file.write_bytes(data[: map_cache.SEAL] + values.tobytes())
+        file.write_bytes(data[:begin] + values.tobytes())
 
     return apply
+
+
+def another_seal(file, data):
+    """The same texels, sealed as those of another map."""
+    arrays = safetensors.numpy.load(data)
+    file.write_bytes(safetensors.numpy.save(arrays, {"seal": user_cache._seal_of("maps", "0" * 64, arrays)}))
+
+
+def other_arrays(file, data):
+    """A whole entry under this name, but of another kind of content."""
+    file.unlink()
+    user_cache.write("maps", file.stem, {"index": np.arange(4)})
 
 
 DAMAGE = {
@@ -51,6 +66,8 @@ DAMAGE = {
     "NaN": floats(lambda v: v.__setitem__(5, np.nan)),
     "inf": floats(lambda v: v.__setitem__(-1, np.inf)),
     "zeros": floats(lambda v: v.fill(0)),
+    "another map's": another_seal,
+    "other arrays": other_arrays,
     "swapped": floats(lambda v: v.__setitem__(slice(None), v[::-1].copy())),
 }
 
@@ -67,20 +84,21 @@ def test_a_damaged_map_is_made_anew(medium, cache, warnings, damage):
 
 
 def test_every_flipped_bit_is_noticed(medium, cache, rng):
-    """Of the seal and of the texels; one light's map under another's name as well."""
+    """Of the header and of the texels; one light's map under another's name as well."""
     texels(medium)
     (file,) = cache.iterdir()
-    name, count, data = file.stem, 3 * SIZE // 4, file.read_bytes()
-    assert map_cache._read(name, count) is not None
-    for place in [*range(map_cache.SEAL), *rng.integers(map_cache.SEAL, len(data), 300)]:
+    name, data = file.stem, file.read_bytes()
+    begin = 8 + int.from_bytes(data[:8], "little")
+    assert user_cache.read("maps", name) is not None
+    for place in [*range(begin), *rng.integers(begin, len(data), 300)]:
         flipped = bytearray(data)
         flipped[place] ^= 1 << rng.integers(8)
         file.write_bytes(flipped)
-        assert map_cache._read(name, count) is None, place
+        assert user_cache.read("maps", name) is None, place
     file.write_bytes(data)
-    assert map_cache._read(name, count) is not None
-    file.rename(file.with_name(f"{'0' * 64}.map"))
-    assert map_cache._read("0" * 64, count) is None
+    assert user_cache.read("maps", name) is not None
+    file.rename(file.with_name(f"{'0' * 64}.safetensors"))
+    assert user_cache.read("maps", "0" * 64) is None
 
 
 def test_something_else_under_a_maps_name(medium, cache, warnings):
@@ -112,8 +130,8 @@ def test_numbers_that_are_not_finite_are_never_kept(cache):
 def test_several_media_of_one_file_bake_it_once(tmp_path, monkeypatch, apart):
     """Mitsuba makes the media of a scene in parallel."""
     path, baked = scenes.write_blobs(tmp_path), []
-    grid_field = loaded.GridField
-    monkeypatch.setattr(loaded, "GridField", lambda *args: baked.append(args) or grid_field(*args))
+    bake = loaded.bake
+    monkeypatch.setattr(loaded, "bake", lambda *args: baked.append(args) or bake(*args))
     if apart == "in threads":
         with ThreadPoolExecutor(8) as pool:
             assert len({id(field) for field in pool.map(lambda _: loaded.load(str(path), 48), range(8))}) == 1
@@ -127,7 +145,7 @@ def test_several_media_of_one_file_bake_it_once(tmp_path, monkeypatch, apart):
 
 def test_the_cache_is_of_many_threads(monkeypatch):
     """All get their maps while others come and go, and nothing is kept of those that went."""
-    monkeypatch.setenv("MI_NTF_MAP_CACHE", "memory")
+    monkeypatch.setenv("MI_NTF_CACHE", "memory")
     map_cache.forget()
 
     def ask(number):
@@ -202,13 +220,13 @@ def test_keys_follow_the_march_and_the_libraries(medium, cache, monkeypatch):
     monkeypatch.setattr(profile, "FOR_NETWORKS", 1.25)  # the rule for a march's step, which only this source follows
     seen.append(names_of(cache, medium, network))
     assert names_of(cache, medium) == seen[-1]
-    for module in (map_cache.mi, map_cache.dr, map_cache.np):
+    for module in (user_cache.mi, user_cache.dr, user_cache.np):
         with monkeypatch.context() as patch:
             patch.setattr(module, "__version__", "0.0.0")
             seen.append(names_of(cache, medium))
     with monkeypatch.context() as patch:
         compiler = "cuda_version" if VARIANT.startswith("cuda") else "llvm_version"
-        patch.setattr(map_cache.dr.detail, compiler, lambda: (1, 2, 3))
+        patch.setattr(user_cache.dr.detail, compiler, lambda: (1, 2, 3))
         seen.append(names_of(cache, medium))
     assert [len(names) for names in seen] == list(range(1, len(seen) + 1))
 
@@ -237,7 +255,7 @@ def kept(size: int):
 
 def test_kept_maps_and_the_one_in_the_making_fit_into_map_memory(cache, monkeypatch):
     """Lights that move each frame: a new map each time, in a memory for two and a half."""
-    monkeypatch.setenv("MI_NTF_MAP_CACHE", "memory")
+    monkeypatch.setenv("MI_NTF_CACHE", "memory")
     limit, size, most = 2.5 * 1000, 1000, []
 
     def make(values=None):

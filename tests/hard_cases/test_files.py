@@ -21,7 +21,7 @@ def batch(kind: str, seed: int, first: int, last: int, folder: Path) -> list[dic
     """What became of the cases `first` to `last`. A process that dies is a failure of its last case, and another one
     goes on behind it."""
     command = [sys.executable, str(TESTS / "hard_cases" / "fuzz.py"), kind, *map(str, (seed, first, last)), str(folder)]
-    environment = {**os.environ, "PYTHONPATH": str(TESTS), "MI_NTF_MAP_CACHE": "off", "XDG_CACHE_HOME": str(folder)}
+    environment = {**os.environ, "PYTHONPATH": str(TESTS), "MI_NTF_CACHE": "off", "XDG_CACHE_HOME": str(folder)}
     try:
         done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60 + SECONDS)
         end = f"died with {done.returncode}: {done.stderr[-2000:]}"

@@ -197,7 +197,7 @@ sys.exit(main(sys.argv[1:]))
 
 def start(*words, program=("-m", "mi_ntf")):
     return subprocess.Popen([sys.executable, *map(str, (*program, *words))], stdout=subprocess.PIPE,
-                            stderr=subprocess.STDOUT, text=True, env=os.environ | {"MI_NTF_MAP_CACHE": "off"})
+                            stderr=subprocess.STDOUT, text=True, env=os.environ | {"MI_NTF_CACHE": "off"})
 
 
 def finish(process, code=0):

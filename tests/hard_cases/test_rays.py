@@ -121,7 +121,7 @@ def test_light_ray(name, method, check):
 def test_camera_ray(name, check):
     o, d = (arrays([v]) for v in RAYS[name])
     grid = ball().source
-    strand = Strand(grid.density, grid, o, d, mi.Float(2 / 384))
+    strand = Strand(grid, o, d, mi.Float(2 / 384))
     halves = [mi.Float(0.5), mi.Float(0.5)]
     for end in (np.inf, 2.5):
         samples = march.camera_samples([strand], mi.Float(end), *halves)

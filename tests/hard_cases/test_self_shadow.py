@@ -106,7 +106,7 @@ def shipped(name: str):
     o = rng.uniform(-0.7, 0.7, (count, 3))
     o += (3 - o @ view)[:, None] * view
     d = arrays(np.tile(-view, (count, 1)))
-    strand = Strand(medium.source.density, medium.source, arrays(o), d, mi.Float(2 / 384))
+    strand = Strand(medium.source, arrays(o), d, mi.Float(2 / 384))
     random = [mi.Float(rng.random(count)) for _ in range(2)]
     with mock.patch.object(march, "SHARE", 1e-4):  # points of the faint depths of skins as well, whatever they weigh
         samples = march.camera_samples([strand], mi.Float(np.full(count, 1e9)), *random)

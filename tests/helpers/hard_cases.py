@@ -8,11 +8,12 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import map_coordinates
 
+from helpers import volumes
 from helpers.jit import arrays
-from mi_ntf.infer.grid import GridField
+from mi_ntf.infer.grid import baked as grid_of
 from mi_ntf.infer.lights import LightTable
 from mi_ntf.infer.network import MIN_DENSITY, NetworkField
-from mi_ntf.infer.skin import Softness
+from mi_ntf.infer.skin import measured
 from mi_ntf.infer.visibility import REGISTRY, outside
 from mi_ntf.render.maps import building
 
@@ -48,8 +49,8 @@ MARCHED = ("raymarch", "transmittance_volume", "transmittance_map", "transmittan
 def baked(header, tensors, resolution: int = 192):
     """A field as a render holds it: stands for a medium whose frame is the identity."""
     network = NetworkField(header, tensors, mi)
-    grid = GridField(network, resolution, mi)
-    return SimpleNamespace(source=grid, field=SimpleNamespace(network=network, grid=grid, softness=Softness(grid, mi)))
+    grid = grid_of(network, resolution, mi)
+    return SimpleNamespace(source=grid, field=SimpleNamespace(network=network, grid=grid, softness=measured(grid, mi)))
 
 
 def seen_from(x: np.ndarray, light) -> tuple:
@@ -86,7 +87,7 @@ def transmittance(method: str, medium, light, x: np.ndarray) -> np.ndarray:
 def marched(grid, x: np.ndarray, light: np.ndarray, step: float = 1 / 1024) -> np.ndarray:
     """τ (n,) from the points `x` towards the direction `light`, in float64: the voxels' ln σ, trilinear, every `step`
     to the end of the unit sphere."""
-    log_sigma = np.array(grid._log_sigma.values(), np.float64)
+    log_sigma = volumes.voxels(grid.bricks)[..., 0].astype(np.float64)
     n = len(log_sigma)
     along = x @ light
     length, depth = np.sqrt(np.maximum(along**2 - (x * x).sum(1) + 1, 0)) - along, np.zeros(len(x))

@@ -15,12 +15,13 @@ from scipy.special import erf
 
 from helpers import fields
 from helpers.jit import arrays
+from helpers.volumes import Formula
 from mi_ntf.core import ops
 from mi_ntf.infer import ops as infer_ops
-from mi_ntf.infer.grid import CELLS, GridField
+from mi_ntf.infer.grid import baked
 from mi_ntf.infer.lights import LightTable
 from mi_ntf.infer.network import NetworkField
-from mi_ntf.infer.skin import Softness
+from mi_ntf.infer.skin import measured
 from mi_ntf.infer.visibility import transmittance_atlas
 from mi_ntf.render.maps import building
 
@@ -73,8 +74,8 @@ def _balls(what: Balls, factor: float):
         if name.startswith("transmittance"):
             values[:] = rng.normal(size=values.shape) * 0.5 * what.wild
     network = NetworkField(header, tensors, mi)
-    grid = GridField(network, 48, mi)
-    return SimpleNamespace(source=grid, field=SimpleNamespace(network=network, grid=grid, softness=Softness(grid, mi)))
+    grid = baked(network, 48, mi)
+    return SimpleNamespace(source=grid, field=SimpleNamespace(network=network, grid=grid, softness=measured(grid, mi)))
 
 
 class Exact:
@@ -135,10 +136,11 @@ class Exact:
     def medium(self):
         """As :meth:`Balls.medium`; its occupancy lets no march skip."""
         corners = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), -1).reshape(-1, 3)
-        grid = SimpleNamespace(clearance=dr.zeros(mi.Float, CELLS**3), hull=corners, density=self.density)
+        volume = Formula(self.density, corners)
         network = Balls(0).medium().field.network
-        field = SimpleNamespace(network=network, grid=grid, softness=SimpleNamespace(opaque=True))
-        return SimpleNamespace(source=SimpleNamespace(density=self.density, reflectance=self.reflectance), field=field)
+        field = SimpleNamespace(network=network, grid=volume, softness=SimpleNamespace(opaque=True))
+        volume.reflectance = self.reflectance
+        return SimpleNamespace(source=volume, field=field)
 
 
 def _inside(x, d, radius):

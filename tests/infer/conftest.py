@@ -5,7 +5,7 @@ import pytest
 from helpers import fields
 from helpers.variants import VARIANT
 
-from mi_ntf.infer.grid import GridField
+from mi_ntf.infer.grid import baked
 from mi_ntf.infer.network import NetworkField
 from mi_ntf.infer.profile import DepthProfile
 
@@ -25,9 +25,9 @@ def network():
 
 @pytest.fixture(scope="module")
 def grid(network):
-    return GridField(network, 96, mi)
+    return baked(network, 96, mi)
 
 
 @pytest.fixture(scope="module")
 def reader(grid):
-    return DepthProfile(grid.density, grid, mi.Float(1 / 256))
+    return DepthProfile(grid, mi.Float(1 / 256))

@@ -7,10 +7,11 @@ import pytest
 from helpers import fields
 from helpers.jit import arrays
 from helpers.variants import VARIANT
+from helpers.volumes import Formula, Unskipped
 
 from mi_ntf.infer import bundle, march
 from mi_ntf.infer.bundle import Strand
-from mi_ntf.infer.grid import GridField
+from mi_ntf.infer.grid import baked
 from mi_ntf.infer.network import NOTHING, NetworkField
 from mi_ntf.infer.visibility import outside, raymarch
 
@@ -20,14 +21,14 @@ BLOBS = [(-0.3, 0.0, 0.0), (0.35, 0.2, 0.1), (0.0, -0.45, 0.3)], [0.35, 0.25, 0.
 @pytest.fixture(scope="module")
 def grid():
     mi.set_variant(VARIANT)
-    return GridField(NetworkField(*fields.blobs(*BLOBS, log_density=3.5), mi), 64, mi)
+    return baked(NetworkField(*fields.blobs(*BLOBS, log_density=3.5), mi), 64, mi)
 
 
 @pytest.fixture(scope="module")
 def slab():
     """σ = 1.5 in the whole unit sphere (but for the voxels that its surface cuts)."""
     mi.set_variant(VARIANT)
-    return GridField(NetworkField(*fields.uniform(1.5), mi), 256, mi)
+    return baked(NetworkField(*fields.uniform(1.5), mi), 256, mi)
 
 
 def rays(rng, n, reach=0.9):
@@ -51,7 +52,7 @@ def test_transmittance_and_weights(grid, rng):
     o, d = rays(rng, 300)
     step = 2 / 2048
     samples = march.camera_samples(
-        [Strand(grid.density, grid, arrays(o), arrays(d), mi.Float(step))],
+        [Strand(grid, arrays(o), arrays(d), mi.Float(step))],
         mi.Float(np.full(300, 1e9)),
         mi.Float(rng.random(300)),
         mi.Float(rng.random(300)),
@@ -73,7 +74,7 @@ def test_samples_follow_free_flight(slab, rng):
     n, sigma = 20000, 1.5
     o, d = np.tile([[0.0, 0.0, 3.0]], (n, 1)), np.tile([[0.0, 0.0, -1.0]], (n, 1))
     samples = march.camera_samples(
-        [Strand(slab.density, slab, arrays(o), arrays(d), mi.Float(0.25))],
+        [Strand(slab, arrays(o), arrays(d), mi.Float(0.25))],
         mi.Float(np.full(n, 1e9)),
         mi.Float(rng.random(n)),
         mi.Float(rng.random(n)),
@@ -94,7 +95,6 @@ def test_optical_depth(grid, rng):
     truth = quadrature(grid.density, x, d, np.zeros(400), length, 4000)
     steps = tuple(mi.Float(s) for s in raymarch.default_steps(2 / 512))
     ours = raymarch.optical_depth(
-        grid.density,
         grid,
         arrays(x),
         arrays(d),
@@ -114,7 +114,6 @@ def test_optical_depth_of_a_uniform_sphere(slab):
     length = np.array([np.inf, np.inf, 0.25, np.inf, np.inf])
     steps = tuple(mi.Float(s) for s in raymarch.default_steps(2 / 384))
     ours = raymarch.optical_depth(
-        slab.density,
         slab,
         arrays(x),
         arrays(d),
@@ -143,7 +142,7 @@ def test_derivatives_of_optical_depth(grid, rng, far):
         lit = mi.Float(x[:, 0]) < 2  # always, which no kernel knows
         return dr.if_stmt(
             state, lit,
-            lambda x, d, length: raymarch.optical_depth(grid.density, grid, x, d, length, steps, mi.Bool(True)),
+            lambda x, d, length: raymarch.optical_depth(grid, x, d, length, steps, mi.Bool(True)),
             lambda x, d, length: mi.Float(0))
 
     h = 2e-3
@@ -159,7 +158,7 @@ def test_derivatives_of_optical_depth(grid, rng, far):
 
 def test_transmittance_from_outside_ends_at_the_light(slab):
     """From points outside of the uniform sphere, to lights before, in and behind it, past it and away from it."""
-    march = raymarch.RayMarch(slab.density, slab, tuple(mi.Float(s) for s in raymarch.default_steps(2 / 384)))
+    march = raymarch.RayMarch(slab, tuple(mi.Float(s) for s in raymarch.default_steps(2 / 384)))
     x = np.array([[-3.0, 0, 0]] * 4 + [[-3.0, 1.5, 0], [3.0, 0, 0], [-0.5, 0, 0], [-0.5, 0, 0]])
     distance = mi.Float([1.5, 2.5, 3.5, np.inf, np.inf, np.inf, 0.75, 1.0])
     active = mi.Bool([True] * 7 + [False])
@@ -171,8 +170,8 @@ def test_transmittance_from_outside_ends_at_the_light(slab):
 def test_opaque_matter_lets_nothing_through(rng):
     """The transmittance of rays that end in matter is 0, not what remains where they ended; that of others is whole."""
     for sigma, truth in ((1000.0, 0.0), (1.0, np.exp(-2.0))):
-        ball = GridField(NetworkField(*fields.uniform(sigma), mi), 64, mi)
-        strand = Strand(ball.density, ball, arrays(np.tile([[0, 0, 3.0]], (64, 1))),
+        ball = baked(NetworkField(*fields.uniform(sigma), mi), 64, mi)
+        strand = Strand(ball, arrays(np.tile([[0, 0, 3.0]], (64, 1))),
                         arrays(np.tile([[0, 0, -1.0]], (64, 1))), mi.Float(2 / 384))  # fmt: skip
         samples = march.camera_samples([strand], mi.Float(np.inf), mi.Float(rng.random(64)), mi.Float(rng.random(64)))
         # Voxels cut by the sphere lose σ/64.
@@ -183,13 +182,9 @@ def test_opaque_matter_lets_nothing_through(rng):
 def test_light_out_of_a_skin_that_thins_out(scale, rng):
     """Density exp(−z/scale)/scale, light from above: of points at which light from there is stopped, transmittances are
     uniform in [0, 1], so their mean is ½, found within 0.07 %."""
-
-    class Grid:
-        clearance = dr.zeros(mi.Float, bundle.CELLS**3)
-
     u = (np.arange(4096) + 0.5) / 4096
     x = np.stack([rng.uniform(-0.3, 0.3, 4096), rng.uniform(-0.3, 0.3, 4096), -scale * np.log(-np.log(u) * 0.8)], 1)
-    found = raymarch.RayMarch(lambda p: dr.exp(-p[2] / scale) / scale, Grid,
+    found = raymarch.RayMarch(Formula(lambda p: dr.exp(-p[2] / scale) / scale),
                               tuple(mi.Float(s) for s in raymarch.default_steps(2 / 384)))
     tau = found.tau(arrays(x), arrays(np.tile([0.6, 0.0, 0.8], (4096, 1))), mi.Float(np.inf), mi.UInt32(0),
                     dr.full(mi.Bool, True, 4096))
@@ -231,28 +226,15 @@ def test_places_in_a_cell(variant, bend):
     np.testing.assert_allclose(np.array(cell.place(mi.Float(depth))), 0.3 + share * part, atol=1e-5 * part + 1e-7)
 
 
-def test_densities_by_their_logarithm(grid, rng):
-    """A strand that knows ln σ finds what one does that asks for σ."""
-    o, d = rays(rng, 200)
-    arguments = [mi.Float(np.full(200, 1e9)), *(mi.Float(rng.random(200)) for _ in range(2))]
-    found = [march.camera_samples([Strand(grid.density, grid, arrays(o), arrays(d), mi.Float(2 / 300), logs=logs)],
-                                  *arguments).transmittance for logs in (None, grid.cut_log_density)]  # fmt: skip
-    np.testing.assert_allclose(np.array(found[0]), np.array(found[1]), atol=2e-5)
-
-
 def test_skipping_changes_nothing(grid, rng):
     """The same rays with an occupancy that never lets a march skip: equal weights, sample by sample."""
-
-    class Everywhere:
-        clearance = dr.zeros(mi.Float, len(grid.clearance))
-
     o, d = rays(rng, 200)
     arguments = (
         mi.Float(np.full(200, 1e9)),
         mi.Float(rng.random(200)),
         mi.Float(rng.random(200)),
     )
-    strands = [[Strand(grid.density, g, arrays(o), arrays(d), mi.Float(2 / 300))] for g in (grid, Everywhere)]
+    strands = [[Strand(g, arrays(o), arrays(d), mi.Float(2 / 300))] for g in (grid, Unskipped(grid))]
     fast, slow = ((s.ray, s.t, *s.weights) for s in (march.camera_samples(k, *arguments) for k in strands))
     order = [np.lexsort((np.array(r[1]), np.array(r[0]))) for r in (fast, slow)]
     for a, b in zip(fast, slow, strict=True):
@@ -261,13 +243,9 @@ def test_skipping_changes_nothing(grid, rng):
 
 def test_skipping_changes_no_flight(grid, rng):
     """Rays end where those do that never skip, to float32's grain, in cells so long that a lost one shows."""
-
-    class Everywhere:
-        clearance = dr.zeros(mi.Float, len(grid.clearance))
-
     o, d = (arrays(v) for v in rays(rng, 2000))
     offset, depth = (mi.Float(rng.random(2000)) for _ in range(2))
-    strands = (Strand(grid.density, g, o, d, mi.Float(1 / 16)) for g in (grid, Everywhere))
+    strands = (Strand(g, o, d, mi.Float(1 / 16)) for g in (grid, Unskipped(grid)))
     (hit, t, _), (all_hit, all_t, _) = (
         [np.array(a) for a in march.free_flight([s], mi.Float(1e9), offset, [-dr.log(1 - depth)])] for s in strands)
     assert hit.any() and not hit.all()
@@ -284,7 +262,7 @@ def test_shared_samples_are_fair(grid, rng, monkeypatch):
     found, noise = [], []
     for share in (march.SHARE, 1e-2):
         monkeypatch.setattr(march, "SHARE", share)
-        samples = march.camera_samples([Strand(grid.density, grid, arrays(o), arrays(d), mi.Float(2 / 200))],
+        samples = march.camera_samples([Strand(grid, arrays(o), arrays(d), mi.Float(2 / 200))],
                                        mi.Float(np.inf), mi.Float(offset), mi.Float(u))
         assert np.array(samples.count).max() <= 1 / share + 1
         ray, t, w = (np.array(a, np.float64) for a in (samples.ray, samples.t, samples.weights[0]))
@@ -299,10 +277,10 @@ def test_shared_samples_are_fair(grid, rng, monkeypatch):
 
 def test_rays_that_miss():
     mi.set_variant(VARIANT)
-    empty = GridField(NetworkField(*fields.empty(), mi), 32, mi)
+    empty = baked(NetworkField(*fields.empty(), mi), 32, mi)
     o, d = np.array([[0, 0, 3.0], [5.0, 0, 3.0]]), np.array([[0, 0, -1.0], [0, 0, -1.0]])
     samples = march.camera_samples(
-        [Strand(empty.density, empty, arrays(o), arrays(d), mi.Float(0.01))],
+        [Strand(empty, arrays(o), arrays(d), mi.Float(0.01))],
         mi.Float([1e9, 1e9]),
         mi.Float([0.3, 0.3]),
         mi.Float([0.5, 0.5]),
@@ -313,12 +291,12 @@ def test_rays_that_miss():
 
 def test_overlapping_fields_add(rng):
     """Two uniform balls that overlap, along one line: weights, shares and free flight in closed form."""
-    dense, thin = (GridField(NetworkField(*fields.uniform(s), mi), 128, mi) for s in (0.5, 0.6))
+    dense, thin = (baked(NetworkField(*fields.uniform(s), mi), 128, mi) for s in (0.5, 0.6))
     n = 4000
     axis = np.tile([[0.0, 0.0, -1.0]], (n, 1))
     # Scene units are those of the dense ball; the thin one is twice its size, its centre 1.2 behind the other's.
     strands = [
-        Strand(f.density, f, arrays(np.tile([[0, 0, z]], (n, 1))), arrays(axis), mi.Float(0.01), mi.Float(rate))
+        Strand(f, arrays(np.tile([[0, 0, z]], (n, 1))), arrays(axis), mi.Float(0.01), mi.Float(rate))
         for f, z, rate in ((dense, 3.0, 1.0), (thin, 2.1, 0.5))
     ]
     far = mi.Float(np.full(n, 1e9))
@@ -344,10 +322,10 @@ def test_overlapping_fields_add(rng):
 
 def test_rays_have_the_samples_of_the_finest_field_that_they_meet():
     """Two balls side by side, one of smoke, which lose 1 − e⁻² of the light of rays through their middles."""
-    ball = GridField(NetworkField(*fields.uniform(1.0), mi), 64, mi)
+    ball = baked(NetworkField(*fields.uniform(1.0), mi), 64, mi)
     o = np.tile([[0.0, 0.0, 3.0], [4.0, 0.0, 3.0], [8.0, 0.0, 3.0]], (500, 1))
     d = arrays(np.tile([[0, 0, -1.0]], (1500, 1)))
-    strands = [Strand(ball.density, ball, arrays(o - [x, 0, 0]), d, mi.Float(0.01), mi.Float(1)) for x in (0, 4)]
+    strands = [Strand(ball, arrays(o - [x, 0, 0]), d, mi.Float(0.01), mi.Float(1)) for x in (0, 4)]
     u = [mi.Float((np.arange(1500) * g) % 1) for g in (0.618034, 0.7548777)]
     lost = 1 - np.exp(-2)
     for shares in ((1 / 8, 1 / 64), ()):
@@ -369,11 +347,11 @@ def test_rays_from_afar(slab, distance):
     truth = 2 * 1.5 * np.sqrt(1 - across**2)
     steps = tuple(mi.Float(s) for s in raymarch.default_steps(2 / 384))
     depth = raymarch.optical_depth(
-        slab.density, slab, arrays(x), arrays(d), mi.Float(np.inf), steps, dr.full(mi.Bool, True, 2)
+        slab, arrays(x), arrays(d), mi.Float(np.inf), steps, dr.full(mi.Bool, True, 2)
     )
     np.testing.assert_allclose(np.array(depth), truth, atol=0.013)  # as above: voxels cut by the sphere
     samples = march.camera_samples(
-        [Strand(slab.density, slab, arrays(x), arrays(d), mi.Float(2 / 384))],
+        [Strand(slab, arrays(x), arrays(d), mi.Float(2 / 384))],
         mi.Float(np.inf),
         mi.Float([0.3, 0.7]),
         mi.Float([0.5, 0.5]),
@@ -397,3 +375,15 @@ def test_shares_that_end_in_a_cell_are_represented_evenly(variant, begin, now):
         truth = (now ** (power + 1) - begin ** (power + 1)) / (power + 1)
         assert (others * place**power).mean() == pytest.approx(truth, rel=1e-3)
     assert (place[others > 0] >= begin - 1e-6).all() and (place[others > 0] <= now + 1e-6).all()
+
+
+def test_no_ray_has_more_samples_than_shares(rng):
+    """Where rounding ends the first cell before the ray begins: a sample too many of one ray would be another's."""
+    dense = baked(NetworkField(*fields.uniform(60.0), mi), 32, mi)
+    o, d = rays(rng, 50_000)
+    offset = mi.Float(np.full(len(o), np.nextafter(np.float32(1), np.float32(0))))
+    strands = [Strand(dense, arrays(o - [x, 0, 0]), arrays(d), mi.Float(2 / 256), mi.Float(1)) for x in (0, 4)]
+    samples = march.camera_samples(strands, mi.Float(np.inf), offset, mi.Float(rng.random(len(o))),
+                                   shares=(march.SMOKE_SHARE,) * 2)
+    assert sum(np.array(w) for w in samples.weights).min() > 0.9 * march.MIN_SHARE
+    assert np.array(samples.count).max() <= 1 / march.SMOKE_SHARE

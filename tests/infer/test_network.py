@@ -9,15 +9,14 @@ import pytest
 from helpers import fields
 from helpers.jit import arrays
 from helpers.variants import VARIANT
-from scipy.ndimage import map_coordinates
 
 from mi_ntf.core import field_file, reference
 from mi_ntf.core.architecture import LOG_FLOOR, Architecture, Encoding, Header, Network
 from mi_ntf.core.depth_profile import LEVELS
 from mi_ntf.core.errors import MiNtfError
-from mi_ntf.infer import grid as grid_module
 from mi_ntf.infer import network as network_module
-from mi_ntf.infer.grid import CELLS, GridField
+from mi_ntf.infer.bake import support_points
+from mi_ntf.infer.grid import baked
 from mi_ntf.infer.network import CLEAR_DEPTH, MIN_DENSITY, NetworkField
 
 HALF = VARIANT.startswith("cuda")
@@ -184,7 +183,7 @@ def test_density_is_zero_outside_the_sphere():
 
 def test_voxels_hold_the_density_that_interpolates_it_and_the_reflectance_at_their_centres(rng):
     network = NetworkField(*fields.blobs([(-0.2, 0.1, 0.0), (0.3, -0.2, 0.1)], [0.4, 0.3]), mi)
-    grid = GridField(network, 64, mi)
+    grid = baked(network, 64, mi)
     i = rng.integers(1, 63, (4000, 3))
     value = np.zeros(len(i))
     for offset in np.ndindex(3, 3, 3):
@@ -203,70 +202,6 @@ def test_voxels_hold_the_density_that_interpolates_it_and_the_reflectance_at_the
         np.testing.assert_allclose(np.array(a), np.array(b), atol=2e-4)
 
 
-def test_fine_voxels_are_baked_near_matter_alone_and_hold_the_same(monkeypatch):
-    """Thin and small blobs, voxels finer than the survey: equal to the bit to a bake of all of them."""
-    network = NetworkField(*fields.blobs([(-0.2, 0.1, 0.0), (0.3, -0.2, 0.1)], [0.4, 0.06]), mi)
-    monkeypatch.setattr(grid_module, "SURVEY", 48)
-    evaluate, looked = grid_module._evaluate, []
-
-    def counted(function, count, index, n, dj):
-        looked.append((n, len(index)))
-        return evaluate(function, count, index, n, dj)
-
-    monkeypatch.setattr(grid_module, "_evaluate", counted)
-    some = GridField(network, 112, mi)
-    assert looked[0] == (48, 48**3) and looked[1][0] == 112 and looked[1][1] < 112**3 / 2
-    monkeypatch.setattr(grid_module, "SURVEY", 112)
-    assert (some._log_sigma.values() == GridField(network, 112, mi)._log_sigma.values()).all()
-
-
-def test_grid_knows_where_density_is(rng):
-    network = NetworkField(*fields.blobs([(-0.3, 0.1, 0.0)], [0.25]), mi)
-    grid = GridField(network, 96, mi)
-    x = rng.uniform(-1, 1, (200000, 3))
-    sigma = np.array(grid.density(arrays(x)))
-    dense = x[sigma > 0]
-    cell = np.minimum(((dense + 1) / 2 * CELLS).astype(int), CELLS - 1)
-    clearance = np.array(grid.clearance).reshape(CELLS, CELLS, CELLS)
-    assert (clearance[cell[:, 2], cell[:, 1], cell[:, 0]] == 0).all()
-    assert (dense.min(0) >= grid.bounds[0]).all() and (dense.max(0) <= grid.bounds[1]).all()
-    assert sigma.max() <= grid.majorant * (1 + 1e-6)
-    # Seen from anywhere, the hull covers the density, and not much more: √3 voxels, and as many that no random x met.
-    for direction in rng.normal(size=(100, 3)):
-        direction /= np.linalg.norm(direction)
-        assert (dense @ direction).max() <= (grid.hull @ direction).max()
-        assert (grid.hull @ direction).max() < (dense @ direction).max() + 3.5 * 2 / 96
-
-
-def test_clearance_is_the_chebyshev_distance(rng):
-    network = NetworkField(*fields.blobs([(0.1, 0.1, 0.0)], [0.2]), mi)
-    clearance = np.array(GridField(network, 64, mi).clearance).reshape((CELLS,) * 3)
-    occupied = np.argwhere(clearance == 0)
-    for cell in rng.integers(0, CELLS, (50, 3)):
-        truth = np.abs(occupied - cell).max(axis=1).min()
-        assert clearance[tuple(cell)] == min(truth, 16)
-
-
-def test_empty_field():
-    grid = GridField(NetworkField(*fields.empty(), mi), 32, mi)
-    assert grid.majorant == 0 and (grid.hull == 0).all()
-    assert (np.array(grid.clearance) > 0).all()
-
-
-def test_voxels(variant, rng):
-    """Trilinear between the values, beyond the outer centres as on them; values as they are to half a level."""
-    values = rng.uniform(-9, 7, (17, 17, 17)).astype(np.float32)
-    voxels, level = grid_module._Voxels(values, mi), np.ptp(values) / 0xFFFF
-    np.testing.assert_allclose(voxels.values(), values, atol=0.51 * level)
-    p = rng.uniform(-1.1, 1.1, (50_000, 3))
-    places = ((p[:, ::-1] + 1) * 17 / 2 - 0.5).T
-    truth = map_coordinates(values.astype(np.float64), places, order=1, mode="nearest")
-    np.testing.assert_allclose(np.array(voxels(arrays(p))), truth, atol=0.51 * level + 6e-5)
-    assert (grid_module._Voxels(np.full((16, 16, 16), 3, np.float32), mi).values() == 3).all()
-    unknown = np.array(voxels(arrays(np.array([[np.nan, 0, 0], [0, np.inf, 0], [0, 0, -np.inf]]))))
-    assert np.isfinite(unknown[1:]).all()
-
-
 def test_hulls_hold_what_voxels_reach(rng):
     """Along the axes exactly; along others to within what lies between the directions that are asked for, 4° apart:
     the sphere's 1 − cos 2°, a corner's more. A voxel fades out at its neighbours' centres."""
@@ -274,7 +209,7 @@ def test_hulls_hold_what_voxels_reach(rng):
     axis = (np.arange(n) + 0.5) * (2 / n) - 1
     z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
     dense = (x * x + y * y + z * z < 0.3) | ((abs(x - 0.5) < 0.2) & (abs(y) < 0.1) & (abs(z + 0.4) < 0.3))
-    hull = grid_module._support_points(dense)
+    hull = support_points(np.argwhere(dense)[:, ::-1], n)
     voxels = np.stack([c[dense] for c in (x, y, z)], 1)
     directions = rng.normal(size=(300, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -284,4 +219,4 @@ def test_hulls_hold_what_voxels_reach(rng):
         assert missed.min() > -1e-12 and missed.max() < most
     assert missed.mean() < 0.002
     assert len(hull) <= 1206
-    np.testing.assert_array_equal(grid_module._support_points(np.zeros((4, 4, 4), bool)), np.zeros((1, 3)))
+    np.testing.assert_array_equal(support_points(np.zeros((0, 3)), 4), np.zeros((1, 3)))

@@ -9,15 +9,15 @@ from helpers.variants import VARIANT
 
 from mi_ntf.core import ops
 from mi_ntf.core import skin as formulas
-from mi_ntf.infer.grid import GridField
+from mi_ntf.infer.grid import baked
 from mi_ntf.infer.network import NetworkField
-from mi_ntf.infer.skin import Softness, spread
+from mi_ntf.infer.skin import measured, spread
 
 
 def softness(header, tensors, x) -> np.ndarray:
     mi.set_variant(VARIANT)
-    grid = GridField(NetworkField(header, tensors, mi), 192, mi)
-    return np.array(Softness(grid, mi)(arrays(x)))
+    grid = baked(NetworkField(header, tensors, mi), 192, mi)
+    return np.array(measured(grid, mi)(arrays(x)))
 
 
 def at_depths(kind: str, heights, n: int = 400) -> np.ndarray:

@@ -80,7 +80,7 @@ def test_close_to_marches_on_a_captured_object(statue):
     x = skin(medium, 60_000, 1)
     d = unit(x.shape[1], 3)
     steps = tuple(mi.Float(s / 4) for s in raymarch.default_steps(2 / 384))
-    truth = tau(raymarch.RayMarch(medium.source.density, medium.field.grid, steps), x, d)
+    truth = tau(raymarch.RayMarch(medium.source, steps), x, d)
     error = tau(atlas, x, d) - truth
     print(f"mean {error.mean() / truth.mean():+.2%}, RMS {np.sqrt((error**2).mean()):.3f}")
     assert x.shape[1] > 20_000 and 0.1 < truth.mean() < 0.6

@@ -12,7 +12,7 @@ from helpers.jit import arrays
 from helpers.variants import VARIANT
 
 from mi_ntf.core import logistic, mixture, ops
-from mi_ntf.infer.grid import GridField
+from mi_ntf.infer.grid import baked
 from mi_ntf.infer.lights import LightTable
 from mi_ntf.infer.network import NetworkField
 from mi_ntf.infer.profile import DepthProfile
@@ -54,7 +54,7 @@ def marched(grid, x, name):
     wi, distance = towards(x, name)
     steps = tuple(mi.Float(s) for s in (1 / 512, 1 / 512, 0.1))
     depth = optical_depth(
-        grid.density, grid, arrays(x), arrays(wi), mi.Float(distance), steps, dr.full(mi.Bool, True, len(x))
+        grid, arrays(x), arrays(wi), mi.Float(distance), steps, dr.full(mi.Bool, True, len(x))
     )
     return np.exp(-np.array(depth))
 
@@ -234,8 +234,8 @@ def test_light_deep_in_opaque_matter(components, rng):
         if name.startswith("transmittance"):
             values *= 0.2
     network = NetworkField(header, tensors, mi)
-    grid = GridField(network, 48, mi)
-    reader = DepthProfile(grid.density, grid, mi.Float(1 / 512))
+    grid = baked(network, 48, mi)
+    reader = DepthProfile(grid, mi.Float(1 / 512))
     where = np.array([[0.05, -0.1, 0.02]])
     lights = LightTable(where, np.ones((1, 3)), np.array([True]), 1.0, mi)
     whole = lambda o, d, begin=None: reader(o, d)  # noqa: E731 — the light lies on a ray the network knows whole

@@ -41,7 +41,7 @@ def test_light_table_units():
 
 def test_raymarch_sees_lights_inside_matter(grid):
     """The march stops at the light."""
-    march = raymarch.RayMarch(grid.density, grid, tuple(mi.Float(s) for s in raymarch.default_steps(2 / 384)))
+    march = raymarch.RayMarch(grid, tuple(mi.Float(s) for s in raymarch.default_steps(2 / 384)))
     x, d = arrays([[-0.3, 0.0, 0.9], [-0.3, 0.0, 0.9]]), arrays([[0, 0, -1.0], [0, 0, -1.0]])
     tau = np.array(march.tau(x, d, mi.Float([0.4, 1.0]), mi.UInt32(0), dr.full(mi.Bool, True, 2)))
     assert tau[0] > 0.95 and tau[1] < 1e-3

@@ -14,6 +14,7 @@ from mi_ntf import cli
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.infer.lights import LightTable
 from mi_ntf.infer.visibility import transmittance_atlas
+from mi_ntf.render import user_cache
 from mi_ntf.render.commands.bake import bake
 from mi_ntf.render.lights import scene_lights as lights_module
 from mi_ntf.render.maps import building, map_cache, map_file
@@ -141,7 +142,7 @@ def test_parts_of_a_table_are_its_lights():
 @pytest.fixture
 def cache(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setenv("MI_NTF_MAP_CACHE", "on")
+    monkeypatch.setenv("MI_NTF_CACHE", "on")
     map_cache.forget()
     yield tmp_path / "mi-ntf" / "maps"
     map_cache.forget()
@@ -165,10 +166,10 @@ def test_cache_in_memory_and_on_disk(medium, cache, monkeypatch):
     file.write_bytes(b"nonsense")
     np.testing.assert_array_equal(np.array(build(medium, table(), options).values), np.array(first.values))
     assert file.stat().st_size > 1000
-    monkeypatch.setenv("MI_NTF_MAP_CACHE", "off")
+    monkeypatch.setenv("MI_NTF_CACHE", "off")
     assert build(medium, table(), options) is not build(medium, table(), options)
-    monkeypatch.setenv("MI_NTF_MAP_CACHE", "no")
-    with pytest.raises(MiNtfError, match='MI_NTF_MAP_CACHE is "no", expected on, memory or off'):
+    monkeypatch.setenv("MI_NTF_CACHE", "no")
+    with pytest.raises(MiNtfError, match='MI_NTF_CACHE is "no", expected on, memory or off'):
         build(medium, table(), options)
 
 
@@ -176,7 +177,7 @@ def test_cache_keeps_within_its_limits(medium, cache, monkeypatch):
     """Maps too large for a file are not written; of the files, those used last stay; memory keeps the newest."""
     options = dataclasses.replace(OPTIONS, cache=True)
     size = 4 * len(build(medium, table(), options).values)
-    monkeypatch.setattr(map_cache, "FOLDER_LIMIT", int(2.5 * (size + 128)))
+    monkeypatch.setattr(user_cache, "FOLDER_LIMIT", int(2.5 * (size + 200)))
     seen = list(cache.glob("*"))
     for k in range(4):
         for file in cache.glob("*"):
@@ -187,7 +188,7 @@ def test_cache_keeps_within_its_limits(medium, cache, monkeypatch):
     options = dataclasses.replace(options, map_memory=2 * size / 2**20)
     last = build(medium, table(0.5), options)
     assert len(map_cache._maps) == 2 and last in map_cache._maps.values()
-    monkeypatch.setattr(map_cache, "LARGEST_FILE", size - 1)
+    monkeypatch.setattr(user_cache, "LARGEST_FILE", size - 1)
     before = set(cache.glob("*"))
     build(medium, table(0.6), options)
     assert set(cache.glob("*")) == before

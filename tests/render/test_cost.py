@@ -11,6 +11,7 @@ from helpers.variants import VARIANT
 import mi_ntf.render
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.infer.visibility import REGISTRY, transmittance_atlas
+from mi_ntf.infer.visibility.method import resolution_for
 from mi_ntf.infer.visibility.raymarch import light_steps
 from mi_ntf.render.commands import calibration
 from mi_ntf.render.cost import model
@@ -115,10 +116,11 @@ def test_auto_takes_the_cheapest(work, best):
     assert "shading points with" in reason and f"s by {best}, " in reason
 
 
-@pytest.mark.parametrize("points, best", [(1000, "raymarch"), (1300, "transmittance_map")])
+@pytest.mark.parametrize("points, best", [(1300, "raymarch"), (1500, "transmittance_map")])
 def test_maps_pay_early_where_steps_are_queries(points, best):
     """The paper's regime: a march of network queries, a fourth of its steps, against one query of the ray network. Half
-    of the points face the light: 0.5 · 88 · 0.25 = 11 queries a point, 12 868 for the map."""
+    of the points face the light: 0.5 · 88 · 0.25 = 11 queries a point, 12 868 for the map, and
+    a fifth more counts as equal."""
     slow = replace(KNOT, density=5700, ray=5700)
     paper = replace(WORK, points=points, lights=1, network=True, source="network")
     assert model.choose(paper, slow)[0] == best
@@ -241,3 +243,17 @@ def test_rays_of_the_calibration_meet_the_object(tmp_path):
     points = calibration.seen_points(medium)
     assert 0.3 < calibration._covered(medium.field.grid) < 1  # spheres side by side, in their square
     assert (mi.Float(medium.field.grid.density(points.x)) > 0.1).numpy().mean() > 0.99
+
+
+@pytest.mark.parametrize(("atlas", "best"), [(1.15, "transmittance_atlas"), (1.25, "transmittance_map")])
+def test_of_two_that_are_alike_auto_takes_the_less_biased(monkeypatch, atlas, best):
+    seconds = {"raymarch": 5.0, "transmittance_map": 1.0, "transmittance_atlas": atlas}
+    monkeypatch.setattr(model, "visibility", lambda work, prices: 1e9 * seconds[work.method])
+    assert model.choose(WORK, KNOT)[0] == best
+
+
+@pytest.mark.parametrize(("lights", "side"), [(0, 384), (1, 384), (4, 384), (8, 271), (16, 192), (512, 192)])
+def test_maps_are_as_fine_as_voxels_for_few_lights(lights, side):
+    assert resolution_for(lights, 384) == side
+    assert REGISTRY["transmittance_volume"].resolution(lights, 384) == 192
+    assert resolution_for(1, 64) == 192

@@ -91,7 +91,7 @@ def test_the_good_scene_renders(path):
         ({"medium": GOOD + '<phase type="isotropic"/>'}, "nrf medium: it has no place for the nested IsotropicPhase"),
         ({"medium": GOOD + '<integer name="samples" value="100"/>'}, 'nrf medium: unknown property "samples"'),
         ({"medium": GOOD + '<integer name="resolution" value="9999"/>'},
-         "resolution is 9999, expected an integer, 16 to 512"),
+         "resolution is 9999, expected an integer, 16 to 1024"),
         ({"medium": GOOD + '<string name="representation" value="mesh"/>'},
          'representation is "mesh", expected one of grid'),
         ({"medium": GOOD + '<transform name="to_world"><scale x="1" y="2" z="1"/></transform>'}, "is no similarity"),

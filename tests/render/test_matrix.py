@@ -30,7 +30,7 @@ KINDS = ("point", "spot", "directional", "constant", "envmap", "sunsky", "area",
 @pytest.fixture(autouse=True)
 def one_atlas_a_field(monkeypatch):
     """Made once for all emitters."""
-    monkeypatch.setenv("MI_NTF_MAP_CACHE", "memory")
+    monkeypatch.setenv("MI_NTF_CACHE", "memory")
 
 
 def images(name: str, kind: str, methods) -> dict[str, np.ndarray]:

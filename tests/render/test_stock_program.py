@@ -1,6 +1,7 @@
 """The stock `mitsuba` program with the plugins of this package: same picture as Python, clean exits, clear errors."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -91,6 +92,21 @@ def test_our_program_writes_what_it_achieved_into_the_header(folder, tmp_path):
         found = json.loads(file.header()["mi_ntf"])
     assert found["ended"] == "noise" and found["noise"] <= 0.05 and found["visibility"] == "raymarch"
     np.testing.assert_array_equal(read_image(tmp_path / "mi-ntf.exr"), read_image(tmp_path / "mitsuba.exr"))
+
+
+def test_it_says_what_it_does(folder, tmp_path):
+    """What is loaded, what `auto` chose and why, what is built, and the seconds of it; the film is developed last."""
+    path = write(folder)
+    done = run_program("mitsuba", "-m", "llvm_ad_rgb", "-D", "visibility=auto", "-o", tmp_path / "a.exr", path,
+                       cwd=tmp_path)
+    text = done.stdout + done.stderr
+    lines = [r"nrf medium: baked .*blobs.safetensors, \d+³ voxels \([\d.]+ s\)",
+             r"nrf medium: loaded .*blobs.safetensors \([\d.]+ s\)",
+             r"nrf integrator: auto takes visibility=\w+: about [\de.+]+ shading points with 1 lights: [\d.e-]+ s by",
+             r"nrf integrator: done, \d+ × \d+ pixels with \d+ samples each \([\d.]+ s\)", r"Developing"]
+    places = [re.search(line, text) for line in lines]
+    assert all(places), text
+    assert [m.start() for m in places] == sorted(m.start() for m in places), text
 
 
 @pytest.mark.parametrize("runs", [4, pytest.param(20, marks=pytest.mark.slow)])

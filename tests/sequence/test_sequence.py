@@ -221,7 +221,7 @@ def test_pictures_that_are_no_sums_over_lights_are_refused(scene, tmp_path):
 
 @pytest.fixture
 def kept_maps(monkeypatch):
-    monkeypatch.setenv("MI_NTF_MAP_CACHE", "memory")
+    monkeypatch.setenv("MI_NTF_CACHE", "memory")
     map_cache.forget()
     yield
     map_cache.forget()

@@ -94,7 +94,7 @@ def test_passes_add_up(scene):
 
 
 def test_only_the_layer_of_a_moved_light_is_rendered_and_its_map_alone_made(scene, monkeypatch):
-    monkeypatch.setenv("MI_NTF_MAP_CACHE", "memory")
+    monkeypatch.setenv("MI_NTF_CACHE", "memory")
     map_cache.forget()
     made = []
     cached = map_cache.cached

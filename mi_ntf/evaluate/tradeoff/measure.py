@@ -46,7 +46,7 @@ class Timing:
 @contextmanager
 def maps_in_memory() -> Iterator[None]:
     """Within, transmittance maps are kept in memory and in no file, and there are none yet."""
-    name = "MI_NTF_MAP_CACHE"
+    name = "MI_NTF_CACHE"
     before = os.environ.get(name)
     os.environ[name] = "memory"
     map_cache.forget()

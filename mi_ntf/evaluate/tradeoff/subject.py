@@ -11,6 +11,7 @@ from ...core.errors import MiNtfError
 from ...render.commands.explain import works
 from ...render.cost import model
 from ...render.lights import scene_lights
+from ...render.maps import building
 from ...render.plugins.registration import load_scene
 from ...render.scene import changed, effects
 from ...render.scene.media import find_media
@@ -53,8 +54,8 @@ class Subject:
         self.lights = len(light.rows.power) + len(light.sampled)
         self.base = Point(
             "auto", sensor.sampler().sample_count(), self.own.max_depth, self.own.samples, self.own.light_samples,
-            self.own.environment_lights, self.own.map_resolution, self.own.map_source, self.own.map_components,
-            media[0].representation)
+            self.own.environment_lights, building.resolved(Settings.of(self.own), self.lights, media).map_resolution,
+            self.own.map_source, self.own.map_components, media[0].representation)
         self.serves = {name: all(method.needs(m) for m in media) for name, method in model.REGISTRY.items()}
 
     def load(self, point: Point, picture: Picture):

@@ -13,6 +13,18 @@ ASKED = 0.06, 0.27
 """Share of the steps of maps and volumes at which the field is asked, of an opaque thing (0.05 to 0.12 on four) and of
 smoke (0.24, 0.31): its grid tells where nothing is, and a march ends where no light is left."""
 
+COARSEST, FINE_MAPS = 192, 4
+"""Texels along a side of the maps of many lights, at least; number of lights whose maps are as fine as the voxels."""
+
+
+def resolution_for(lights: int, voxels: int) -> int:
+    """Return the texels along a side of the maps of so many lights, where the user names none.
+
+    Texels are as fine as the field's voxels, of which there are `voxels` across its sphere, for up to ``FINE_MAPS``
+    lights. More lights share as many texels.
+    """
+    return max(COARSEST, int(voxels * min(1, FINE_MAPS / max(lights, 1)) ** 0.5))
+
 
 @dataclass(frozen=True)
 class Options:
@@ -23,7 +35,7 @@ class Options:
     for the next frame and on disk (:mod:`mi_ntf.render.maps.map_cache`)."""
 
     step: float
-    map_resolution: int = 192
+    map_resolution: int = COARSEST
     map_source: str = "field"
     map_components: int = 1
     half: bool = False
@@ -54,10 +66,11 @@ class Method:
                  in float32 numbers
     per_field    `making` and `numbers` are of all that is held for a field, whatever the lights
     dials        properties of the integrator that it reads
+    resolution   ``(lights, voxels)`` → texels along a side where the user names none
     drawn        name of the method that serves lights which are drawn at random, and all other rays; "": itself
     candidates   draws that a random light is resampled from: as many as are cheap beside one visibility
     derivatives  whether places of lights have derivatives
-    automatic    whether ``auto`` may choose it
+    automatic    rank among the methods that ``auto`` may choose from, the least biased first; 0: it may not
     needs        ``(medium)`` → whether the field can serve it
     trial        ``(resolution, lights)`` that its prices are measured with
     """
@@ -71,10 +84,11 @@ class Method:
     numbers: Callable[[Any, Any, Options], int] | None = None
     per_field: bool = False
     dials: tuple[str, ...] = ()
+    resolution: Callable[[int, int], int] = resolution_for
     drawn: str = ""
     candidates: int = 8
     derivatives: bool = False
-    automatic: bool = False
+    automatic: int = 0
     needs: Callable[[Any], bool] = lambda medium: True
     trial: tuple[int, int] = (128, 4)
 

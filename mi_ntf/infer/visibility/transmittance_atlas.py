@@ -211,6 +211,6 @@ METHOD = Method(
     per_field=True,
     candidates=2,
     dials=("map_source", "map_file"),
-    automatic=True,
+    automatic=2,
     trial=(128, 256),  # of few lights, what is found once for a point is much of it
 )

@@ -171,6 +171,6 @@ METHOD = Method(
     numbers=width,
     dials=("map_resolution", "map_source", "map_components", "map_memory", "map_file"),
     drawn="raymarch",
-    automatic=True,
+    automatic=3,
     trial=(128, 256),  # maps of so many lights fit no cache, and neither do a scene's
 )

@@ -10,10 +10,10 @@ import numpy as np
 from ...core import spheres
 from ...core.errors import MiNtfError
 from .. import ops
-from ..bundle import clear_distance, density_where, safe_inverse
+from ..bundle import density_where, safe_inverse
 from ..lights import LightTable
 from .light_rays import LightRays
-from .method import FILLED, Method, Options, queries
+from .method import COARSEST, FILLED, Method, Options, queries
 from .raymarch import MAX_OPTICAL_DEPTH
 
 ENTRIES = 1.5
@@ -23,15 +23,14 @@ ENTRIES = 1.5
 class TransmittanceVolume:
     """Tables of all lights of a table, `resolution`² rays of `depths` entries each.
 
-    `density`: σ at a point; `grid`: a :class:`mi_ntf.infer.grid.GridField`, or what has its ``clearance``, whose empty
-    space is not asked for σ, and its ``hull``. The entries of a ray divide t' ∈ [−R, R] evenly, R the hull's radius;
+    `volume`: a :class:`mi_ntf.infer.grid.Volume`. The entries of a ray divide t' ∈ [−R, R] evenly, R the hull's radius;
     entry j holds τ at the *far* edge of the j-th cell from the light, so light that has passed no cell yet is 1. A
     lookup is trilinear: τ linear along each of the four nearest rays, bilinear between them. Memory: 4 m² n bytes a
     light.
     """
 
-    def __init__(self, lights: LightTable, resolution: int, depths: int, grid, density, dj: ModuleType):
-        self.dj, self.depths, self.grid, hull = dj, depths, grid, grid.hull
+    def __init__(self, lights: LightTable, resolution: int, depths: int, volume, dj: ModuleType):
+        self.dj, self.depths, self.volume, hull = dj, depths, volume, volume.hull
         self.rays = LightRays(lights, hull, resolution, dj)
         if lights.count * resolution**2 * depths >= 1 << 32:
             raise MiNtfError(
@@ -44,7 +43,7 @@ class TransmittanceVolume:
         self.values = dr.ones(dj.Float, lights.count * resolution**2 * depths)
         chunk = max(1, (1 << 22) // resolution**2)
         for first in range(0, lights.count, chunk):
-            self._march(density, *self.rays.all_rays(first, min(chunk, lights.count - first)))
+            self._march(*self.rays.all_rays(first, min(chunk, lights.count - first)))
             dr.eval(self.values)
 
     def tau(self, x, wi, distance, index, active):
@@ -63,20 +62,21 @@ class TransmittanceVolume:
             result += weight * dr.lerp(here, beyond, place - j)
         return dr.select(inside, result, 1)
 
-    def _march(self, density, texel, o, d, end):
+    def _march(self, texel, o, d, end):
         """Fill the rays `texel`: σ at the middle of each cell, or of its part on this side of the light at `end`; asked
         for in occupied space alone, and up to MAX_OPTICAL_DEPTH: what lies behind is dark whatever it holds."""
-        hit, m, _ = spheres.chord(ops, o, d)
+        hit, m, h = spheres.chord(ops, o, d)
         inverse = safe_inverse(d)
 
         def body(j, depth, active):
             near = self._radius - self.dj.Float(j) * self._cell
             length = dr.clip(end - near + self._cell, 0, self._cell)
             t = near - self._cell + 0.5 * length
-            p = tuple(mi + t * di for mi, di in zip(m, d, strict=True))
+            place = self.volume.place(tuple(mi + t * di for mi, di in zip(m, d, strict=True)))
             # Entries behind all light are written still: they begin as 1.
-            matter = active & (clear_distance(self.grid, p, inverse) <= 0) & (depth < MAX_OPTICAL_DEPTH)
-            depth = depth + density_where(matter, density, p) * length
+            matter = active & (dr.abs(t) < h) & (depth < MAX_OPTICAL_DEPTH)
+            matter &= self.volume.clear_distance(place, inverse) <= 0
+            depth = depth + density_where(matter, self.volume, place) * length
             dr.scatter(self.values, dr.exp(-depth), texel * self._n + j, active)
             return j + 1, depth, active & (j + 1 < self._n)
 
@@ -92,8 +92,7 @@ def depths(options: Options) -> int:
 
 def build(medium, table, options: Options, dj, keep) -> TransmittanceVolume:
     """See :class:`mi_ntf.infer.visibility.method.Method`."""
-    grid, density = medium.field.grid, medium.source.density
-    return TransmittanceVolume(table, options.map_resolution, depths(options), grid, density, dj)
+    return TransmittanceVolume(table, options.map_resolution, depths(options), medium.source, dj)
 
 
 METHOD = Method(
@@ -106,6 +105,7 @@ METHOD = Method(
         FILLED * work.texels * ENTRIES * work.samples * (prices.cell + queries(work, prices))),
     numbers=lambda medium, table, options: depths(options),
     dials=("map_resolution", "map_memory"),
+    resolution=lambda lights, voxels: COARSEST,  # its memory grows with the third power
     drawn="raymarch",
     trial=(52, 4),
 )

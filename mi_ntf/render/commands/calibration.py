@@ -33,7 +33,7 @@ def calibrate(medium) -> model.Constants:
     """Constants of this machine, by `medium`'s field; kept in the cache. Takes some seconds, compilation mostly."""
     grid, network = medium.field.grid, medium.field.network
     points, close, many = seen_points(medium), seen_points(medium, RAYS), _table(MANY)
-    skin = bounced.Skin(medium, np.random.default_rng(0))
+    skin = bounced.skin_of(medium, np.random.default_rng(0))
     jobs = {
         "camera": (lambda: _camera(grid, RAYS).t, RAYS * SAMPLES * _covered(grid) / model.COVERAGE),
         "reflect": (lambda: (grid.reflectance(close.x), medium.field.softness(close.x)), RAYS),
@@ -126,7 +126,7 @@ def _covered(grid) -> float:
 def _camera(grid, count: int) -> Samples:
     o, d = _rays(grid, count)
     middle = dr.full(mi.Float, 0.5, count)
-    strand = Strand(grid.density, grid, o, d, dr.opaque(mi.Float, 2 / SAMPLES))
+    strand = Strand(grid, o, d, dr.opaque(mi.Float, 2 / SAMPLES))
     return march.camera_samples([strand], mi.Float(dr.inf), middle, middle)
 
 
@@ -159,4 +159,4 @@ def look_up(method, table, x):
 def _between(grid, skin) -> None:
     """Rays from each patch of the `skin`."""
     rng = np.random.default_rng(0)
-    bounced.meet(grid.density, grid, *radiosity.rays(skin.position, skin.normal, radiosity.FEW, rng), rng)
+    bounced.meet(grid, *radiosity.rays(skin.position, skin.normal, radiosity.FEW, rng), rng)

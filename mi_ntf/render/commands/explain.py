@@ -48,6 +48,7 @@ def explain(scene: Path, parameters: dict[str, str], measure: bool = False) -> d
         media = choice.composition.media
     else:
         light = scene_lights.Lights(loaded, media, settings.light_samples, settings.environment_lights)
+        settings = building.resolved(settings, len(light.rows.power), media)
         found = effects.describe(loaded, settings, sensor, spp, media, light)
     count = light.table(media[0].frame).count
     drawn = effects.drawn(settings, light)

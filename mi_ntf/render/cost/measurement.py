@@ -66,7 +66,7 @@ def watch(work):
 def maps_made_anew():
     """Within, no transmittance map is taken from a cache (:mod:`mi_ntf.render.maps.map_cache`): what it costs is the
     question."""
-    name = "MI_NTF_MAP_CACHE"
+    name = "MI_NTF_CACHE"
     before = os.environ.get(name)
     os.environ[name] = "off"
     try:

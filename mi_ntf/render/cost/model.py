@@ -19,8 +19,8 @@ import numpy as np
 from ... import __version__
 from ...core import radiosity
 from ...infer import march
-from ...infer.grid import CELLS
 from ...infer.visibility import REGISTRY
+from ...infer.visibility.method import resolution_for
 from .. import user_cache
 
 CACHE = "cost.json"
@@ -28,6 +28,8 @@ CACHE = "cost.json"
 PROGRAM = Path(__file__).parents[1] / "commands" / "calibration.py"
 """What measures them."""
 
+ALIKE = 1.2
+"""Ratio of predicted seconds up to which two methods count as equally fast."""
 FACING = 0.5
 """Share of (point, light) pairs whose light falls on the front, the others ask for no visibility."""
 COVERAGE = 0.35
@@ -37,6 +39,9 @@ POINTS_A_HIT = 6.5
 fewer samples 0.6 of it at 96."""
 POINTS_IN_SMOKE = 33.0
 """The same in smoke (`cloud`)."""
+FACES = 1.85
+"""Patches in a cell that holds some of a skin: one for each axis that its normals are nearest to (1.7 to 2.1 on four
+objects)."""
 NOT_SKIPPED = 0.05
 """Share of the samples across the diameter at which a camera ray's march asks the field."""
 
@@ -67,7 +72,7 @@ class Work:
     texels        of a map: m²; `components`: logistics in each
     samples       cells across the unit sphere's diameter
     source        of maps: ``field`` or ``network``
-    network       the field is its networks, not its grid, of `voxels`³
+    network       the field is its networks, not its grid; `held`: bytes of the grid
     opaque        the field is no smoke
     patches       that light bounces between, 0 where it does not by radiosity
     frames        pictures that share what is built for a field; `still`: and for each light
@@ -82,7 +87,7 @@ class Work:
     source: str = "field"
     components: int = 1
     network: bool = False
-    voxels: int = 192
+    held: int = 0
     opaque: bool = True
     patches: int = 0
     drawn: int = 0
@@ -124,8 +129,8 @@ def visibility(work: Work, c: Constants) -> float:
 
 
 def choose(work: Work, c: Constants | None = None) -> tuple[str, str]:
-    """``(method, reason)`` of ``visibility=auto``: the cheapest, by :func:`visibility`, of the methods that serve what
-    there is. ``work.method`` is not read."""
+    """Return the method of ``visibility=auto``, and why: the least biased of those whose predicted seconds
+    (:func:`visibility`) are within ``ALIKE`` of the least. ``work.method`` is not read."""
     prices = c or constants()
     found = {}
     for name, method in REGISTRY.items():
@@ -135,7 +140,9 @@ def choose(work: Work, c: Constants | None = None) -> tuple[str, str]:
     lights = " and ".join(f"{n} {kind}" for n, kind in (
         (work.lights, "lights"), (work.drawn, "drawn ones")) if n) or "no light"
     costs = ", ".join(f"{found[name]:.2g} s by {name}" for name in best)
-    return best[0], f"about {work.points:.2g} shading points with {lights}: {costs}"
+    alike = [name for name in best if found[name] <= ALIKE * found[best[0]]]
+    reason = f"about {work.points:.2g} shading points with {lights}: {costs}"
+    return min(alike, key=lambda name: REGISTRY[name].automatic), reason
 
 
 def work(integrator, medium, method: str, rays: int, lights: int = 1, drawn: int = 0, others: float = 0.0) -> Work:
@@ -143,23 +150,25 @@ def work(integrator, medium, method: str, rays: int, lights: int = 1, drawn: int
     as many `drawn` ones, with as many rays of `others`. Shading points are guessed: an opaque object in the picture."""
     network, opaque = integrator.map_source == "network", medium.field.softness.opaque
     points = rays * COVERAGE * (POINTS_A_HIT if opaque else POINTS_IN_SMOKE) * min(integrator.samples / 384, 1) ** 0.35
+    texels = (integrator.map_resolution or resolution_for(lights, medium.field.grid.resolution)) ** 2
     return Work(
         rays=rays, points=points, lights=lights, method=method,
-        texels=integrator.map_resolution**2, samples=integrator.samples, source=integrator.map_source,
+        texels=texels, samples=integrator.samples, source=integrator.map_source,
         components=medium.field.network.components if network else integrator.map_components,
-        network=medium.representation == "network", voxels=medium.field.grid.resolution, drawn=drawn, others=others,
+        network=medium.representation == "network", held=medium.field.grid.nbytes, drawn=drawn, others=others,
         opaque=opaque, frames=integrator.frames,
     )
 
 
 def patches(grid) -> int:
-    """About how many patches (:class:`mi_ntf.render.transport.bounced.Patches`) the skin in `grid` has: cells between
-    matter and empty space. Those are smaller than patches' cells, which may have a patch for several faces."""
-    matter = np.pad(np.array(grid.clearance).reshape((CELLS,) * 3) == 0, 1)
+    """Return about how many patches (:class:`mi_ntf.render.transport.bounced.Patches`) the skin in `grid` has, by the
+    bricks between matter and empty space."""
+    distances = grid.bricks.distances()
+    matter = np.pad(distances == 0, 1)
     inner = matter.copy()
     for axis in range(3):
         inner &= np.roll(matter, 1, axis) & np.roll(matter, -1, axis)
-    return int(matter.sum() - inner.sum())
+    return int(FACES * (matter.sum() - inner.sum()) * (radiosity.CELLS / len(distances)) ** 2)
 
 
 def seconds(work: Work, c: Constants) -> dict[str, float]:
@@ -186,7 +195,7 @@ def memory(work: Work, chunk: int) -> dict[str, int]:
     share = work.points / max(work.rays, 1) * (2 if work.rays > chunk else 1)
     camera, between = min(chunk, work.rays), work.patches * radiosity.SIDE**2
     return {
-        "field grid": 4 * work.voxels**3 + 32 * min(work.voxels, 128) ** 3,
+        "field grid": work.held,
         # Some 24 floats a shading point, 12 a ray between patches, in arrays that Dr.Jit rounds up to powers of two;
         # and two for each point that a camera ray may have.
         "rays in flight": round(max(camera * (max(share, 1) * 128 + 8 / march.share(work.opaque)), between * 72)),
@@ -237,7 +246,7 @@ def measured() -> Constants | None:
 
 def remember(found: Constants) -> None:
     """Keep `found` for this machine. A cache that cannot be written is no fault of the caller's work."""
-    user_cache.write(CACHE, json.dumps(_read() | {_name(): asdict(found)}, indent=1))
+    user_cache.write_text(CACHE, json.dumps(_read() | {_name(): asdict(found)}, indent=1))
 
 
 def _name() -> str:
@@ -247,7 +256,7 @@ def _name() -> str:
 
 def _read() -> dict:
     try:
-        found = json.loads(user_cache.read(CACHE) or b"{}")
+        found = json.loads(user_cache.read_text(CACHE) or "{}")
     except (ValueError, RecursionError):  # no JSON, no text, or nested without end
         return {}
     return found if isinstance(found, dict) else {}

@@ -10,7 +10,16 @@ from ...infer.texels import DTYPES
 from ...infer.visibility import REGISTRY
 from ...infer.visibility.marched_suns import MarchedSuns
 from ...infer.visibility.method import Options
-from . import map_cache, map_file
+from .. import log
+from . import map_cache
+
+
+def resolved(settings, lights: int, media):
+    """Return `settings` with a `map_resolution` for so many lights where it is 0."""
+    if settings.map_resolution:
+        return settings
+    method = REGISTRY["transmittance_map" if settings.visibility == "auto" else settings.visibility]
+    return settings.but(map_resolution=method.resolution(lights, max(m.field.grid.resolution for m in media)))
 
 
 def options(integrator) -> Options:
@@ -61,6 +70,8 @@ def build(method: str, medium, table, options: Options):
     def keep(width: int, step: float, make, directions=None, own: Options = options, some=None):
         lights = directions or table
         if own.map_file:
+            from . import map_file  # few renders need EXR
+
             resolver = mi.file_resolver()  # type: ignore[operator]  # an object in the stub
             path = Path(str(resolver.resolve(own.map_file)))
             return make(map_file.read(path, medium, lights, own, width))
@@ -71,9 +82,13 @@ def build(method: str, medium, table, options: Options):
         limit = own.map_memory * 2**20 if lights.count == lights.total else 0
         known = map_cache.lights(medium, lights, own, width, step) if some and limit and lights.count > 1 else None
         return map_cache.cached(name, make, lights.count * own.map_resolution**2 * width, limit, known, some,
-                                DTYPES[own.half])
+                                DTYPES[own.half], directions is None)
 
-    return REGISTRY[method].build(medium, table, options, mi, keep)
+    if not REGISTRY[method].numbers:
+        return REGISTRY[method].build(medium, table, options, mi, keep)
+    size = "" if REGISTRY[method].per_field else f", {table.count} × {options.map_resolution}² texels"
+    with log.timed(f"nrf integrator: made the {method}{size}"):
+        return REGISTRY[method].build(medium, table, options, mi, keep)
 
 
 def with_suns(looked_up, suns, medium, table, options: Options) -> MarchedSuns:

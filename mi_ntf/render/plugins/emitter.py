@@ -6,7 +6,7 @@ import mitsuba as mi
 from ...core.errors import MiNtfError
 from ...infer.visibility import REGISTRY, names, outside
 from ...infer.visibility.marched_suns import DRAWN
-from ...infer.visibility.method import Options
+from ...infer.visibility.method import Options, resolution_for
 from ..lights import environment, light_checks, light_rows, scene_lights
 from ..lights.emitter_samples import SHARP
 from ..maps import building
@@ -165,7 +165,7 @@ def _visibility(name: str, inner, medium):
                 "places; choose raymarch or transmittance_atlas"
             )
         table = scene_lights.rows([(inner, kind)], 1).table(medium.frame)
-    options = Options(STEP, cache=True)
+    options = Options(STEP, resolution_for(1, medium.field.grid.resolution), cache=True)
     found = building.build(method, medium, table, options)
     return building.with_suns(found, DRAWN, medium, table, options) if REGISTRY[method].per_field and not one else found
 

@@ -20,8 +20,8 @@ def integrator_class() -> type:
         =================== ======= ===================================================================================
         visibility          string  how light reaches a point: ``raymarch``, ``transmittance_map``,
                                     ``transmittance_atlas``, ``neural_transmittance``, ``ray_network``,
-                                    ``transmittance_volume``, ``visibility_mlp``, ``none``, or ``auto``, the cheapest of
-                                    the first three (default: auto)
+                                    ``transmittance_volume``, ``visibility_mlp``, ``none``, or ``auto``, the least
+                                    biased of the first three that is about as cheap as the cheapest (default: auto)
         samples             integer steps across the unit sphere's diameter (default: 384); flights of further bounces
                                     take 128 at most, between patches 256
         light_samples       integer lights per shading point, drawn from Mitsuba's emitter sampling and resampled, from
@@ -30,7 +30,8 @@ def integrator_class() -> type:
                                     as an area; no map serves these: they are marched under ``transmittance_map``
                                     (default: 0)
         environment_lights  integer most directional lights that stand for an environment (default: 512)
-        map_resolution      integer texels per side of a light's transmittance map (default: 192)
+        map_resolution      integer texels per side of a light's transmittance map; 0: as fine as the field's voxels for
+                                    up to 4 lights, whose texels more lights share, but 192 at least (default: 0)
         map_source          string  ``field``: marched once per texel; ``network``: one query per texel (default: field)
         map_components      integer logistics per texel of a marched map, 1 or 2: two err less on maps of 256² or more
                                     and on what is not opaque, and take four times the memory (default: 1)
@@ -41,8 +42,9 @@ def integrator_class() -> type:
                                     multiple scattering in fields and between surfaces, −1 has no limit and ends paths
                                     by Russian roulette from depth 5 on (default: 2)
         bounces             string  how light of `max_depth` > 2 is found: ``paths``, traced, exact and noisy;
-                                    ``radiosity``, without noise, between opaque fields alone, whose skins count as
-                                    diffuse; ``auto``: ``radiosity`` where nothing else takes part (default: auto)
+                                    ``radiosity``, without noise and biased, between opaque fields alone, whose
+                                    skins count as diffuse; ``auto``: ``radiosity`` where nothing else takes part
+                                    (default: auto)
         aovs                string  further outputs, a comma-separated list of ``depth``, ``normal``, ``albedo``,
                                     ``roughness``, ``opacity``, ``visibility``, ``visibility_lights``: see
                                     :mod:`mi_ntf.render.transport.aovs` (default: none)
@@ -95,7 +97,7 @@ def integrator_class() -> type:
             self.samples = read.whole("samples", 384, 8, 8192)
             self.light_samples = read.whole("light_samples", 0, 0, 65536)
             self.environment_lights = read.whole("environment_lights", 512, 1, 65536)
-            self.map_resolution = read.whole("map_resolution", 192, 4, 4096)
+            self.map_resolution = read.whole("map_resolution", 0, 0, 4096)
             self.map_components = read.whole("map_components", 1, 1, 2)
             self.map_memory = read.number("map_memory", 1024.0, 0.0, 2.0**24)
             self.map_file = read.text("map_file", "")

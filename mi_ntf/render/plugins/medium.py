@@ -7,6 +7,7 @@ import mitsuba as mi
 
 from ...core.architecture import MAX_LOG_DENSITY
 from ...core.errors import MiNtfError
+from ...infer.grid import NetworkVolume
 from ...infer.shade import Reflectance
 from ..scene import loaded
 from ..scene.frame import SCALES, Frame
@@ -38,7 +39,7 @@ def medium_class(phase_class: type) -> type:
         to_world         transform placement after `scale`; rotation, translation, uniform scale (default: identity)
         scale            float     scene units per capture unit, > 0 (default: 1)
         representation   string    ``grid``: baked voxels; ``network``: the networks, exact and slower (default: grid)
-        resolution       integer   voxels per side of the baked grid, 16 to 512 (default: by the field, 192 or more)
+        resolution       integer   voxels per side of the baked grid, 16 to 1024 (default: by the field, 192 or more)
         sample_emitters  boolean   as of any medium: for stock volumetric integrators (default: true)
         ================ ========= ====================================================================================
 
@@ -65,10 +66,11 @@ def medium_class(phase_class: type) -> type:
             to_world = read.placement("to_world")
             scale = read.number("scale", 1.0, *SCALES)
             self.representation = read.choice("representation", "grid", REPRESENTATIONS)
-            resolution = read.whole("resolution", None, 16, 512)
+            resolution = read.whole("resolution", None, 16, 1024)
             read.flag("sample_emitters", True)
             self.field = loaded.load(path, resolution)
-            self.source = self.field.grid if self.representation == "grid" else self.field.network
+            grid, bound = self.field.grid, math.exp(MAX_LOG_DENSITY)  # the networks are bounded by their clipping alone
+            self.source = grid if self.representation == "grid" else NetworkVolume(self.field.network, grid, bound)
             architecture = self.field.header.architecture
             self.reflectance = _reflectance(self.source, self.field.softness, architecture.fresnel)
             self.frame = Frame(self.field.header.similarity, to_world, scale)
@@ -81,10 +83,8 @@ def medium_class(phase_class: type) -> type:
             self.m_is_homogeneous = False
             self.m_has_spectral_extinction = False
             self._density_unit = dr.opaque(mi.Float, 1 / self.frame.length)
-            # Trilinear interpolation stays below the voxels' maximum; the networks are bounded by their clipping alone.
-            bound = self.field.grid.majorant if self.representation == "grid" else math.exp(MAX_LOG_DENSITY)
-            self._majorant = dr.opaque(mi.Float, max(bound, 1e-3) / self.frame.length)
-            low, high = self.field.grid.bounds
+            self._majorant = dr.opaque(mi.Float, max(self.source.majorant, 1e-3) / self.frame.length)
+            low, high = self.source.bounds
             self._low, self._high = (mi.Point3f(*map(float, side)) for side in (low, high))
             dr.make_opaque(self._low, self._high)
 

@@ -13,9 +13,11 @@ import numpy as np
 from ...core import field_file
 from ...core.architecture import Header
 from ...infer.backend import module
+from ...infer.bake import VERSION, bake
 from ...infer.grid import GridField
 from ...infer.network import NetworkField
-from ...infer.skin import Softness
+from ...infer.skin import Softness, measure
+from .. import log, user_cache
 
 QUEUED = 1 << 16
 """Width of a kernel that Dr.Jit queues instead of running it at once: several blocks."""
@@ -66,12 +68,42 @@ def _begin_other_media(variant: str) -> None:
 
 
 @lru_cache(maxsize=4)
-def _load(path: str, _stamp: tuple | None, resolution: int | None, variant: str) -> LoadedField:
+def _load(path: str, _identity: tuple | None, resolution: int | None, variant: str) -> LoadedField:
     dj = module(variant)
     header, tensors = field_file.load(path)
-    network = NetworkField(header, tensors, dj)
-    grid = GridField(network, resolution or voxels(header), dj)
-    return LoadedField(header, network, grid, Softness(grid, dj), _digest(header, tensors))
+    with log.timed(f"nrf medium: loaded {path}"):
+        network, digest = NetworkField(header, tensors, dj), _digest(header, tensors)
+        n = resolution or voxels(header)
+        known = field_file.load_baked(path, _stamp(digest, n))
+        if known is not None:
+            try:
+                return LoadedField(header, network, GridField(known, network, dj), Softness(known, dj), digest)
+            except (KeyError, ValueError):
+                log.info(f"nrf medium: the voxels in {path} are damaged")
+        arrays = user_cache.kept("fields", user_cache.key(digest, n), lambda: _baked(path, network, n, dj))
+        return LoadedField(header, network, GridField(arrays, network, dj), Softness(arrays, dj), digest)
+
+
+def add_baked(path: Path, resolution: int | None = None) -> dict:
+    """Bake a field file and put the voxels into it, so that no later load bakes; return ``file``, ``voxels`` and
+    ``bytes``. Raises MiNtfError."""
+    header, tensors = field_file.load(path)
+    dj = module(str(mi.variant()))
+    n = resolution or voxels(header)
+    arrays = _baked(str(path), NetworkField(header, tensors, dj), n, dj)
+    field_file.add_baked(path, arrays, _stamp(_digest(header, tensors), n))
+    return {"file": str(path), "voxels": n, "bytes": Path(path).stat().st_size}
+
+
+def _baked(path: str, network: NetworkField, n: int, dj) -> dict[str, np.ndarray]:
+    with log.timed(f"nrf medium: baked {path}, {n}³ voxels"):
+        arrays = bake(network, n, dj, log.Progress(f"nrf medium: baking {path}, {n}³ voxels"))
+        return arrays | measure(GridField(arrays, network, dj), dj)
+
+
+def _stamp(digest: str, n: int) -> str:
+    """Return what tells that arrays in a field file are baked from its tensors, by this version, at n³ voxels."""
+    return f"{VERSION} {n} {digest}"
 
 
 def _digest(header: Header, tensors: dict) -> str:

@@ -1,5 +1,6 @@
 """Further bounces of light within fields, without noise: radiosity between patches of their skins."""
 
+import time
 from typing import Any
 
 import drjit as dr
@@ -10,6 +11,7 @@ from ...core import microfacet, radiosity
 from ...infer import march, shade
 from ...infer.bundle import Strand
 from ...infer.irradiance import Irradiance
+from .. import log, user_cache
 
 SEED = 7
 DRAWS = 16
@@ -17,27 +19,44 @@ DRAWS = 16
 
 
 class Patches:
-    """The skins of all fields of `composition` (:class:`mi_ntf.render.transport.composition.Composition`) and what
-    their patches see of each other, whatever the lights. `first`: number of each skin's first patch; `hits` (patches,
-    rays)."""
+    """The skins of all fields of a scene and what their patches see of each other, whatever the lights.
+
+    `composition`: a :class:`mi_ntf.render.transport.composition.Composition`. `first`: number of each skin's first
+    patch; `hits` (patches, rays): the patch that each ray meets, −1 for none. They are found in the user's cache.
+    """
 
     def __init__(self, composition):
-        rng = np.random.default_rng(SEED)
         self._key = _key(composition)
-        self.skins = [Skin(part.medium, rng) for part in composition.parts]
+        self.skins = [Skin(part.medium) for part in composition.parts]
+        found = user_cache.kept("patches", user_cache.key(*self._key), lambda: self._found(composition),
+                                placed=len(self.skins) > 1)
+        for number, skin in enumerate(self.skins):
+            for name in Skin.ARRAYS:
+                setattr(skin, name, found[f"{number}.{name}"])
+        self.first, self.hits = found["first"], found["hits"]
+        self.albedo = np.concatenate([s.albedo for s in self.skins])
+        log.info(f"nrf integrator: light bounces between {len(self.albedo)} patches of skins, which count as diffuse: "
+                 "fast and biased; bounces=paths is not")
+
+    def _found(self, composition) -> dict[str, np.ndarray]:
+        """Return the arrays of all skins, found by random rays, and `first` and `hits`."""
+        begin = time.perf_counter()
+        rng = np.random.default_rng(SEED)
+        self.skins[:] = [skin_of(part.medium, rng) for part in composition.parts]
         for skin, (x, d, _) in zip(self.skins, self._trace(composition, radiosity.FEW, rng), strict=True):
             skin.add(x, d)
-        self.first = np.cumsum([0, *(len(s.position) for s in self.skins)])
-        self.albedo = np.concatenate([s.albedo for s in self.skins])
-        hits = np.full(self.first[-1] * radiosity.SIDE**2, -1)
+        first = np.cumsum([0, *(len(s.position) for s in self.skins)])
+        hits = np.full(first[-1] * radiosity.SIDE**2, -1, np.int32)
         met_of_skins = self._trace(composition, radiosity.SIDE, rng)
-        for skin, start, met in zip(self.skins, self.first, met_of_skins, strict=False):
+        for skin, start, met in zip(self.skins, first, met_of_skins, strict=False):
             x, d, ray = met
             normal, _ = skin.reflectance(x)
             patch = skin.table[radiosity.place(x, normal)]
             # Nothing comes from matter that is seen from behind.
             hits[ray] = np.where(((normal * d).sum(1) < 0) & (patch >= 0), patch + start, -1)
-        self.hits = hits.reshape(-1, radiosity.SIDE**2)
+        arrays = {f"{i}.{name}": getattr(s, name) for i, s in enumerate(self.skins) for name in Skin.ARRAYS}
+        log.info(f"nrf integrator: found the patches that light bounces between ({time.perf_counter() - begin:.2g} s)")
+        return arrays | {"first": first, "hits": hits.reshape(-1, radiosity.SIDE**2)}
 
     def of(self, composition) -> bool:
         """Whether these are the patches of `composition`, too: of the same fields in the same places."""
@@ -76,9 +95,10 @@ class Patches:
 
 
 def _key(composition) -> tuple:
-    """What patches depend on."""
-    fields = [(m.field.digest, m.representation, m.field.grid.resolution, m.frame.placement())
-              for m in (part.medium for part in composition.parts)]
+    """Return what patches depend on: those of a single field do not on its place."""
+    media = [part.medium for part in composition.parts]
+    fields = [(m.field.digest, m.representation, m.field.grid.resolution, len(media) > 1 and m.frame.placement())
+              for m in media]
     return mi.variant(), min(radiosity.STEPS, composition.settings.samples), tuple(fields)
 
 
@@ -115,12 +135,13 @@ def _direct(composition, part, skin: "Skin") -> np.ndarray:
 
 
 class Skin:
-    """The patches of one `medium`: `position`, `normal`, `albedo` (n, 3); `table`."""
+    """The patches of one `medium`: `position`, `normal`, `albedo` (n, 3); `table`; none before :meth:`add`."""
 
-    def __init__(self, medium, rng):
+    ARRAYS = "position", "normal", "albedo", "table"
+
+    def __init__(self, medium):
         self.frame, self._reflectance = medium.frame, medium.reflectance
         self.position = np.zeros((0, 3))
-        self.add(*_chords(medium, rng))
 
     def add(self, x: np.ndarray, d: np.ndarray) -> None:
         """Points that rays along `d` meet become patches where there are none."""
@@ -141,20 +162,27 @@ class Skin:
         return _rows(found.normal), _rows(albedo)
 
 
+def skin_of(medium, rng) -> Skin:
+    """Return the patches that random lines through the sphere of `medium` meet."""
+    skin = Skin(medium)
+    skin.add(*_chords(medium, rng))
+    return skin
+
+
 def _chords(medium, rng) -> tuple[np.ndarray, np.ndarray]:
     """Points where random lines through the sphere of `medium` meet its skin first, and the lines' directions."""
     o = rng.normal(size=(radiosity.CHORDS, 3))
     o /= np.linalg.norm(o, axis=1, keepdims=True)
     d = -radiosity.directions(o, 1, rng)[:, 0]
-    met, x = meet(medium.source.density, medium.field.grid, o - 0.1 * d, d, rng)
+    met, x = meet(medium.source, o - 0.1 * d, d, rng)
     return x[met], d[met]
 
 
-def meet(density, grid, o: np.ndarray, d: np.ndarray, rng) -> tuple[np.ndarray, np.ndarray]:
-    """Whether rays (n, 3), field coordinates, meet the skin of a field, and where first; `density`, `grid`: as of
-    :class:`mi_ntf.infer.bundle.Strand`."""
+def meet(volume, o: np.ndarray, d: np.ndarray, rng) -> tuple[np.ndarray, np.ndarray]:
+    """Return for rays (n, 3), field coordinates, if they meet the skin of a :class:`mi_ntf.infer.grid.Volume`, and
+    where first."""
     n, start, along = len(o), _vector(o), _vector(d)
-    strand = Strand(density, grid, tuple(start), tuple(along), dr.opaque(mi.Float, 2 / radiosity.STEPS))
+    strand = Strand(volume, tuple(start), tuple(along), dr.opaque(mi.Float, 2 / radiosity.STEPS))
     hit, t, _ = march.free_flight([strand], dr.full(mi.Float, dr.inf, n), mi.Float(rng.random(n)),
                                   [mi.Float(radiosity.DEPTH)])
     x = start + dr.select(hit, t, 0) * along

@@ -12,6 +12,7 @@ from dataclasses import replace
 import mitsuba as mi
 
 from ...infer.visibility import REGISTRY
+from ..maps import building
 from ..scene.settings import Limits, Settings
 from . import estimate
 from .choice import Choice, Kept, Trial
@@ -53,6 +54,7 @@ class Chooser(Trials):
         if not self.limits.error and not by_time:
             return Choice(self._composed(self.settings))
         self.estimate = Estimate(self.scene, self.settings, self.sensor, self._size[0] * self._size[1], self._spp)
+        self.settings = building.resolved(self.settings, len(self.estimate.lights.rows.power), self.estimate.media)
         self._glints = Glints(self._composed, self.estimate, self.sensor, self.settings)
         found = self.estimate.effects
         if found.gradients or not found.needs_visibility or found.visibility == "none":
@@ -204,7 +206,8 @@ class Chooser(Trials):
             if method.automatic and name != "raymarch" and method.per_field == of_all:
                 found.append(settings.but(visibility=name))
                 if set(FINER) <= set(method.dials):
-                    found.append(settings.but(visibility=name, **FINER))
+                    finer = {dial: max(value, getattr(settings, dial)) for dial, value in FINER.items()}
+                    found.append(settings.but(visibility=name, **finer))
         return found
 
     def _without(self, best: Trial, look: Look, omissions: dict, limit: float) -> tuple[Trial, Look]:

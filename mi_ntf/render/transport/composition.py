@@ -13,6 +13,7 @@ from ...infer import march, shade
 from ...infer.bundle import Strand
 from ...infer.visibility import REGISTRY
 from ...infer.visibility.marched_suns import DRAWN
+from .. import log
 from ..cost import measurement
 from ..lights import scene_lights
 from ..maps import building
@@ -59,7 +60,10 @@ class Composition:
         self.media = media = [m for number, m in enumerate(find_media(scene)) if number not in settings.without]
         self.lights = scene_lights.Lights(scene, media, settings.light_samples, settings.environment_lights,
                                           settings.dimmest, settings.only)
+        self.settings = settings = building.resolved(settings, len(self.lights.rows.power), media)
         self.effects = effects.describe(scene, settings, sensor, spp, media, self.lights)
+        if settings.visibility == "auto" and self.effects.needs_visibility:
+            log.info(f"nrf integrator: auto takes visibility={self.effects.visibility}: {self.effects.reason}")
         self._media = [m for m in media if m.field.grid.majorant > 0]
         self._seen = [m for m, visible in zip(media, self.effects.in_view, strict=True) if visible]
         self.smoke, self.rough = not all(m.field.softness.opaque for m in self._seen), False
@@ -170,13 +174,11 @@ class Composition:
         unit = min(p.frame.length for p in parts)
         result = [
             Strand(
-                p.source.density,
-                p.medium.field.grid,
+                p.source,
                 p.frame.point_to_field(ray.o),
                 p.frame.direction_to_field(ray.d),
                 dr.opaque(mi.Float, 2 / (steps or self.settings.samples)),
                 dr.opaque(mi.Float, unit / p.frame.length) if several else None,
-                p.source.cut_log_density if p.source is p.medium.field.grid else None,
             )
             for p in parts
         ]

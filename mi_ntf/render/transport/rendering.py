@@ -8,6 +8,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...core.errors import MiNtfError
+from .. import log
 from ..scene.camera import Camera, Reconstruction
 from ..scene.settings import Limits, Settings
 from . import aovs, camera_light, choosing, passes
@@ -62,6 +63,11 @@ def render(integrator, scene, sensor, seed, spp: int, develop: bool):
         samples = counted.next() if integrator.limits.of_samples else 0
         if samples and composition.rough and counted.noise > integrator.limits.noise:
             composition.rough, halves, samples = False, _Halves(film, 0), counted.again()
+    if not composition.effects.gradients:
+        halves.wait()  # the program develops the film next
+        width, height = film.crop_size()
+        log.info(f"nrf integrator: done, {width} × {height} pixels with {counted.count} samples each "
+                 f"({counted.gone():.2g} s)")
     integrator.achieved = _achieved(integrator.limits, choice, counted)
     if not develop:
         return mi.TensorXf()
@@ -129,7 +135,9 @@ def _trace(integrator, composition, pixels: Reconstruction, picture, seed, count
     rays = getattr(integrator, "chunk", CHUNK) // (IN_SMOKE if composition.smoke else 1)
     chunks = range(0, camera.count, max(1, rays // camera.spp))
     seen = getattr(integrator, "seen", None)
-    for run, first in itertools.product(composition.own, chunks):
+    progress, parts = log.Progress("nrf integrator: rendering"), len(composition.own) * len(chunks)
+    for number, (run, first) in enumerate(itertools.product(composition.own, chunks)):
+        progress(number / parts)
         if integrator.should_stop() or counted.overtime(integrator.timeout):
             _stop(pixels, run, first, len(composition.runs))
             counted.ended = "timeout"

@@ -1,0 +1,211 @@
+"""Sparse volumes: bricks of 8³ trilinear cells where there is anything, and an index that also skips empty space."""
+
+import itertools
+from types import ModuleType
+
+import drjit as dr
+import numpy as np
+
+from .backend import words
+
+SIDE = 8
+"""Cells along an edge of a brick. A brick holds the 9³ voxels around its cells: those on its far faces twice."""
+LINE, LAYER, WORDS = SIDE, SIDE * (SIDE + 1), SIDE * (SIDE + 1) ** 2
+"""Words of a line of voxels, of a layer of lines, and of a brick, for each channel."""
+FARTHEST = 15
+"""Largest distance to the next brick that the index holds, in bricks."""
+_OCTANTS, _DISTANCE = 20, 28
+"""First bits of an index entry's octants and distance; the bits below hold the number of the brick."""
+
+
+def bricks_per_side(resolution: int) -> int:
+    """Return the number of bricks along an edge of a volume of `resolution`³ voxels."""
+    return -(-(resolution - 1) // SIDE)
+
+
+class Bricks:
+    """Channels of trilinear numbers on [−1, 1]³, sampled at the centres of `resolution`³ voxels.
+
+    Parameters
+    ----------
+    arrays
+        Result of :func:`pack`. Raises ValueError where they cannot be that.
+    dj
+        Dr.Jit module of the back end.
+
+    Notes
+    -----
+    A word holds the 16-bit levels of a voxel and of the next one along x, so a lookup takes four fetches for each
+    channel and one of the index. An entry of the index is the number of a brick, one bit for each of its octants that
+    holds anything, and the distance to the next brick that does. Brick 0 is empty.
+
+    Places outside the voxels' centres count as the nearest ones. Whoever needs several things at one point asks for
+    its :meth:`place` once.
+    """
+
+    def __init__(self, arrays: dict[str, np.ndarray], dj: ModuleType):
+        _check(arrays)
+        self._dj, self.resolution = dj, int(arrays["resolution"][0])
+        self.channels, self.side = arrays["range"].shape[1], bricks_per_side(self.resolution)
+        self._index, self._words = (words(arrays[name], dj) for name in ("index", "words"))
+        n = self.resolution
+        last = np.nextafter(np.float32(n - 1), np.float32(0))  # of the last cell, whose next voxel is there
+        self._half, self._first, self._last, self._voxel = (
+            dr.opaque(dj.Float, v) for v in (n / 2, n / 2 - 0.5, last, 2 / n))
+        self._bricks, self._size = (dr.opaque(dj.UInt32, v) for v in (self.side, self.channels * WORDS))
+        self._low, self._step = ([dr.opaque(dj.Float, float(v)) for v in row] for row in arrays["range"])
+
+    @property
+    def nbytes(self) -> int:
+        """Size in bytes."""
+        return 4 * (dr.width(self._words) + dr.width(self._index))
+
+    def place(self, p) -> tuple:
+        """Return where the points `p` lie: in voxels from the first centre, by axis, and their entries in the index."""
+        # NaN must not become an index.
+        place = [dr.fmin(dr.fmax(dr.fma(self._half, c, self._first), 0), self._last) for c in p]
+        x, y, z = (self._dj.UInt32(f) >> 3 for f in place)
+        return *place, dr.gather(self._dj.UInt32, self._index, (z * self._bricks + y) * self._bricks + x)
+
+    def at(self, place: tuple) -> list:
+        """Return the channels at a :meth:`place`."""
+        *cell, entry = place
+        corner = [self._dj.UInt32(f) for f in cell]
+        fx, fy, fz = (f - self._dj.Float(i) for f, i in zip(cell, corner, strict=True))
+        x, y, z = (c & (SIDE - 1) for c in corner)
+        first = (entry & ((1 << _OCTANTS) - 1)) * self._size + z * LAYER + y * LINE + x
+
+        def along_x(index):
+            word = dr.gather(self._dj.UInt32, self._words, index)
+            low = self._dj.Float(word & 0xFFFF)
+            return low + fx * (self._dj.Float(word >> 16) - low)
+
+        def along_y(index):
+            low = along_x(index)
+            return low + fy * (along_x(index + LINE) - low)
+
+        result = []
+        for channel, (low, step) in enumerate(zip(self._low, self._step, strict=True)):
+            near = along_y(first + channel * WORDS)
+            result.append(low + step * (near + fz * (along_y(first + (channel * WORDS + LAYER)) - near)))
+        return result
+
+    def clear_distance(self, place: tuple, inverse_d):
+        """Return the distance that a ray runs through empty space from a :meth:`place`; 0 where there may be anything.
+
+        `inverse_d`: componentwise 1/direction (finite). The distance ends at the empty octant, or at the empty cube of
+        bricks around an empty brick.
+        """
+        *cell, entry = place
+        n = entry >> _DISTANCE
+        half = [self._dj.UInt32(f) >> 2 for f in cell]  # in halves of bricks
+        x, y, z = (h & 1 for h in half)
+        empty = ((entry >> (_OCTANTS + x + 2 * y + 4 * z)) & 1) == 0
+        whole, distance = n > 0, dr.inf
+        ahead = self._dj.Float(dr.select(whole, 2 * n, 1))
+        behind = self._dj.Float(dr.select(whole, 2, 1)) - ahead
+        for f, h, inverse in zip(cell, half, inverse_d, strict=True):
+            begin = self._dj.Float(dr.select(whole, h & ~self._dj.UInt32(1), h))
+            face = begin + dr.select(inverse > 0, ahead, behind)
+            distance = dr.minimum(distance, ((SIDE // 2) * face - f) * inverse)
+        return dr.select(empty, dr.maximum(distance * self._voxel, 0), 0)
+
+    def occupied(self, place: tuple):
+        """Return True where a :meth:`place` lies in a brick that holds anything."""
+        return (place[-1] & ((1 << _OCTANTS) - 1)) > 0
+
+    def distances(self) -> np.ndarray:
+        """Return the Chebyshev distance of each brick (z, y, x) to the next one that holds anything, in bricks."""
+        return (self._index.numpy() >> _DISTANCE).reshape((self.side,) * 3)
+
+
+def pack(values: np.ndarray, places: np.ndarray, octants: np.ndarray, resolution: int,
+         empty: float) -> dict[str, np.ndarray]:
+    """Return the arrays of a :class:`Bricks`.
+
+    Parameters
+    ----------
+    values
+        (bricks, channels, 9, 9, 9) float32, the last three axes z, y, x.
+    places
+        (bricks, 3) positions of the bricks, z first, in bricks.
+    octants
+        (bricks, 2, 2, 2) bool, z first: which octants hold anything.
+    resolution
+        Voxels along an edge of the volume.
+    empty
+        Value of every channel where there is no brick, at most: each value is stored to 1/65535 of its channel's range.
+    """
+    side, count, channels = bricks_per_side(resolution), *values.shape[:2]
+    index = np.zeros((side,) * 3, np.uint32)
+    bits = octants.reshape(-1, 8).astype(np.uint32) @ (1 << np.arange(8, dtype=np.uint32))
+    index[tuple(places.T)] = np.arange(1, count + 1) | bits << _OCTANTS
+    index |= chebyshev_distance(index > 0).astype(np.uint32) << _DISTANCE
+    low, high = (np.full(channels, empty, np.float32) for _ in range(2))
+    if count:
+        low, high = (pick(bound, extreme((0, 2, 3, 4))) for pick, bound, extreme in (
+            (np.minimum, low, values.min), (np.maximum, high, values.max)))
+    step = np.maximum(high - low, np.float32(1e-6)) / 0xFFFF
+    result = np.zeros((count + 1, channels, SIDE + 1, SIDE + 1, SIDE), np.uint32)
+    for channel in range(channels):
+        levels = np.round((values[:, channel] - low[channel]) / step[channel]).astype(np.uint32)
+        result[1:, channel] = levels[..., :-1] | levels[..., 1:] << 16
+    return {"index": index, "words": result, "range": np.stack([low, step]), "resolution": np.array([resolution])}
+
+
+def _check(arrays: dict[str, np.ndarray]) -> None:
+    """Raise the ValueError of arrays from a file that would be read outside of their memory."""
+    index, held, ranges, resolution = (
+        arrays.get(name, np.zeros(0)) for name in ("index", "words", "range", "resolution"))
+    side = bricks_per_side(int(resolution[0])) if resolution.size == 1 else 0
+    whole = (held.ndim == 5 and held.shape[2:] == (SIDE + 1, SIDE + 1, SIDE) and ranges.shape == (2, held.shape[1])
+             and index.shape == (side,) * 3 and index.dtype == held.dtype == np.uint32)
+    if not whole or not np.isfinite(ranges).all() or (index & ((1 << _OCTANTS) - 1)).max() >= len(held):
+        raise ValueError("these are no bricks")
+
+
+def of_dense(values: np.ndarray, wanted: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the arrays of a :class:`Bricks` of `values` (z, y, x, channels) where the voxels `wanted` (z, y, x) are
+    interpolated."""
+    n = len(values)
+    first = SIDE * np.arange(bricks_per_side(n))
+    places = np.argwhere(any_between(wanted, first, first + SIDE))
+    voxels = np.minimum(SIDE * places[..., None] + np.arange(SIDE + 1), n - 1)  # (bricks, axis, 9)
+    z, y, x = voxels[:, 0, :, None, None], voxels[:, 1, None, :, None], voxels[:, 2, None, None, :]
+    return pack(np.moveaxis(values[z, y, x], -1, 1), places, octants_of(wanted[z, y, x]), n, 0.0)
+
+
+def octants_of(dense: np.ndarray) -> np.ndarray:
+    """Return which octants (bricks, 2, 2, 2) interpolate between any voxel that is `dense` (bricks, 9, 9, 9)."""
+    half = SIDE // 2
+    parts = [dense[:, z : z + half + 1, y : y + half + 1, x : x + half + 1].any((1, 2, 3))
+             for z, y, x in itertools.product((0, half), repeat=3)]
+    return np.stack(parts, 1).reshape(-1, 2, 2, 2)
+
+
+def any_between(mask: np.ndarray, first: np.ndarray, last: np.ndarray) -> np.ndarray:
+    """Return which cells (z, y, x) hold any voxel of `mask`, where cell k spans the voxels first[k] to last[k] of each
+    axis."""
+    for axis in range(3):
+        parts = [mask.take(range(a, min(b + 1, mask.shape[axis])), axis).any(axis)
+                 for a, b in zip(first, last, strict=True)]
+        mask = np.stack(parts, axis)
+    return mask
+
+
+def chebyshev_distance(occupied: np.ndarray, limit: int = FARTHEST) -> np.ndarray:
+    """Return the distance of each cell to the nearest `occupied` one (0 in one), at most `limit`; (z, y, x) uint8."""
+    distance = np.zeros(occupied.shape, np.uint8)
+    for _ in range(limit):
+        distance += ~occupied
+        occupied = grown(occupied)
+    return distance
+
+
+def grown(mask: np.ndarray) -> np.ndarray:
+    """Return `mask` (z, y, x) with the 26 neighbours of each of its cells."""
+    for axis in range(3):
+        padded = np.pad(mask, [(1, 1) if a == axis else (0, 0) for a in range(3)])
+        n = mask.shape[axis]
+        mask = padded.take(range(n), axis) | padded.take(range(1, n + 1), axis) | padded.take(range(2, n + 2), axis)
+    return mask
