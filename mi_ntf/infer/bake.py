@@ -8,6 +8,7 @@ import numpy as np
 
 from ..core.architecture import LOG_FLOOR
 from . import bricks
+from .backend import words
 from .bricks import SIDE, any_between, bricks_per_side, grown
 from .network import LOG_MIN_DENSITY, NetworkField
 
@@ -41,12 +42,12 @@ def bake(field: NetworkField, resolution: int, dj: ModuleType,
     majorant = float(np.exp(values.max())) if len(values) else 0.0
     del values
     index = np.flatnonzero(matter)
-    found = _evaluate(lambda p: _flat(field.reflectance(p)), 8, index, coarse, dj)
+    found = at_voxels(lambda p: flat(field.reflectance(p)), 8, index, coarse, dj)
     gloss = float((found[:, 7] / (4 * found[:, 6] ** 4)).max(initial=0.0))
     if not field.quick:
         near = np.flatnonzero(grown(matter))
         dense = np.zeros((coarse**3, 8), np.float32)
-        dense[near] = _evaluate(lambda p: _flat(field.reflectance(p)), 8, near, coarse, dj)
+        dense[near] = at_voxels(lambda p: flat(field.reflectance(p)), 8, near, coarse, dj)
         result |= _named("reflectance", bricks.of_dense(dense.reshape(coarse, coarse, coarse, 8), matter))
     return result | {"hull": support_points(ends, resolution), "numbers": np.array([majorant, gloss])}
 
@@ -78,7 +79,7 @@ def sampled_bricks(field: NetworkField, n: int, reach: tuple[int, int], dj: Modu
     volume are those of its border.
     """
     survey = min(n, SURVEY)
-    coarse = _evaluate(lambda p: [field.log_density(p)], 1, None, survey, dj,
+    coarse = at_voxels(lambda p: [field.log_density(p)], 1, None, survey, dj,
                        lambda done: progress(done / 2)).reshape((survey,) * 3)
     first, last = ((SIDE * np.arange(bricks_per_side(n)) + k) * 2 + 1 for k in (0, SIDE))
     places = np.argwhere(any_between(grown(coarse > LOG_FLOOR), first * survey // (2 * n), last * survey // (2 * n)))
@@ -88,11 +89,11 @@ def sampled_bricks(field: NetworkField, n: int, reach: tuple[int, int], dj: Modu
         progress((1 + number / parts) / 2)
         voxels = np.clip(SIDE * some[..., None] + np.arange(*reach), 0, n - 1).astype(np.uint32)
         z, y, x = voxels[:, 0, :, None, None], voxels[:, 1, None, :, None], voxels[:, 2, None, None, :]
-        samples = _evaluate(lambda p: [field.log_density(p)], 1, ((z * n + y) * n + x).ravel(), n, dj)
+        samples = at_voxels(lambda p: [field.log_density(p)], 1, ((z * n + y) * n + x).ravel(), n, dj)
         yield some, np.maximum(samples, LOG_FLOOR).reshape(len(some), edge, edge, edge)
 
 
-def _evaluate(function, count: int, index: np.ndarray | None, n: int, dj: ModuleType,
+def at_voxels(function, count: int, index: np.ndarray | None, n: int, dj: ModuleType,
               progress: Callable[[float], None] = lambda done: None) -> np.ndarray:
     """Return ``function(p)``, a list of `count` arrays, at the centres of the voxels `index` of n³, x first (None: all
     of them); (voxels, count), float32."""
@@ -102,8 +103,7 @@ def _evaluate(function, count: int, index: np.ndarray | None, n: int, dj: Module
     for first in range(0, total, PART):
         progress(first / total)
         end = min(first + PART, total)
-        voxel = (dr.arange(dj.UInt32, end - first) + dr.opaque(dj.UInt32, first) if index is None
-                 else dj.UInt32(index[first:end].astype(np.uint32)))
+        voxel = words(np.arange(first, end) if index is None else index[first:end], dj)
         place = voxel % side, voxel // side % side, voxel // (side * side)
         values = function(tuple((dj.Float(c) + 0.5) * size - 1 for c in place))
         dr.eval(values)
@@ -112,7 +112,8 @@ def _evaluate(function, count: int, index: np.ndarray | None, n: int, dj: Module
     return result
 
 
-def _flat(reflectance) -> list:
+def flat(reflectance) -> list:
+    """Return the 8 channels of a reflectance."""
     normal, albedo, roughness, specular = reflectance
     return [*normal, *albedo, roughness, specular]
 
@@ -123,11 +124,15 @@ def _outline(places: np.ndarray, values: np.ndarray, n: int, coarse: int) -> tup
     low, high = np.full((n + 1, n + 1), n, np.int32), np.full((n + 1, n + 1), -1, np.int32)
     matter = np.zeros((coarse,) * 3, bool)
     for some, part in zip(*(np.array_split(a, max(1, len(places) // 512)) for a in (places, values)), strict=True):
-        brick, z, y, x = np.nonzero(part > LOG_MIN_DENSITY)
-        z, y, x = (np.minimum(SIDE * some[brick, axis] + c, n - 1) for axis, c in enumerate((z, y, x)))
-        np.minimum.at(low, (z, y), x)
-        np.maximum.at(high, (z, y), x)
-        matter[z * coarse // n, y * coarse // n, x * coarse // n] = True
+        dense = part > LOG_MIN_DENSITY
+        z, y, x = np.minimum(SIDE * some.T[..., None] + np.arange(SIDE + 1), n - 1)  # (bricks, 9) each
+        brick, line_z, line_y = np.nonzero(dense.any(3))
+        line = dense[brick, line_z, line_y]
+        where = z[brick, line_z], y[brick, line_y]
+        np.minimum.at(low, where, x[brick, line.argmax(1)])
+        np.maximum.at(high, where, x[brick, SIDE - line[:, ::-1].argmax(1)])
+        brick, *at = np.nonzero(dense)
+        matter[tuple(c[brick, i] * coarse // n for c, i in zip((z, y, x), at, strict=True))] = True
     z, y = np.nonzero(high >= 0)
     return np.concatenate([np.stack([side[z, y], y, z], 1) for side in (low, high)]), matter
 

@@ -8,7 +8,8 @@ import numpy as np
 from ..core import skin
 from ..core.ops import dot
 from . import ops
-from .bake import REFLECTANCE_RESOLUTION
+from .backend import floats
+from .bake import REFLECTANCE_RESOLUTION, at_voxels, flat
 from .bricks import of_dense
 from .bundle import density_where, onward, safe_inverse
 from .grid import bricks_of
@@ -48,44 +49,45 @@ def _measure(grid, n: int, dj: ModuleType) -> tuple[np.ndarray, float]:
     """Return the softness (z, y, x), float32, and the fraction of skins that are opaque."""
     solid = 0.0
     result, known = np.zeros((n, n, n), np.float32), np.zeros((n, n, n), bool)
+    index = np.flatnonzero(_occupied(grid, n, dj))
+    normals = at_voxels(lambda p: flat(grid.reflectance(p)), 8, index, n, dj)[:, :3]
 
-    def look(index):
-        x = tuple(dj.Float((index[:, k] + 0.5) * (2 / n) - 1) for k in (2, 1, 0))
-        normal = grid.reflectance(x)[0]
-        dr.eval(x, normal)
-        return x, normal
+    def depth(way, most):
+        """Optical depths from the voxels `index` along the directions `way` (k, 3)."""
+        x, d = _centres(index, n, dj), tuple(floats(c, dj) for c in way.T)
+        return _depth(grid, x, d, most).numpy()
 
-    index = _occupied(grid, n, dj)
     if len(index):
-        x, normal = look(index)
-        out = _depth(grid, x, normal, skin.DEEPEST).numpy()
+        out = depth(normals, skin.DEEPEST)
         seen = (out > 0) & (out < skin.DEEPEST)
-        index, out = index[seen], out[seen]
+        index, normals, out = index[seen], normals[seen], out[seen]
     if len(index):
-        x, normal = look(index)
-        below = _depth(grid, x, tuple(-c for c in normal), skin.SOLID).numpy()
-        known[tuple(index.T)] = True
+        below = depth(-normals, skin.SOLID)
+        known.ravel()[index] = True
         solid = float(np.mean(out + below > skin.SOLID))
         # Smoke has no skin: eight marches less for each of its voxels, which may be all there are.
         firm = out + below > skin.SMOKE
-        index, out, below = index[firm], out[firm], below[firm]
+        index, normals, out, below = index[firm], normals[firm], out[firm], below[firm]
     if len(index):
-        x, normal = look(index)
-        out, below = dj.Float(out), dj.Float(below)
+        x, normal = _centres(index, n, dj), tuple(floats(c, dj) for c in normals.T)
+        out, below = floats(out, dj), floats(below, dj)
         sigma, total = grid.density(x), dj.Float(0)
         for turn in skin.TURNS:
             d = skin.across(ops, normal, tuple(dr.opaque(dj.Float, c) for c in turn))
             total = total + skin.share(ops, out, _depth(grid, x, d, skin.FLATTEST * out), sigma)
             dr.eval(total)
-        result[tuple(index.T)] = skin.softness(ops, total / skin.AZIMUTHS, out, below).numpy()
+        result.ravel()[index] = skin.softness(ops, total / skin.AZIMUTHS, out, below).numpy()
     return spread(result, known), solid
 
 
+def _centres(index: np.ndarray, n: int, dj: ModuleType) -> tuple:
+    """Return the centres of the voxels `index` of n³, x first."""
+    return tuple(floats((index // n**axis % n + 0.5) * (2 / n) - 1, dj) for axis in range(3))
+
+
 def _occupied(grid, n: int, dj: ModuleType) -> np.ndarray:
-    """Voxels (k, 3), z first, of n³ that hold density."""
-    axis = dj.Float((np.arange(n) + 0.5) * (2 / n) - 1)
-    z, y, x = dr.meshgrid(axis, axis, axis, indexing="ij")
-    return np.argwhere((grid.density((x, y, z)).numpy() > 0).reshape(n, n, n))
+    """Return which voxels of n³, x first, hold density."""
+    return at_voxels(lambda p: [grid.density(p)], 1, None, n, dj)[:, 0] > 0
 
 
 def _depth(grid, x, d, most):

@@ -83,13 +83,13 @@ def test_bake_finds_all_density(rng, monkeypatch):
     """Thin and small blobs, voxels finer than the survey: nothing is missed that a full survey finds, and it looks at
     a part of the voxels."""
     network = NetworkField(*fields.blobs([(-0.2, 0.1, 0.0), (0.3, -0.2, 0.1)], [0.4, 0.06]), mi)
-    evaluate, looked = bake._evaluate, []
+    evaluate, looked = bake.at_voxels, []
 
     def counted(function, count, index, n, *more):
         looked.append((n, n**3 if index is None else len(index)))
         return evaluate(function, count, index, n, *more)
 
-    monkeypatch.setattr(bake, "_evaluate", counted)
+    monkeypatch.setattr(bake, "at_voxels", counted)
     monkeypatch.setattr(bake, "SURVEY", 48)
     some = bake.bake(network, 112, mi)
     assert looked[0] == (48, 48**3) and looked[1][0] == 112 and looked[1][1] < 112**3 / 2

@@ -9,6 +9,7 @@ import numpy as np
 
 from ...core import microfacet, radiosity
 from ...infer import march, shade
+from ...infer.backend import floats, words
 from ...infer.bundle import Strand
 from ...infer.irradiance import Irradiance
 from .. import log, user_cache
@@ -70,13 +71,13 @@ class Patches:
             begin, way = radiosity.rays(skin.position, skin.normal, side, rng)
             origins.append(np.array(skin.frame.point_to_world(_vector(begin))))
             ways.append(np.array(skin.frame.direction_to_world(_vector(way))))
-        o, d = (mi.Vector3f(np.concatenate(v, 1)) for v in (origins, ways))
+        o, d = (_vector(np.concatenate(v, 1).T) for v in (origins, ways))
         n, nothing = dr.width(o), (np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, int))
         if not n:
             return [nothing] * len(self.skins)
         steps = min(radiosity.STEPS, composition.settings.samples)
         hit, t, which = composition.fly(mi.Ray3f(mi.Point3f(o), d), dr.full(mi.Float, dr.inf, n),
-                                        mi.Float(rng.random(n)), [mi.Float(radiosity.DEPTH)] * len(self.skins), steps)
+                                        floats(rng.random(n), mi), [mi.Float(radiosity.DEPTH)] * len(self.skins), steps)
         dr.eval(hit, t, which)
         hit, which = hit.numpy(), which.numpy()
         result = []
@@ -85,7 +86,7 @@ class Patches:
             if not len(index):
                 result.append(nothing)
                 continue
-            k = mi.UInt32(index)
+            k = words(index, mi)
             along: Any = dr.gather(mi.Vector3f, d, k)
             x = dr.gather(mi.Vector3f, o, k) + dr.gather(mi.Float, t, k) * along
             place, way = skin.frame.point_to_field(mi.Point3f(x)), skin.frame.direction_to_field(along)
@@ -183,7 +184,7 @@ def meet(volume, o: np.ndarray, d: np.ndarray, rng) -> tuple[np.ndarray, np.ndar
     where first."""
     n, start, along = len(o), _vector(o), _vector(d)
     strand = Strand(volume, tuple(start), tuple(along), dr.opaque(mi.Float, 2 / radiosity.STEPS))
-    hit, t, _ = march.free_flight([strand], dr.full(mi.Float, dr.inf, n), mi.Float(rng.random(n)),
+    hit, t, _ = march.free_flight([strand], dr.full(mi.Float, dr.inf, n), floats(rng.random(n), mi),
                                   [mi.Float(radiosity.DEPTH)])
     x = start + dr.select(hit, t, 0) * along
     dr.eval(x, hit)
@@ -191,7 +192,8 @@ def meet(volume, o: np.ndarray, d: np.ndarray, rng) -> tuple[np.ndarray, np.ndar
 
 
 def _vector(rows: np.ndarray):
-    return mi.Vector3f(np.ascontiguousarray(rows.reshape(-1, 3).T, np.float32))
+    # By components: the length of an array of two dimensions would be part of kernels.
+    return mi.Vector3f(*(floats(column, mi) for column in rows.reshape(-1, 3).T))
 
 
 def _rows(v) -> np.ndarray:
