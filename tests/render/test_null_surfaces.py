@@ -1,5 +1,7 @@
 """Surfaces that let light through: in front of lights, of fields and of the camera, against stock ``volpath``."""
 
+import gc
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -130,8 +132,11 @@ def test_no_kernel_depends_on_how_many_rays_cross(blobs):
     sheets = {str(i): sheet((1 - 0.1 * i) * np.array(TO_CAMERA), 0.9, {**LEAF, "opacity": 0.3}) for i in range(4)}
     lights = {"light": scenes.light("point")}
     scene = scenes.scene(blobs, scenes.nrf(samples=64), lights, size=16, spp=16, shapes=sheets)
+    gc.collect()
+    dr.eval()  # what other tests left scheduled would be part of kernels
     scenes.render(scene, 0)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         scenes.render(scene, 1)
-        assert all(kernel["cache_hit"] for kernel in dr.kernel_history([dr.KernelType.JIT]))
+        kernels = dr.kernel_history([dr.KernelType.JIT])
+    assert not [(k["size"], k["operation_count"]) for k in kernels if not k["cache_hit"]]
