@@ -85,7 +85,7 @@ def load_header(path: str | Path) -> Header:
 
 
 def describe(path: str | Path) -> dict:
-    """What `mi-ntf info` prints: header, parameter counts, file size in bytes."""
+    """Return the table of `mi-ntf info`: header, parameter counts, file size in bytes."""
     header, tensors = load(path)
     counts = {name: sum(v.size for k, v in tensors.items() if k.startswith(name + ".")) for name in
               header.architecture.networks()}

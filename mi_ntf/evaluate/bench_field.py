@@ -26,8 +26,8 @@ MEMORY = 4096.0
 
 
 def same_field_rows(scene, medium, sizes: Sizes) -> list[Row]:
-    """One image by each method, tables, maps and atlas made anew in it: seconds, how many times faster than the march
-    and than the volume, and the error to a fine march."""
+    """Return a row for each method: seconds of one image, its speed over the march and over the volume, its error to a
+    fine march. Tables, maps and atlas are made anew for the image."""
     columns, rows = sizes.field_lights
     lit = bench_image.under_sky(sizes.field_image, columns, rows)
     work: dict[str, Callable[[], Any]] = {
@@ -87,7 +87,7 @@ def setting_rows(medium, sizes: Sizes) -> list[Row]:
 
 
 def _like(medium, source, network):
-    """What a visibility needs of a medium, with the density of `source`."""
+    """Return a stand-in for `medium`, for visibility methods, with the density of `source`."""
     field = SimpleNamespace(grid=medium.field.grid, network=network, softness=medium.field.softness)
     return SimpleNamespace(field=field, source=source)
 

@@ -58,7 +58,7 @@ def medium_of(scene):
 
 
 def integrator(columns: int, rows: int, **options):
-    """As many lights as the environment has texels."""
+    """Return an integrator with as many lights as the environment has texels."""
     return mi.load_dict({"type": "nrf", "visibility": "transmittance_map", "samples": SAMPLES, "hide_emitters": True,
                          "environment_lights": columns * rows, **options})
 

@@ -19,7 +19,7 @@ STEP, FINE = 2 / 384, 2 / 1536
 
 
 class Picture:
-    """What the camera of `scene` sees of the field, `side`² pixels of four rays: shading points and their weights."""
+    """Shading points of the field that the camera of `scene` sees, and their weights: `side`² pixels of four rays."""
 
     def __init__(self, scene, medium, side: int):
         o, d, far = view_rays(scene.sensors()[0], medium.frame, 2 * side)

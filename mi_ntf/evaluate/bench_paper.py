@@ -74,7 +74,7 @@ class PaperField:
         return self.shape.clear_distance(place[1], inverse_d)
 
     def reflectance(self, p):
-        """As :meth:`mi_ntf.infer.network.NetworkField.reflectance`."""
+        """Return the reflectance, as :meth:`mi_ntf.infer.network.NetworkField.reflectance` does."""
         pairs = zip(self.shape.reflectance(p), self.network.reflectance(p), strict=True)
         return tuple(tuple(u + VANISHING * v for u, v in zip(a, b, strict=True)) if isinstance(a, tuple)
                      else a + VANISHING * b for a, b in pairs)
@@ -115,9 +115,11 @@ def tabulate(density, o, d, samples: int):
 
 
 def culled_shares(grid, sizes: Sizes) -> dict[str, float]:
-    """What culling leaves of :func:`light_rays` of all lights, on the shipped grid: ``share/256`` and ``share/192``,
-    the samples of a ray that lie in occupied space and before τ passes e^−12; ``share/rays``, the rays that meet any
-    occupied space, which are those that a map asks of."""
+    """Return the fractions of :func:`light_rays` of all lights that culling on the shipped grid leaves.
+
+    ``share/256`` and ``share/192``: samples of a ray in occupied space, before τ passes e^−12. ``share/rays``: rays
+    that meet any occupied space; a map is filled for these alone.
+    """
     shares = {}
     for n in (IMAGE_SAMPLES, STAGE_SAMPLES):
         o, d = light_rays(LIGHTS, max(LIGHTS, sizes.queries // 8))
@@ -206,8 +208,11 @@ def shading_costs(medium, points, sizes: Sizes) -> dict[str, float]:
 
 
 def costs_of(scene, medium, sizes: Sizes) -> dict[str, float]:
-    """All that the rows are composed of: seconds (:func:`stage_costs`, :func:`shading_costs`; ``camera``, a pixel),
-    ``points``, shaded ones a pixel, and shares (:func:`culled_shares`)."""
+    """Return the measurements that the rows are computed from.
+
+    Seconds (:func:`stage_costs`, :func:`shading_costs`; ``camera``: of a pixel), ``points``: shading points of a pixel,
+    and fractions (:func:`culled_shares`).
+    """
     network = random_network(sizes.hidden)
     costs = stage_costs(medium, network, sizes)
     camera, points = camera_cost(scene.sensors()[0], medium, PaperField(medium.field.grid, network), sizes)

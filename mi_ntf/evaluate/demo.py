@@ -48,8 +48,8 @@ def program() -> tuple[list[str], str]:
 
 
 def environment() -> dict[str, str]:
-    """That of every process whose seconds are shown: this one's, but no transmittance map comes from a cache or goes
-    into one."""
+    """Return the environment variables of all processes whose seconds are shown: those of this process, with the cache
+    of fields and maps off."""
     return {**os.environ, "MI_NTF_CACHE": "off"}
 
 
@@ -150,7 +150,10 @@ def demo(out: Path = Path("out/demo"), scene: str = "statue", size: int = 256, s
 
 
 def _shots(command: list[str], folder: Path, out: Path, size: int, samples: dict[str, int], console) -> list[Shot]:
-    """All renders of the scene in `folder`, one after the other; `samples`: per pixel, by light."""
+    """Render the scene in `folder` under all lights by all methods, one after the other.
+
+    `samples`: per pixel, by light.
+    """
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     shots = []

@@ -1,4 +1,4 @@
-"""What frames of a sequence cost beside calls of the stock program.
+"""Cost of the frames of a sequence, compared with calls of the stock program.
 
     python -m mi_ntf.evaluate.frames [--frames 120] [--calls 6] [--size 256]
 

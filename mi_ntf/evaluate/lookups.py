@@ -1,5 +1,4 @@
-"""What lookups are worth beside the march, on the shipped scenes: time and error of what :mod:`mi_ntf.evaluate.bench`
-does not measure.
+"""Time and error of lookups compared with the march, on the shipped scenes, beyond :mod:`mi_ntf.evaluate.bench`.
 
     python -m mi_ntf.evaluate.lookups loop   [--scenes statue globe …] [--size 192] [--spp 8]
     python -m mi_ntf.evaluate.lookups whole  …
@@ -71,7 +70,7 @@ def _towards_own(method, x):
 
 
 def whole(name: str, size: int, spp: int) -> dict[str, Any]:
-    """One picture a method."""
+    """Render one picture by each method; return its seconds and its error to the march."""
     small, loaded, found = dial.scene(name, "env", 16, 1), dial.scene(name, "env", size, spp), {}
     with maps_in_memory():
         for method in METHODS:

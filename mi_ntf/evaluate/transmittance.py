@@ -1,4 +1,4 @@
-"""What the learned transmittance costs and errs: one scene, its field, 50 directional lights.
+"""Time and error of the learned transmittance: one scene, its field, 50 directional lights.
 
     python -m mi_ntf.evaluate.transmittance [SCENE.xml ...] [--size 128] [--spp 4] [--lights 50]
 

@@ -13,23 +13,23 @@ from .bricks import SIDE, any_between, bricks_per_side, grown
 from .network import LOG_MIN_DENSITY, NetworkField
 
 VERSION = 1
-"""Of the arrays: those in field files of another version are not read."""
+"""Version of the arrays. Those of another version are not read from field files."""
 SURVEY = 192
-"""Voxels per side at which density is looked for first: bricks are sampled where there is some nearby."""
+"""Voxels per side of the first, dense sampling. Bricks are sampled only near its density."""
 REFLECTANCE_RESOLUTION = 128
 """Voxels per side of reflectance and of softness, at most."""
 PART = 1 << 20
-"""Points that are evaluated together: bounds the memory."""
+"""Number of points that are evaluated together, which bounds the memory."""
 
 
 def bake(field: NetworkField, resolution: int, dj: ModuleType,
          progress: Callable[[float], None] = lambda done: None) -> dict[str, np.ndarray]:
-    """Return the arrays of a :class:`mi_ntf.infer.grid.GridField`: ln σ at `resolution`³ voxels, and what follows.
+    """Return the arrays of a :class:`mi_ntf.infer.grid.GridField`: ln σ at `resolution`³ voxels, and arrays from it.
 
     Names with a dot are arrays of :class:`mi_ntf.infer.bricks.Bricks`. ``density`` holds ln σ, since the networks' own
     σ is the exponential of a smooth function. Its voxels hold the coefficients f − f″/12 along each axis, between which
     trilinear interpolation is right on average (Condat and Möller 2011, quasi-interpolation); none exceeds the highest
-    sample. ``reflectance`` is there where the field's own is slow: 8 channels, as of
+    sample. ``reflectance``, of fields whose own is slow, has 8 channels, as
     :meth:`mi_ntf.infer.network.NetworkField.reflectance`. ``hull`` (k, 3): points whose convex hull holds all density.
     ``numbers``: upper bound of the density; highest specular lobe, s/(4 α²), at a voxel with matter. `progress` is told
     the fraction of the densities that are sampled.
@@ -95,8 +95,10 @@ def sampled_bricks(field: NetworkField, n: int, reach: tuple[int, int], dj: Modu
 
 def at_voxels(function, count: int, index: np.ndarray | None, n: int, dj: ModuleType,
               progress: Callable[[float], None] = lambda done: None) -> np.ndarray:
-    """Return ``function(p)``, a list of `count` arrays, at the centres of the voxels `index` of n³, x first (None: all
-    of them); (voxels, count), float32."""
+    """Return ``function(p)``, a list of `count` arrays, at the centres of voxels; (voxels, count), float32.
+
+    `index`: numbers of the voxels among n³, x fastest; None: all of them. `progress` is told the fraction that is done.
+    """
     total = n**3 if index is None else len(index)
     result = np.empty((total, count), np.float32)
     side, size = dr.opaque(dj.UInt32, n), dr.opaque(dj.Float, 2 / n)

@@ -6,6 +6,7 @@ from types import ModuleType
 import drjit as dr
 import numpy as np
 
+from ..core.errors import MiNtfError
 from .backend import words
 
 SIDE = 8
@@ -39,8 +40,8 @@ class Bricks:
     channel and one of the index. An entry of the index is the number of a brick, one bit for each of its octants that
     holds anything, and the distance to the next brick that does. Brick 0 is empty.
 
-    Places outside the voxels' centres count as the nearest ones. Whoever needs several things at one point asks for
-    its :meth:`place` once.
+    Points outside the voxels' centres read the nearest voxels. :meth:`place` does the work that lookups and clear
+    distances at the same points share.
     """
 
     def __init__(self, arrays: dict[str, np.ndarray], dj: ModuleType):
@@ -134,8 +135,17 @@ def pack(values: np.ndarray, places: np.ndarray, octants: np.ndarray, resolution
     resolution
         Voxels along an edge of the volume.
     empty
-        Value of every channel where there is no brick, at most: each value is stored to 1/65535 of its channel's range.
+        Upper bound of every channel's value where there is no brick. Values are stored to 1/65535 of their channel's
+        range.
+
+    Raises
+    ------
+    MiNtfError
+        There are more bricks than the index can number.
     """
+    if len(values) >= 1 << _OCTANTS:
+        raise MiNtfError(f"a field of {resolution}³ voxels takes {len(values)} bricks, more than the "
+                         f"{(1 << _OCTANTS) - 1} that can be numbered; give the nrf medium a lower resolution")
     side, count, channels = bricks_per_side(resolution), *values.shape[:2]
     index = np.zeros((side,) * 3, np.uint32)
     bits = octants.reshape(-1, 8).astype(np.uint32) @ (1 << np.arange(8, dtype=np.uint32))
@@ -154,7 +164,7 @@ def pack(values: np.ndarray, places: np.ndarray, octants: np.ndarray, resolution
 
 
 def _check(arrays: dict[str, np.ndarray]) -> None:
-    """Raise the ValueError of arrays from a file that would be read outside of their memory."""
+    """Raise ValueError if a lookup in `arrays`, which may come from a file, would read outside of their memory."""
     index, held, ranges, resolution = (
         arrays.get(name, np.zeros(0)) for name in ("index", "words", "range", "resolution"))
     side = bricks_per_side(int(resolution[0])) if resolution.size == 1 else 0

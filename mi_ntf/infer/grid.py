@@ -30,13 +30,13 @@ class Volume(Protocol):
         """Return σ at the points `p`, 1/(unit-sphere radius); 0 outside the unit sphere."""
 
     def place(self, p: Any) -> tuple:
-        """Return what the two methods below need to know of the points `p`, a tuple of arrays."""
+        """Return a tuple of arrays: what `log_density` and `clear_distance` share at the points `p`."""
 
     def log_density(self, place: tuple) -> Any:
         """Return ln σ at a :meth:`place` inside the unit sphere, ``NOTHING`` where there is none."""
 
     def clear_distance(self, place: tuple, inverse_d: Any) -> Any:
-        """Return how far a ray meets no density from a :meth:`place` inside the sphere, 0 where it may.
+        """Return the distance from a :meth:`place` inside the sphere along which a ray meets no density, or 0.
 
         `inverse_d`: 1/direction by axis, finite.
         """
@@ -48,7 +48,7 @@ class GridField:
     Parameters
     ----------
     arrays
-        Result of :func:`mi_ntf.infer.bake.bake`.
+        Result of :func:`mi_ntf.infer.bake.bake`. Raises KeyError or ValueError where they cannot be that.
     field
         The networks, which give reflectance where it costs no more than some fetches: shading points are few beside the
         steps of marches, and voxels as fine as the networks' planes would take gigabytes.
@@ -62,6 +62,9 @@ class GridField:
         self._reflectance = None if field.quick else bricks_of(arrays, "reflectance", dj)
         self.majorant, self.gloss = map(float, arrays["numbers"])
         self.hull = arrays["hull"]
+        channels = 8 if self._reflectance is None else self._reflectance.channels
+        if (self.hull.shape[1:], channels) != ((3,), 8) or not np.isfinite(self.hull).all():
+            raise ValueError("these arrays are no baked field")
         self.bounds = self.hull.min(0), self.hull.max(0)
 
     @property

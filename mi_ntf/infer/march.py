@@ -28,7 +28,10 @@ MIN_TRANSMITTANCE = 1e-3
 
 
 def share(opaque: bool, rough: bool = False) -> float:
-    """What a sample of a field with or without opaque skins stands for; `rough`: of the latter, with more noise."""
+    """Return the fraction of a ray's light that one sample stands for.
+
+    `opaque`: the field has opaque skins; `rough`: without them, with fewer samples and more noise.
+    """
     return SHARE if opaque else ROUGH_SHARE if rough else SMOKE_SHARE
 
 
@@ -70,7 +73,7 @@ def camera_samples(strands, maxt, offset, depth, shade=True, view=False, shares=
 
 
 def _sizes(bundle, shares):
-    """Of the light that a ray could lose, what a sample stands for."""
+    """Return the fraction of a ray's light that one of its samples stands for, per ray."""
     size = 1
     for share, (begin, _) in zip(shares, bundle.intervals, strict=True):
         size = dr.minimum(size, dr.select(dr.isfinite(begin), dr.opaque(type(bundle.base), share), 1))
@@ -126,10 +129,13 @@ def _gather(bundle, depth, channels: int, size, most: int):
 
 
 def _closing(depth, begin, now):
-    """Of the shares that end in a cell, which begins after `begin` shares and ends in share `now`: ``(early, others,
-    place)``, whether one of them has its sample in an earlier cell, how many others there are, and where in the cell
-    the one sample lies that stands for them: uniformly, spread over the samples of a pixel as evenly as `depth`, and
-    at the cell's beginning where `early` turns on the last bit."""
+    """Return ``(early, others, place)`` of the shares that end in a cell.
+
+    The cell begins after `begin` shares and ends in share `now`. `early`: one of these shares has its sample in an
+    earlier cell. `others`: number of the others. `place`: where the light of the one sample ends that stands for them,
+    in shares. It is uniform, spread over the samples of a pixel as evenly as `depth`, and lies at the cell's beginning
+    where `early` turns on the last bit.
+    """
     first = dr.floor(begin)
     place, passed = _place(depth, first), begin - first
     early = (now > first) & (place < passed)
@@ -140,8 +146,10 @@ def _closing(depth, begin, now):
 
 
 def _place(depth, number):
-    """Where in its share `number` a ray's sample lies, in [0, 1): evenly over a ray's shares, and over rays as `depth`
-    is."""
+    """Return the place of a ray's sample within its share `number`, in [0, 1).
+
+    Places are spread evenly over the shares of a ray, and over rays as `depth` is.
+    """
     place = depth + number * GOLDEN
     return place - dr.floor(place)
 
@@ -206,8 +214,11 @@ class _Here:
 
 
 def _walk(bundle, emit, state):
-    """One walk along the camera rays of `bundle`; ``emit(active, last, here, state)`` gives the next state and is
-    called for each cell, a :class:`_Here`; `last`: it is the ray's last one. Returns ``(transmittance, state)``."""
+    """Walk along the camera rays of `bundle`; return ``(transmittance, state)``.
+
+    ``emit(active, last, here, state)`` is called for each cell, a :class:`_Here`, and returns the next state; `last`:
+    the cell is the ray's last one.
+    """
     floats, uint = type(bundle.base), dr.uint32_array_t(type(bundle.base))
 
     def body(t, transmittance, before, state, active):
@@ -238,12 +249,12 @@ def _absorbed(depth):
 
 
 def free_flight(strands, maxt, offset, depths):
-    """Where rays end in the fields, of which each stops them at an optical depth of its own (for free flight
-    −ln(1 − u), u of each field's own): the first of these ends is distributed as in the sum of all densities.
+    """Return ``(hit, t, index)`` of the first field that stops each ray.
 
-    Arguments as :func:`camera_samples`; `depths`: for each strand. Returns ``(hit, t, index)``: whether a ray ends
-    before `maxt`, where, from its origin (`maxt` if not), and the strand's index. Densities exponential across
-    the pieces of cells.
+    Each field stops a ray at an optical depth of its own (`depths`, one array a strand; for free flight −ln(1 − u) with
+    an own u). The first of these ends is distributed as in the sum of all densities. Other arguments: as in
+    :func:`camera_samples`. `hit`: the ray ends before `maxt`; `t`: distance from its origin (`maxt` if it does not);
+    `index`: the strand. Densities are exponential across the pieces of cells.
     """
     end, hit, index = maxt, False, 0
     for i, (strand, depth) in enumerate(zip(strands, depths, strict=True)):

@@ -109,7 +109,7 @@ class NetworkField:
 
 
 def _half(dj: ModuleType) -> bool:
-    """Whether cooperative vectors are float16, which ends at 65504: on CUDA. On LLVM float32 is faster, and exact."""
+    """Return True if cooperative vectors are float16 (largest number 65504): on CUDA. On LLVM float32 is faster."""
     return dr.backend_v(dj.Float) == dr.JitBackend.CUDA
 
 

@@ -1,4 +1,4 @@
-"""What a render says through Mitsuba's logger, at level Info: the stock program shows it, Python programs do not."""
+"""Messages of a render through Mitsuba's logger, at level Info, which the stock program shows and Python does not."""
 
 import time
 from collections.abc import Iterator

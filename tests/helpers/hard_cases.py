@@ -1,4 +1,4 @@
-"""What the catalogue of hard cases shares: its table, visibility methods on a field."""
+"""Helpers of the catalogue of hard cases: its table, visibility methods on a field."""
 
 from pathlib import Path
 from types import SimpleNamespace

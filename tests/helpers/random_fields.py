@@ -57,7 +57,7 @@ class Balls:
     central: bool = False
 
     def medium(self, brighter: float = 1.0):
-        """What :func:`mi_ntf.render.maps.building.build` asks of a medium; density times `brighter`."""
+        """Return a stand-in for a medium, for :func:`mi_ntf.render.maps.building.build`; density times `brighter`."""
         return _balls(self, brighter)
 
 
@@ -134,7 +134,7 @@ class Exact:
         return depth
 
     def medium(self):
-        """As :meth:`Balls.medium`; its occupancy lets no march skip."""
+        """Return a stand-in for a medium, as :meth:`Balls.medium`, without empty space to skip."""
         corners = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), -1).reshape(-1, 3)
         volume = Formula(self.density, corners)
         network = Balls(0).medium().field.network
@@ -144,7 +144,7 @@ class Exact:
 
 
 def _inside(x, d, radius):
-    """Where the rays x + t d enter and leave the ball of `radius` around the origin; twice the nearest place if
+    """Return where the rays x + t d enter and leave the ball of `radius` around the origin; twice the nearest place if
     never."""
     b = (x * d).sum(1)
     h = np.sqrt(np.maximum(b * b - (x * x).sum(1) + radius**2, 0))

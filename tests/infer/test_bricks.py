@@ -7,6 +7,7 @@ from helpers import fields, volumes
 from helpers.jit import arrays
 from scipy.ndimage import distance_transform_cdt, map_coordinates
 
+from mi_ntf.core.errors import MiNtfError
 from mi_ntf.infer import bake, bricks
 from mi_ntf.infer.bricks import SIDE, Bricks
 from mi_ntf.infer.bundle import safe_inverse
@@ -46,6 +47,14 @@ def test_no_brick_and_all_bricks(rng):
     same = Bricks(bricks.of_dense(np.full((20, 20, 20, 1), 3, np.float32), np.ones((20, 20, 20), bool)), mi)
     np.testing.assert_allclose(np.array(same.at(same.place(p))[0]), 3, rtol=1e-5)
     assert not same.distances().any()
+
+
+def test_more_bricks_than_the_index_numbers(monkeypatch):
+    """A field full of fog at the finest resolution: refused, where numbers would run into the octants' bits."""
+    monkeypatch.setattr(bricks, "_OCTANTS", 3)
+    fog = np.ones((24, 24, 24, 1), np.float32)
+    with pytest.raises(MiNtfError, match="of 24³ voxels takes 27 bricks, more than the 7 .* a lower resolution"):
+        bricks.of_dense(fog, fog[..., 0] > 0)
 
 
 def test_empty_space_is_empty(rng):

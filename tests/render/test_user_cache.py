@@ -1,4 +1,4 @@
-"""What a field is made into once: found again on the disk and in its own file, whatever has become of either."""
+"""Arrays that are made from a field once: found again on the disk and in its own file, also where these are damaged."""
 
 import json
 import os
@@ -159,7 +159,7 @@ def test_baked_into_the_file(path, bakes, cache, capsys):
     assert_same(loaded.load(str(copy), None), field)
 
 
-@pytest.mark.parametrize("change", ["index", "words", "missing", "version"])
+@pytest.mark.parametrize("change", ["index", "words", "missing", "hull", "version"])
 def test_voxels_in_a_file_that_are_wrong_are_not_used(path, bakes, monkeypatch, change):
     """Crafted ones would be read outside of their memory."""
     truth = loaded.load(str(path), 48)
@@ -171,6 +171,8 @@ def test_voxels_in_a_file_that_are_wrong_are_not_used(path, bakes, monkeypatch, 
         arrays["density.words"] = arrays["density.words"][:-1]
     elif change == "missing":
         del arrays["softness.range"]
+    elif change == "hull":
+        arrays["hull"] = arrays["hull"][:, :2]
     field_file.add_baked(path, arrays, loaded._stamp(field, 48))
     if change == "version":
         monkeypatch.setattr(loaded, "VERSION", bake.VERSION + 1)

@@ -24,7 +24,9 @@ REPEATS = 3
 
 @dataclass(frozen=True)
 class Timing:
-    """Of one point. Seconds: `build` of maps, atlas and the light between patches, without compilation; `compile` of
+    """Times and memory of one point.
+
+    Seconds: `build` of maps, atlas and the light between patches, without compilation; `compile` of
     kernels in the first picture, or their fetching from Dr.Jit's cache on disk; `first`: the first picture as a whole;
     `render`: the median of `repeats` warm pictures, what is built left out; `peak`: most bytes that Dr.Jit held;
     `load`: jobs that the system ran on average when it was measured."""

@@ -186,7 +186,7 @@ def build(medium, lights, options: Options, dj, keep) -> TransmittanceAtlas:
 
 
 def numbers(medium, lights, options: Options) -> int:
-    """What all maps take, in float32 numbers."""
+    """Return the size of all maps, in float32 numbers."""
     network = options.map_source == "network"
     return RAYS * channels(medium.field.network.components if network else LOGISTICS) // 2
 

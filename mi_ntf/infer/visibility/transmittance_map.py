@@ -105,7 +105,7 @@ def _root(t, mixture):
 
 
 def _shifts(mixtures, weights, size):
-    """How far to move along each of the four rays before reading it.
+    """Return the distance to move along each of the four rays before reading it.
 
     On a surface at a slant the four rays meet the same skin at different t', and averaging them blurs it. Where their
     centres c differ by few texels (`size`), each ray is therefore read as deep in its own skin as the point lies in the
@@ -128,7 +128,7 @@ def width(medium, table, options: Options) -> int:
 
 
 def _inside(table) -> bool:
-    """Whether some light lies inside the sphere."""
+    """Return True if some light lies inside the sphere."""
     return bool((table.is_point & (np.linalg.norm(table.where, axis=1) < 1)).any())
 
 

@@ -107,7 +107,7 @@ def _timed(run: Callable[[], Any]) -> float:
 
 
 def seen_points(medium, count: int | None = None) -> shade.Points:
-    """Where camera rays meet the field, `count` points, `WIDTH` unless told."""
+    """Return `count` shading points (default: ``WIDTH``) where camera rays meet the field."""
     grid, count = medium.field.grid, count or WIDTH
     found = _camera(grid, count)
     lane = dr.arange(mi.UInt32, count) % dr.opaque(mi.UInt32, max(dr.width(found.t), 1))

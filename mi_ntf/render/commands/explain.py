@@ -1,4 +1,4 @@
-"""What the ``nrf`` integrator will do with a scene, why, and what that costs: ``mi-ntf explain``."""
+"""The command ``mi-ntf explain``: what the ``nrf`` integrator will do with a scene, why, and at what cost."""
 
 import math
 from dataclasses import replace
@@ -72,14 +72,14 @@ def explain(scene: Path, parameters: dict[str, str], measure: bool = False) -> d
 
 
 def _environment(light) -> dict:
-    """How well directional lights stand for an environment; the sun of a ``sunsky`` is beside them."""
+    """Return the error of an environment that directional lights stand for, the sun of a ``sunsky`` left out."""
     cells = light.cells
     return {"emitter": environment.name(light.emitter, light.kind), "lights": int((cells.weight > 0).sum()),
             "radius_degrees": math.degrees(cells.radius), "irradiance_error_percent": 100 * cells.error()}
 
 
 def works(integrator, media: list, found, rays: int, count: int, drawn: int) -> list[model.Work]:
-    """What each medium's part of the render comes to."""
+    """Return the size of the render's work, for each medium."""
     method = found.visibility if found.needs_visibility else "none"
     radiosity = found.bounces == "radiosity"
     works = []

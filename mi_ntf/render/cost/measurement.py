@@ -1,5 +1,5 @@
-"""One render, watched: the seconds that its stages really take, told apart by the loops in their kernels; by the clock
-where NumPy works beside kernels."""
+"""Measured seconds of the stages of a render, told apart by the loops in their kernels, or by the clock where NumPy
+works beside kernels."""
 
 import os
 import time
@@ -22,7 +22,7 @@ _watched: list[dict] | None = None
 
 @contextmanager
 def by_clock(stage: str):
-    """All that happens within is `stage`, whatever its kernels; costs nothing where no render is watched."""
+    """Attribute the time of the block to `stage`, whatever its kernels; free of cost where no render is measured."""
     if _watched is None:
         yield
         return

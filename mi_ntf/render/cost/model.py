@@ -1,4 +1,4 @@
-"""What the stages of a render cost, predicted from a few constants of the machine, and which method is cheapest then.
+"""Predicted cost of the stages of a render, from a few constants of the machine, and the choice of the cheapest method.
 
 Constants are measured by :mod:`mi_ntf.render.commands.calibration`, which `mi-ntf explain --measure` and `mi-ntf
 bench` run; a render reads them from the user's cache, or takes those of two cores of 2024.
@@ -102,7 +102,7 @@ def per_pair(work: Work, c: Constants) -> float:
 
 
 def per_drawn_pair(work: Work, c: Constants) -> float:
-    """The same of a light that is drawn at random."""
+    """Return ns of one point and a light that is drawn at random."""
     return REGISTRY[REGISTRY[work.method].for_drawn].pair(work, c)
 
 
@@ -146,8 +146,11 @@ def choose(work: Work, c: Constants | None = None) -> tuple[str, str]:
 
 
 def work(integrator, medium, method: str, rays: int, lights: int = 1, drawn: int = 0, others: float = 0.0) -> Work:
-    """What it comes to that an ``nrf`` integrator traces `rays` camera rays through `medium` under `lights` lights and
-    as many `drawn` ones, with as many rays of `others`. Shading points are guessed: an opaque object in the picture."""
+    """Return the work of an ``nrf`` integrator that traces `rays` camera rays through `medium`.
+
+    `lights`: lights of the table; `drawn`: lights drawn at each point; `others`: rays towards lights from elsewhere.
+    The number of shading points is a guess, that of an object which fills much of the picture.
+    """
     network, opaque = integrator.map_source == "network", medium.field.softness.opaque
     points = rays * COVERAGE * (POINTS_A_HIT if opaque else POINTS_IN_SMOKE) * min(integrator.samples / 384, 1) ** 0.35
     texels = (integrator.map_resolution or resolution_for(lights, medium.field.grid.resolution)) ** 2
@@ -203,7 +206,7 @@ def memory(work: Work, chunk: int) -> dict[str, int]:
 
 
 def machine() -> str:
-    """What constants hold for: this version and variant, and what computes: processor and threads, or graphics card."""
+    """Return what the constants hold for: version, variant, and processor with its threads or graphics card."""
     variant = str(mi.variant())
     hardware = graphics_card() if variant.startswith("cuda") else f"{processor()} · {dr.thread_count()} threads"
     return f"{__version__} · {hardware} · {variant}"
@@ -250,7 +253,7 @@ def remember(found: Constants) -> None:
 
 
 def _name() -> str:
-    """What constants are called in the cache: none outlives a change of what measures them."""
+    """Return the key of the constants in the cache: none outlives a change of the program that measures them."""
     return f"{machine()} · {hashlib.sha256(PROGRAM.read_bytes()).hexdigest()[:8]}"
 
 

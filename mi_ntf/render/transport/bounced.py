@@ -60,7 +60,7 @@ class Patches:
         return arrays | {"first": first, "hits": hits.reshape(-1, radiosity.SIDE**2)}
 
     def of(self, composition) -> bool:
-        """Whether these are the patches of `composition`, too: of the same fields in the same places."""
+        """Return True if these are the patches of `composition`, too: of the same fields in the same places."""
         return self._key == _key(composition)
 
     def _trace(self, composition, side: int, rng) -> list:

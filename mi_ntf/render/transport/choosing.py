@@ -39,8 +39,11 @@ HOPELESS = 1.5
 
 
 class Chooser(Trials):
-    """What a render by `settings` is to be. `gone`: seconds that it has taken so far; `before`: :meth:`kept` of an
-    earlier frame; `whole`: nothing is left out, whatever it is worth. All else as in :class:`Trials`."""
+    """Choice of method and dials for a render by `settings`.
+
+    `gone`: seconds that it has taken so far; `before`: :meth:`kept` of an earlier frame; `whole`: nothing is left out,
+    whatever it is worth. All else as in :class:`Trials`.
+    """
 
     def __init__(self, scene, settings: Settings, limits: Limits, sensor, spp: int, patches,
                  gone: Callable[[], float] = lambda: 0.0, before=None, whole: bool = False):
@@ -49,7 +52,7 @@ class Chooser(Trials):
         self._moved = False
 
     def choose(self) -> Choice:
-        """As the limits say. A method that the user named stays, whatever its error."""
+        """Return the choice that keeps to the limits. A method that the user named stays, whatever its error."""
         by_time = self.limits.seconds > 0 and self.settings.visibility == "auto"
         if not self.limits.error and not by_time:
             return Choice(self._composed(self.settings))
@@ -82,13 +85,12 @@ class Chooser(Trials):
                 tuple(lights.kinds), len(lights.rows.power))
 
     def _placed(self) -> tuple:
-        """Where fields and lights are."""
+        """Return the places of fields and lights."""
         rows = self.estimate.lights.rows
         return rows.where.tobytes(), *(m.frame.placement() for m in self.estimate.media)
 
     def _worth_again(self, before: Kept) -> bool:
-        """Whether lights that have not moved so far may make a map for each worth its price, which further frames
-        share; of one frame nobody knows."""
+        """Return True if maps may pay, since the lights have not moved so far and further frames share the maps."""
         if before.settings.still or self._moved or self.settings.visibility != "auto" or not self.limits.error:
             return False
         self.estimate.dearer = before.dearer
@@ -99,7 +101,7 @@ class Chooser(Trials):
         return bool(found) and self._pays(before.predicted["seconds"] - min(found), LOOK + TRIAL)
 
     def _pays(self, saved: float, lost: float) -> bool:
-        """Whether so many seconds less a picture are worth `lost` seconds of a trial and of building."""
+        """Return True if `saved` seconds a picture are worth `lost` seconds of a trial and of building."""
         return saved * self.settings.frames >= lost
 
     def _by_error(self) -> Choice:
@@ -199,8 +201,10 @@ class Chooser(Trials):
 
     @staticmethod
     def _candidates(settings: Settings, of_all: bool) -> list[Settings]:
-        """What ``auto`` may choose in place of the march, with the settings' own dials and finer ones; `of_all`: what
-        is built for all lights together, else for each."""
+        """Return what ``auto`` may choose in place of the march, with the settings' own dials and finer ones.
+
+        `of_all`: methods that are built for all lights together, else for each light.
+        """
         found = []
         for name, method in REGISTRY.items():
             if method.automatic and name != "raymarch" and method.per_field == of_all:
@@ -287,14 +291,14 @@ class Chooser(Trials):
         return math.hypot(self.probes.error(look, self.truth, max(samples, 1.0)), self._noise(samples))
 
     def _noise(self, samples: float) -> float:
-        """Of fewer than one it is what there is not time for, and tells apart what is too slow from what is not."""
+        """Return the noise of so many samples; fewer than one tell methods apart that there is no time for."""
         return self.probes.noise(self.truth) / math.sqrt(max(samples, 1e-3))
 
     def _left(self) -> float:
         return max(self.limits.seconds - self._gone(), 1e-3)
 
     def _warn(self, each: float, settings: Settings) -> None:
-        """What cannot end in time is said before it begins."""
+        """Warn before a render that cannot end in time."""
         if each > self._left():
             mi.Log(  # type: ignore[operator]  # an object in the stub
                 mi.LogLevel.Warn,

@@ -30,9 +30,13 @@ IN_SMOKE = 4
 
 @dataclass(frozen=True)
 class Part:
-    """One ``nrf`` medium prepared for a render: lights in its field coordinates, all of them (`lights`) and those of
-    the present run (`table`); visibility of the table's lights, of drawn ones and any other rays, and of all lights
-    (None: no shadows)."""
+    """An ``nrf`` medium prepared for a render.
+
+    lights   all lights, in the medium's field coordinates; `table`: those of the present run
+    mapped   visibility of the table's lights; None: no shadows
+    drawn    visibility of lights that are drawn at random, and of any other rays
+    every    visibility of all lights
+    """
 
     medium: Any
     lights: Any
@@ -159,8 +163,10 @@ class Composition:
                     looked_up.stream = stream
 
     def transmittance(self, p, d, distance, active, sun=False):
-        """What the fields let through from scene point `p` along `d`, as far as `distance`; `sun`: of a light that is
-        :func:`mi_ntf.render.lights.emitter_samples.sharp`."""
+        """Return the transmittance of the fields from scene point `p` along `d`, as far as `distance`.
+
+        `sun`: the light is :func:`mi_ntf.render.lights.emitter_samples.sharp`.
+        """
         tau = mi.Float(1)
         for part in self.parts:
             if part.drawn:
@@ -192,7 +198,7 @@ class Composition:
         return hit, t * unit, index
 
     def with_all_lights(self, do):
-        """What `do()` returns where those of other runs shine too."""
+        """Return ``do()``, while the lights of all runs shine."""
         parts = self.parts
         if len(self.runs) > 1:
             self.parts = [replace(p, table=p.lights, mapped=p.every) for p in parts]
@@ -219,8 +225,10 @@ class Composition:
         return total
 
     def shadow(self, part: Part, kind: str, far: bool = False):
-        """What dims the light of kind `kind`, ``mapped`` or ``drawn``, at points of `part`: every field and surface;
-        `far`: the lights lie outside of the part's sphere."""
+        """Return the shadow of every field and surface at points of `part`.
+
+        `kind`: of lights, ``mapped`` or ``drawn``; `far`: the lights lie outside of the part's sphere.
+        """
         own = getattr(part, kind)
         far = far and (kind == "drawn" or REGISTRY[self.effects.visibility].per_field)  # a light's map needs its place
         others = [(p.frame, getattr(p, kind)) for p in self.parts if p is not part]

@@ -109,7 +109,7 @@ class _Halves:
         dr.sync_thread()
 
     def _weight(self, block):
-        """What the filter's weights of each pixel sum to."""
+        """Return the sum of the filter's weights for each pixel."""
         tensor = block.tensor()
         pixel = dr.arange(mi.UInt32, tensor.shape[0] * tensor.shape[1])
         return dr.gather(mi.Float, tensor.array, pixel * tensor.shape[2] + (tensor.shape[2] - self._extra - 1))
@@ -182,7 +182,7 @@ def _stop(pixels: Reconstruction, run: int, first: int, runs: int) -> None:
 
 
 def _achieved(limits: Limits, choice: Choice, counted: passes.Passes) -> dict:
-    """What came of the limits; logged where there are any."""
+    """Return the result of a render under limits, and log it if there are any."""
     effects = choice.effects
     found = {
         "visibility": effects.visibility, "reason": effects.reason, "spp": counted.count, "passes": counted.passes,
@@ -199,7 +199,7 @@ def _achieved(limits: Limits, choice: Choice, counted: passes.Passes) -> dict:
 
 
 def _seed(seed, number: int):
-    """That of pass `number`: the first has the user's own."""
+    """Return the seed of pass `number`: the first has the user's own."""
     return mi.sample_tea_32(_opaque(seed), _opaque(number))[0] if number else _opaque(seed)
 
 
