@@ -53,7 +53,7 @@ def test_more_bricks_than_the_index_numbers(monkeypatch):
     """A field full of fog at the finest resolution: refused, where numbers would run into the octants' bits."""
     monkeypatch.setattr(bricks, "_OCTANTS", 3)
     fog = np.ones((24, 24, 24, 1), np.float32)
-    with pytest.raises(MiNtfError, match="of 24³ voxels takes 27 bricks, more than the 7 .* a lower resolution"):
+    with pytest.raises(MiNtfError, match=r"of 24³ voxels takes 27 bricks, more than the 7 .* a lower resolution"):
         bricks.of_dense(fog, fog[..., 0] > 0)
 
 
