@@ -236,7 +236,7 @@ class Explain:
     )
     """Value of $KEY in the scene."""
     measure: bool = False
-    """Measure the prices of this machine, render, and set the real costs beside the predicted ones."""
+    """Render the scene, and show the real seconds beside those that a pilot predicts."""
     json: bool = False
     """Print JSON in place of a table."""
 

@@ -19,17 +19,14 @@ from rich.table import Table
 from ..core import files
 from ..core.variants import VARIANTS
 from ..infer.visibility import transmittance_atlas
-from ..render import register
-from ..render.commands import calibration
-from ..render.cost import model
-from ..render.cost.measurement import maps_made_anew
+from ..render import register, user_cache
+from ..render.machine import processor
 from . import bench_culled, bench_field, bench_image, bench_lights, bench_product
 from .bench_measure import FULL, QUICK, Row, Sizes
 
 
 def bench(quick: bool = False, out: Path | None = None, say: Callable[[str], None] = lambda text: None) -> dict:
-    """Measure everything; ``{"machine": …, "rows": […]}``, JSON-ready. Also keeps the machine's constants for `auto`
-    (:mod:`mi_ntf.render.cost.model`).
+    """Measure everything; return ``{"machine": …, "rows": […]}``, JSON-ready.
 
     quick  tiny sizes: shows that everything runs
     out    folder for ``bench.json`` and ``bench.png``; None: write nothing
@@ -40,10 +37,9 @@ def bench(quick: bool = False, out: Path | None = None, say: Callable[[str], Non
     register()
     sizes = QUICK if quick else FULL
     start = time.perf_counter()
-    say(f"{0:5} s  the machine's constants")
-    sections = _sections(sizes)  # prices are those of whole atlases
+    sections = _sections(sizes)
     rows = []
-    with maps_made_anew(), _atlas(sizes.atlas):
+    with user_cache.switched("off"), _atlas(sizes.atlas):
         for title, work in sections.items():
             say(f"{time.perf_counter() - start:5.0f} s  {title}")
             rows += work()
@@ -61,7 +57,6 @@ def bench(quick: bool = False, out: Path | None = None, say: Callable[[str], Non
 def _sections(sizes: Sizes) -> dict[str, Callable[[], list[Row]]]:
     scene = bench_image.under_sky(sizes.image)
     medium = bench_image.medium_of(scene)
-    calibration.calibrate(medium)
     return {
         "the paper's networks": lambda: bench_culled.rows(scene, medium, sizes),
         "map lookup": lambda: bench_product.lookup_rows(medium, sizes),
@@ -89,7 +84,7 @@ def _atlas(resolution: int | None):
 
 def machine() -> dict:
     """What the figures were measured on."""
-    return {"processor": model.processor(), "cores": os.cpu_count(), "load": round(os.getloadavg()[0], 2),
+    return {"processor": processor(), "cores": os.cpu_count(), "load": round(os.getloadavg()[0], 2),
             "variant": mi.variant(), "mitsuba": mi.__version__}
 
 

@@ -12,12 +12,11 @@ import mitsuba as mi
 
 from ..core import spheres
 from ..infer.grid import NetworkVolume
-from ..render.commands import calibration
-from ..render.commands.calibration import seconds, table_of
 from ..render.maps import building
-from . import bench_image, bench_paper, metrics
+from . import bench_image, bench_paper, loops, metrics
 from .bench_lights import FINE, Picture
 from .bench_measure import Row, Sizes, row
+from .loops import seconds, table_of
 
 METHODS = ("raymarch", "transmittance_volume", "transmittance_map", "transmittance_atlas", "neural_transmittance",
            "ray_network")
@@ -105,14 +104,14 @@ def _loops(medium, x, tables: bool, sizes: Sizes) -> tuple[dict[str, float], dic
         built = building.build(name, medium, table, options)
         dr.sync_thread()
         making[name] = time.perf_counter() - start
-        work[name] = partial(calibration.look_up, built, table, x)
+        work[name] = partial(loops.look_up, built, table, x)
     found = seconds(work, min(sizes.repeats, 3))
     return {name: 1e9 * value / (dr.width(x) * table.count) for name, value in found.items()}, making
 
 
 def _seen(medium, count: int):
     """`count` points, side by side, where parallel camera rays meet the voxels."""
-    x = calibration.seen_points(medium).x
+    x = loops.seen_points(medium).x
     first = (dr.width(x) - count) // 2
     part = tuple(dr.gather(mi.Float, c, first + dr.arange(mi.UInt32, count)) for c in x)
     dr.eval(part)

@@ -8,11 +8,11 @@ from ..core import spheres
 from ..infer import march, shade
 from ..infer.bundle import Strand
 from ..infer.visibility import raymarch
-from ..render.commands.calibration import table_of
 from ..render.maps import building
 from . import metrics
 from .bench_measure import Row, Sizes, row
 from .bench_paper import view_rays
+from .loops import table_of
 
 STEP, FINE = 2 / 384, 2 / 1536
 """Cells of the camera's march and of the atlas; those that light's march, and maps, are made with."""

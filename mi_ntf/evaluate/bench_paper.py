@@ -26,8 +26,8 @@ from ..infer.bundle import Strand, safe_inverse
 from ..infer.network import NetworkField
 from ..infer.profile import DepthProfile
 from ..infer.visibility.raymarch import MAX_OPTICAL_DEPTH
-from ..render.commands.calibration import seconds, table_of
 from .bench_measure import Sizes
+from .loops import seconds, table_of
 
 LIGHTS = 500
 SIDE = 600

@@ -13,9 +13,9 @@ import numpy as np
 
 from ..core import spheres
 from ..infer import shade
-from ..render.commands.calibration import seconds, table_of
 from . import bench_image, metrics, transmittance
 from .bench_measure import Row, Sizes, row
+from .loops import seconds, table_of
 
 
 def many_lights_rows(sizes: Sizes) -> list[Row]:

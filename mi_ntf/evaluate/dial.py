@@ -37,7 +37,6 @@ import numpy as np
 from ..core.variants import VARIANTS
 from ..render.maps import map_cache
 from .photographs import field_ball
-from .tradeoff.measure import maps_in_memory
 
 SCENES = Path(__file__).parents[2] / "scenes"
 NAMES = ("statue", "globe", "knot", "cloud", "skull")
@@ -115,7 +114,7 @@ def relative(image: np.ndarray, truth: np.ndarray) -> float:
 def frames(loaded, options: dict[str, Any]) -> tuple[np.ndarray, list[float], Any]:
     """Two pictures (2, h, w, 3), seconds of the first, the second and a further one, maps made anew in the first and
     kernels compiled before, and the integrator."""
-    with maps_in_memory():
+    with map_cache.in_memory():
         picture(loaded, integrator(**options), 9, 0 if "max_error" in options else 1)
         map_cache.forget()
         nrf = integrator(**options)
@@ -183,7 +182,7 @@ def time_case(name: str, light: str, size: int, spp: int) -> list[dict[str, Any]
     for budget in BUDGETS:
         found = []
         for options in ({}, *({"visibility": v} for v in ("raymarch", "transmittance_atlas", "transmittance_map"))):
-            with maps_in_memory():
+            with map_cache.in_memory():
                 picture(loaded, integrator(time_budget=WARM, **options), 9)
                 map_cache.forget()
                 nrf = integrator(time_budget=budget, **options)
@@ -224,7 +223,7 @@ def stock_case(name: str, light: str, size: int, spp: int) -> list[dict[str, Any
         nrf = integrator(**options)
         picture(loaded, nrf, 9, 1)
         for samples in sorted({1} | {n << k for n in (2, 3) for k in range(10)}):
-            with maps_in_memory():
+            with map_cache.in_memory():
                 image, took = picture(loaded, nrf, 1, samples)
             error = math.sqrt(max(relative(image, truth) ** 2 - own**2, 0.0))
             if took > best[0] or error <= LIMIT:

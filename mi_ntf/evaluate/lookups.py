@@ -29,12 +29,10 @@ import numpy as np
 
 from ..core.variants import VARIANTS
 from ..infer.visibility.method import Options
-from ..render.commands import calibration
 from ..render.maps import building, map_cache
 from ..render.scene.media import find_media
-from . import dial
+from . import dial, loops
 from .photographs import field_ball
-from .tradeoff.measure import maps_in_memory
 
 METHODS = ("raymarch", "transmittance_atlas", "neural_transmittance")
 LIGHTS, DRAWN, FLOOR_SPP, ROUNDS = 64, 8, 256, 3
@@ -44,13 +42,13 @@ def loop(name: str, size: int, spp: int) -> dict[str, Any]:
     """`size` and `spp` are not read."""
     medium = find_media(dial.scene(name, "point", 16, 1))[0]
     toward = np.random.default_rng(0).normal(size=(LIGHTS, 3))
-    lights = calibration.table_of(toward / np.linalg.norm(toward, axis=1, keepdims=True))
-    x = calibration.seen_points(medium).x
-    options = Options(2 / calibration.SAMPLES)
+    lights = loops.table_of(toward / np.linalg.norm(toward, axis=1, keepdims=True))
+    x = loops.seen_points(medium).x
+    options = Options(2 / loops.SAMPLES)
     built: dict[str, Any] = {v: building.build(v, medium, lights, options) for v in METHODS[:2]}
     jobs: dict[str, Any] = {f"random {v}": (lambda m=m: _towards_own(m, x)) for v, m in built.items()}
-    jobs |= {f"same {v}": (lambda m=m: calibration.look_up(m, lights, x)) for v, m in built.items()}
-    ns = {k: 1e9 * t / (LIGHTS * dr.width(x[0])) for k, t in calibration.seconds(jobs, 7).items()}
+    jobs |= {f"same {v}": (lambda m=m: loops.look_up(m, lights, x)) for v, m in built.items()}
+    ns = {k: 1e9 * t / (LIGHTS * dr.width(x[0])) for k, t in loops.seconds(jobs, 7).items()}
     ratio = {way: ns[f"{way} {METHODS[0]}"] / ns[f"{way} {METHODS[1]}"] for way in ("random", "same")}
     return {"scene": name, "ns": ns, "ratio": ratio}
 
@@ -72,7 +70,7 @@ def _towards_own(method, x):
 def whole(name: str, size: int, spp: int) -> dict[str, Any]:
     """Render one picture by each method; return its seconds and its error to the march."""
     small, loaded, found = dial.scene(name, "env", 16, 1), dial.scene(name, "env", size, spp), {}
-    with maps_in_memory():
+    with map_cache.in_memory():
         for method in METHODS:
             nrf = dial.integrator(visibility=method)
             dial.picture(small, nrf)
@@ -89,7 +87,7 @@ def drawn(name: str, size: int, spp: int) -> dict[str, Any]:
     row: dict[str, Any] = {"scene": name, "size": size, "spp": spp}
     for light in ("env", "area"):
         loaded, found = dial.scene(name, light, size, spp), {}
-        with maps_in_memory():
+        with map_cache.in_memory():
             for method in METHODS:
                 nrf = dial.integrator(visibility=method, light_samples=DRAWN)
                 dial.picture(loaded, nrf, 9)
@@ -144,7 +142,7 @@ def bounces(name: str, size: int, spp: int) -> dict[str, Any]:
     load = runpy.run_path(str(dial.SCENES.parent / "examples" / "three_fields.py"))["load"]
     scenes: dict[str, Any] = {method: load(size, spp, 4, method) for method in METHODS[:2]}
     taken: dict[str, list] = {method: [] for method in scenes}
-    with maps_in_memory():
+    with map_cache.in_memory():
         for seed in range(ROUNDS + 1):
             for method, loaded in scenes.items():
                 taken[method].append(dial.picture(loaded, loaded.integrator(), seed))

@@ -17,8 +17,6 @@ SMOKE_SHARE = 1 / 64
 """The same in a field without opaque skins, whose rays are long to march and meet many a normal: to equal noise
 pictures of `cloud` take 0.4 to 0.7 of the time of shares of 1/16 (a point light, 8 drawn lights, 128 summed ones);
 1/128 gains nothing more but with a single drawn light."""
-ROUGH_SHARE = 1 / 14
-"""The same where more noise is asked for than two samples by the others have."""
 GOLDEN = 0.618034
 """Its multiples fill [0, 1) most evenly."""
 MIN_SHARE = 1e-4
@@ -27,12 +25,9 @@ MIN_TRANSMITTANCE = 1e-3
 """Camera rays end here; what lies behind could add 0.1 %."""
 
 
-def share(opaque: bool, rough: bool = False) -> float:
-    """Return the fraction of a ray's light that one sample stands for.
-
-    `opaque`: the field has opaque skins; `rough`: without them, with fewer samples and more noise.
-    """
-    return SHARE if opaque else ROUGH_SHARE if rough else SMOKE_SHARE
+def share(opaque: bool) -> float:
+    """Return the fraction of a ray's light that one sample stands for; `opaque`: the field has opaque skins."""
+    return SHARE if opaque else SMOKE_SHARE
 
 
 def camera_samples(strands, maxt, offset, depth, shade=True, view=False, shares=()) -> Samples:

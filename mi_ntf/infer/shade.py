@@ -108,12 +108,20 @@ class Reflectance(NamedTuple):
 
 
 class Points:
-    """Shading points: position, direction to the viewer, reflectance. 3-tuples and scalars, all of one width."""
+    """Shading points: position, direction to the viewer, reflectance. 3-tuples and scalars, all of one width.
 
-    def __init__(self, x, wo, reflectance: Reflectance):
+    ray, ordinal  of each point: the number of its camera ray, and its place among the points of this ray. Random
+                  lights of the point follow from these two. None: the point's place in the arrays, and 0.
+    """
+
+    def __init__(self, x, wo, reflectance: Reflectance, ray=None, ordinal=None):
         self.x, self.wo, self.reflectance = x, wo, reflectance
+        uint = dr.uint32_array_t(type(x[0]))
+        self.ray = dr.arange(uint, dr.width(x[0])) if ray is None else ray
+        self.ordinal = uint(0) if ordinal is None else ordinal
         self.normal, self.albedo, self.roughness, self.specular, self.softness, _ = reflectance
 
     def evaluate(self) -> None:
         """Compute them now: what follows loops over lights."""
-        dr.eval(self.x, self.wo, self.normal, self.albedo, self.roughness, self.specular, self.softness)
+        dr.eval(self.x, self.wo, self.normal, self.albedo, self.roughness, self.specular, self.softness, self.ray,
+                self.ordinal)

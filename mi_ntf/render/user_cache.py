@@ -43,6 +43,19 @@ def mode() -> str:
     return value
 
 
+@contextmanager
+def switched(value: str) -> Iterator[None]:
+    """Set ``MI_NTF_CACHE`` to `value` within the block."""
+    before = os.environ.get("MI_NTF_CACHE")
+    os.environ["MI_NTF_CACHE"] = value
+    try:
+        yield
+    finally:
+        os.environ.pop("MI_NTF_CACHE")
+        if before is not None:
+            os.environ["MI_NTF_CACHE"] = before
+
+
 def folder() -> Path | None:
     """Return the cache's folder, which need not exist; None for users without a home."""
     base = os.environ.get("XDG_CACHE_HOME")
@@ -140,24 +153,6 @@ def write(kind: str, name: str, arrays: dict[str, np.ndarray], placed: bool = Fa
     if _write(_path(kind, name), content):
         with suppress(OSError):  # of other processes that tidy up as well
             _tidy()
-
-
-def read_text(name: str) -> str | None:
-    """Return the text of file `name`; None where it is missing or unreadable."""
-    where = folder()
-    try:
-        return (where / name).read_text() if where and (where / name).is_file() else None
-    except OSError as error:
-        _warn(f"cannot read {where and where / name} ({error.strerror})")
-    except UnicodeDecodeError:
-        pass
-    return None
-
-
-def write_text(name: str, text: str) -> None:
-    """Keep `text` as file `name`."""
-    where = folder()
-    _write(where and where / name, text)
 
 
 def entries() -> Iterator[tuple[str, Path, os.stat_result]]:

@@ -21,7 +21,7 @@ def small(monkeypatch):
 @pytest.mark.slow  # its scene is read at full size
 def test_directions_of_their_own_and_shared_ones(monkeypatch):
     monkeypatch.setattr(lookups, "LIGHTS", 2)
-    monkeypatch.setattr(lookups.calibration, "WIDTH", 1 << 10)
+    monkeypatch.setattr(lookups.loops, "POINTS", 1 << 10)
     row = lookups.loop("knot", 0, 0)
     for way in ("random", "same"):
         march, atlas = (row["ns"][f"{way} {method}"] for method in lookups.METHODS[:2])

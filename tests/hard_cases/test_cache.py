@@ -14,8 +14,6 @@ import OpenEXR
 import pytest
 from helpers.maps import table, texels, without_cache
 
-from mi_ntf import cli
-from mi_ntf.render.cost import model
 from mi_ntf.render.maps import map_cache
 
 # --- folders that cannot be used -------------------------------------------------------------------------------------
@@ -73,19 +71,6 @@ def test_a_cache_that_cannot_be_used_is_one_warning(medium, cache, warnings, mon
     assert re.search(reason, text) and "XDG_CACHE_HOME" in text and "\n" not in text
     if cache.is_dir():
         assert not list(cache.iterdir()), "nothing half-written, nothing temporary"
-
-
-@pytest.mark.parametrize("what", FAULTS)
-def test_prices_that_cannot_be_kept_are_one_warning(cache, warnings, monkeypatch, what):
-    reason = spoil(what, cache, monkeypatch)
-    possible = what == "a file in place of maps"
-    with little_room(100 if what == "a full disk" else resource.RLIM_INFINITY):
-        for _ in range(2):
-            model.remember(model.Constants(march=3.0))
-    assert model.constants() == model.Constants(march=3.0 if possible else model.Constants().march)
-    assert [bool(re.search(reason, text)) for text in warnings] == ([] if possible else [True])
-    if cache.parent.is_dir():
-        assert {p.name for p in cache.parent.iterdir()} == ({"maps", "cost.json"} if possible else set())
 
 
 SCENE = """<scene version="3.9.0">
@@ -151,15 +136,3 @@ def test_three_processes_on_one_cache(render, tmp_path):
     finish(later)
     np.testing.assert_array_equal(pixels(out), pixels(reference))
     assert [p.stat().st_ino for p in file.parent.iterdir()] == [before], "it was read, not written anew"
-
-
-@pytest.mark.slow
-def test_prices_are_measured_without_a_place_for_them(path, tmp_path, cache, warnings, capfd):
-    """`mi-ntf explain --measure` says what it measured, and in one warning that it cannot keep it."""
-    (tmp_path / "cache").write_text("a file")
-    scene = tmp_path / "scene.xml"
-    scene.write_text(SCENE.replace("FIELD", str(path)))
-    assert cli.main(["explain", str(scene), "--measure"]) == 0
-    assert "measured" in capfd.readouterr().out
-    (text,) = warnings
-    assert "keeps nothing for later renders" in text

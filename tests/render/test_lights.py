@@ -1,6 +1,8 @@
 """Emitters as lights of the field: every kind of Mitsuba's against stock `volpath`, rows against Mitsuba's own
 sampling, orientation, and the noise of resampling."""
 
+from unittest import mock
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -88,10 +90,10 @@ def points(n: int, copies: int, rng) -> shade.Points:
     return shade.Points(x, wo, shade.Reflectance(normal, albedo, tile(roughness), tile(specular), tile(0 * specular)))
 
 
-def drawn(emitters: list, at, count: int, candidates: int = 8) -> emitter_samples.EmitterSamples:
-    return emitter_samples.EmitterSamples(
-        emitters, [1.0] * len(emitters), identity(), at, dr.opaque(mi.UInt32, 7), count, resampled=candidates
-    )
+def drawn(emitters: list, at, count: int, candidates: int = emitter_samples.CANDIDATES):
+    with mock.patch.object(emitter_samples, "CANDIDATES", candidates):
+        return emitter_samples.EmitterSamples(
+            emitters, [1.0] * len(emitters), identity(), at, dr.opaque(mi.UInt32, 7), count)
 
 
 @pytest.mark.parametrize("kinds", [("envmap",), ("constant", "directional", "spot")])

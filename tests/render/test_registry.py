@@ -32,8 +32,7 @@ class Share:
 def half(variant, monkeypatch):
     mi_ntf.render.register()
     for name, share in (("all", 1.0), ("half", 0.5)):
-        method = Method(name, "a share of each light", lambda *about, share=share: Share(share),
-                        lambda work, prices: 3.0)
+        method = Method(name, "a share of each light", lambda *about, share=share: Share(share))
         monkeypatch.setitem(REGISTRY, name, method)
 
 
@@ -50,9 +49,9 @@ def test_a_method_of_a_registry_entry(half, tmp_path, light):
 
 
 def test_reports_know_the_method(half):
-    """`explain` prices it; a misspelt name lists it."""
-    report = explain(SCENE, {"light": "point", "visibility": "half", "res": "8", "spp": "1"})
-    assert report["visibility"] == "half" and report["seconds"]["lights"] > 0
+    """`explain` predicts it; a misspelt name lists it."""
+    report = explain(SCENE, {"light": "point", "visibility": "half", "res": "8", "spp": "1", "depth": "2"})
+    assert report["visibility"] == "half" and report["predicted"]["seconds"] > 0
     with pytest.raises(RuntimeError, match=r"expected one of .* half, auto"):
         mi.load_dict({"type": "nrf", "visibility": "halve"})
 

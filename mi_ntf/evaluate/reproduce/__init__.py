@@ -17,7 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from ...core import errors
 from ...jobs import Workers
-from ...render.cost.measurement import maps_made_anew
+from ...render import user_cache
 from .. import bench
 from . import sharing
 from .compared import FULL, QUICK, Sizes
@@ -50,7 +50,7 @@ def reproduce(out: Path, quick: bool = False, scenes: Sequence[str] = (), enviro
     request = Request(out, sizes or (QUICK if quick else FULL), quick, tuple(scenes), environments, tuple(tables),
                       tuple(methods))
     plan = request.plan()
-    with State(out) as state, maps_made_anew():
+    with State(out) as state, user_cache.switched("off"):
         interrupted, failed = None, set()
         try:
             failed = _work(plan.jobs, state) if workers.here else _shared(plan.jobs, state, request, workers)

@@ -11,11 +11,11 @@ import mitsuba as mi
 import numpy as np
 
 from ...core import spheres
-from ...render.commands.calibration import seconds, table_of
-from ...render.cost.measurement import maps_made_anew
+from ...render import user_cache
 from ...render.maps import building
 from .. import bench, bench_culled, bench_image, bench_paper, bench_product
 from ..bench_measure import Sizes as BenchSizes
+from ..loops import seconds, table_of
 from ..photographs import field_ball
 from . import paper
 from .compared import Scene, Sizes
@@ -29,7 +29,7 @@ OURS = "ours", True
 
 def measure(sizes: BenchSizes) -> dict:
     """Row of the job: ``costs`` of :func:`mi_ntf.evaluate.bench_paper.costs_of` and ``machine``."""
-    with maps_made_anew():
+    with user_cache.switched("off"):
         scene = bench_image.under_sky(sizes.image)
         costs = bench_paper.costs_of(scene, bench_image.medium_of(scene), sizes)
     return {"costs": {name: float(value) for name, value in costs.items()}, "machine": bench.machine()}
@@ -37,7 +37,7 @@ def measure(sizes: BenchSizes) -> dict:
 
 def scaling(sizes: BenchSizes) -> dict:
     """Row of the job: seconds of whole pictures by ``transmittance_map`` under 1 to 500 lights, ``pixels`` a side."""
-    with maps_made_anew():
+    with user_cache.switched("off"):
         found = next(r for r in bench_product.scaling_rows(sizes) if "intercept_seconds" in r.details)
     return {"pixels": sizes.image, **{k: found.details[k] for k in ("lights", "seconds", "intercept_seconds")}}
 

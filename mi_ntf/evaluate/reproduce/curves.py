@@ -10,9 +10,9 @@ import numpy as np
 
 from ... import swap
 from ...core.errors import MiNtfError
-from ...render.commands.calibration import table_of
 from ...render.maps import building
 from .. import bench_paper, transmittance
+from ..loops import table_of
 from ..photographs import field_ball
 from . import images
 from .compared import Scene, Sizes

@@ -13,8 +13,7 @@ import mitsuba as mi
 
 from ... import jobs as engines
 from ...core.errors import MiNtfError
-from ...render import register
-from ...render.cost.measurement import maps_made_anew
+from ...render import register, user_cache
 from . import compared, lights
 from .compared import METHODS, TABLES, Scene, Sizes
 from .images import Studio
@@ -80,7 +79,7 @@ def perform(task: Task) -> dict[str, Any]:
         _plans.clear()
         raise MiNtfError(f"{platform.node()} has other scenes, fields or another version of mi_ntf than the machine "
                          "that began this run; give all the same")
-    with maps_made_anew():
+    with user_cache.switched("off"):
         return timed(job) | {"shared": True}
 
 

@@ -1,17 +1,11 @@
-"""Interface of a visibility method: its construction, the lights that it serves, its cost.
+"""Interface of a visibility method: its construction, and the lights that it serves.
 
 Every method's file ends with its own :class:`Method`; :data:`mi_ntf.infer.visibility.REGISTRY` lists them.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
-
-FILLED = 0.785398
-"""Share of a map's texels whose rays meet the object: π/4."""
-ASKED = 0.06, 0.27
-"""Share of the steps of maps and volumes at which the field is asked, of an opaque thing (0.05 to 0.12 on four) and of
-smoke (0.24, 0.31): its grid tells where nothing is, and a march ends where no light is left."""
 
 COARSEST, FINE_MAPS = 192, 4
 """Texels along a side of the maps of many lights, at least; number of lights whose maps are as fine as the voxels."""
@@ -57,47 +51,34 @@ class Method:
                  `step`, is at hand; for a field's own maps their table of directions and their options come after
                  `make`. ``some=``: a function of rows of `table` that makes a map of these lights alone, where each
                  light's numbers are its own
-    pair         ``(work, prices)`` → nanoseconds of a point and light; `work`: :class:`mi_ntf.render.cost.model.Work`,
-                 `prices`: :class:`mi_ntf.render.cost.model.Constants`
-    prices       name → nanoseconds on two cores of 2024; the first is what `pair` counts in, the second what `making`
-                 does
-    making       as `pair`, of what is held for a light; None for methods that hold nothing
+    rays         ``(lights, resolution)`` → number of rays, each marched or asked for once, that fill what is held for a
+                 field; `lights` of the table, `resolution` texels along a side of their maps
     numbers      ``(medium, table, options)`` → what is held for each of the squared ``map_resolution`` rays of a light,
                  in float32 numbers
-    per_field    `making` and `numbers` are of all that is held for a field, whatever the lights
+    per_field    `rays` and `numbers` are of all that is held for a field, whatever the lights
     dials        properties of the integrator that it reads
     resolution   ``(lights, voxels)`` → texels along a side where the user names none
     drawn        name of the method that serves lights which are drawn at random, and all other rays; "": itself
-    candidates   draws that a random light is resampled from: as many as are cheap beside one visibility
     derivatives  whether places of lights have derivatives
-    automatic    rank among the methods that ``auto`` may choose from, the least biased first; 0: it may not
+    automatic    true if ``auto`` may take it under a limit
     needs        ``(medium)`` → whether the field can serve it
-    trial        ``(resolution, lights)`` that its prices are measured with
     """
 
     name: str
     summary: str
     build: Callable[..., Any]
-    pair: Callable[[Any, Any], float]
-    prices: dict[str, float] = field(default_factory=dict)
-    making: Callable[[Any, Any], float] | None = None
+    rays: Callable[[int, int], int] = lambda lights, resolution: 0
     numbers: Callable[[Any, Any, Options], int] | None = None
     per_field: bool = False
     dials: tuple[str, ...] = ()
     resolution: Callable[[int, int], int] = resolution_for
     drawn: str = ""
-    candidates: int = 8
     derivatives: bool = False
-    automatic: int = 0
+    automatic: bool = False
     needs: Callable[[Any], bool] = lambda medium: True
-    trial: tuple[int, int] = (128, 4)
 
     @property
     def for_drawn(self) -> str:
         """Name of the method that serves drawn lights where this one serves the table's."""
         return self.drawn or self.name
 
-
-def queries(work, prices, asked: tuple[float, float] = ASKED) -> float:
-    """Nanoseconds that the densities of a step cost on top, where the field is its networks."""
-    return asked[0 if work.opaque else 1] * prices.density if work.network else 0.0

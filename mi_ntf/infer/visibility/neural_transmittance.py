@@ -16,11 +16,6 @@ def build(medium, table, options, dj, keep):
     return transmittance_atlas.build(medium, table, replace(options, map_source="network"), dj, keep)
 
 
-def making(work, prices) -> float:
-    """ns of all maps."""
-    return transmittance_atlas.making(replace(work, source="network"), prices)
-
-
 def numbers(medium, lights, options) -> int:
     """float32 numbers of all maps."""
     return transmittance_atlas.numbers(medium, lights, replace(options, map_source="network"))
@@ -30,10 +25,8 @@ METHOD = Method(
     name="neural_transmittance",
     summary="per field, the ray network's answers for the rays of an atlas, each asked once; looked up as in one",
     build=build,
-    pair=transmittance_atlas.METHOD.pair,
-    making=making,
+    rays=transmittance_atlas.METHOD.rays,
     numbers=numbers,
     per_field=True,
-    candidates=2,
     dials=("map_file",),
 )

@@ -6,6 +6,5 @@ METHOD = Method(
     name="none",
     summary="no shadows",
     build=lambda medium, table, options, dj, keep: None,
-    pair=lambda work, prices: 0.0,
     derivatives=True,
 )

@@ -38,6 +38,4 @@ METHOD = Method(
     summary="the ray network asked per point and light, as in the paper; networks that read a ray's depths march for "
             "them first",
     build=build,
-    pair=lambda work, prices: prices.ray,
-    prices={"ray": 600.0},
 )

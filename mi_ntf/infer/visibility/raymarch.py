@@ -6,7 +6,7 @@ from ...core import spheres
 from ...core.ops import dot
 from .. import ops
 from ..bundle import density_where, safe_inverse, slope_where
-from .method import Method, Options, queries
+from .method import Method, Options
 
 MAX_OPTICAL_DEPTH = 12.0
 """Light rays end here, and count as blocked: a lamp that shines through at τ = 6e-6 would light what is outside an
@@ -95,16 +95,6 @@ def optical_depth(volume, x, d, length, steps, active):
     return dr.replace_grad(depth, dot(slopes[:3], x) + dot(slopes[3:], d) + last * length)
 
 
-def light_steps(samples: int) -> int:
-    """Steps of a light's march from a point over the mean chord, 1 unit-sphere radius."""
-    shortest, longest, growth = default_steps(2 / samples)
-    t, count = 0.0, 0
-    while t < 1:
-        t += min(max(growth * t, shortest), longest)
-        count += 1
-    return count
-
-
 def build(medium, table, options: Options, dj, keep) -> RayMarch:
     """See :class:`mi_ntf.infer.visibility.method.Method`."""
     steps, fine = (tuple(dr.opaque(dj.Float, s) for s in default_steps(options.step, gradients))
@@ -116,8 +106,6 @@ METHOD = Method(
     name="raymarch",
     summary="one march through the field per point and light: the reference",
     build=build,
-    pair=lambda work, prices: light_steps(work.samples) * (prices.march + queries(work, prices, ASKED)),
-    prices={"march": 2.0},
     derivatives=True,
-    automatic=1,
+    automatic=True,
 )

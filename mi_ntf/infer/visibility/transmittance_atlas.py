@@ -22,7 +22,7 @@ from ...core.ops import dot
 from .. import octahedral, ops, profile
 from ..lights import LightTable
 from . import map_source, raymarch, two_logistics
-from .method import FILLED, Method, Options, queries
+from .method import Method, Options
 from .transmittance_map import TransmittanceMap, channels
 
 SIDE = 36
@@ -52,11 +52,6 @@ OUTSIDE = 0.98
 COARSE = 7.0
 """Steps of the march that fills the maps of an opaque thing, in those of a transmittance map: what a texel blurs hides
 more (pictures of `statue`, `globe` and `knot` err alike by 5 and 7)."""
-ASKED = 0.04, 0.03
-"""Share of the steps in :func:`making` at which the field is asked, of opaque things (0.03 to 0.05 on four), of smoke.
-"""
-IN_SMOKE = 1.8
-"""What a step of a transmittance map's march costs there, of such a map's price: all are fitted with more effort."""
 SMOKE_STEP = 1 / 32
 """The same of smoke, field units: on `cloud` τ is off by 0.0273 (RMS), as by steps of 1/400."""
 
@@ -191,26 +186,13 @@ def numbers(medium, lights, options: Options) -> int:
     return RAYS * channels(medium.field.network.components if network else LOGISTICS) // 2
 
 
-def making(work, prices) -> float:
-    """ns of all maps: of an opaque thing a ray costs half a texel of a light's map, a seventh of the steps and two
-    logistics to fit. The network is asked once."""
-    if work.source == "network":
-        return FILLED * RAYS * prices.ray
-    per_step = 0.5 if work.opaque else IN_SMOKE
-    return FILLED * RAYS * per_step * work.samples * (prices.texel + queries(work, prices, ASKED))
-
-
 METHOD = Method(
     name="transmittance_atlas",
     summary="per field, maps of directions all around: one texel and a few densities per point and light",
     build=build,
-    pair=lambda work, prices: prices.atlas,
-    prices={"atlas": 25.0},
-    making=making,
+    rays=lambda lights, resolution: RAYS,
     numbers=numbers,
     per_field=True,
-    candidates=2,
     dials=("map_source", "map_file"),
-    automatic=2,
-    trial=(128, 256),  # of few lights, what is found once for a point is much of it
+    automatic=True,
 )

@@ -19,7 +19,7 @@ from ..texels import Texels, blank
 from . import map_source
 from .light_rays import LightRays
 from .map_source import Source
-from .method import FILLED, Method, Options, queries
+from .method import Method, Options
 
 SAME, APART = 1.0, 2.0
 """Texels by which the centres of four neighbouring rays may differ to count as one surface, and as two. On `statue`,
@@ -153,24 +153,13 @@ def build(medium, table, options: Options, dj, keep) -> TransmittanceMap:
     return keep(width(medium, table, options), step, make, some=None if network else some)
 
 
-def per_ray(work, prices) -> float:
-    """ns of one ray of a map: q of research/transmittance.md, section 5."""
-    if work.source == "network":
-        return prices.ray
-    return work.samples * (work.components * prices.texel + queries(work, prices))
-
-
 METHOD = Method(
     name="transmittance_map",
     summary="per light, a table of the logistics of its rays",
     build=build,
-    pair=lambda work, prices: prices.lookup * work.components,
-    # 0.6 of an atlas's lookup, as in loops over many lights; in pictures of 128 lights it is 0.9, two logistics 1.4.
-    prices={"lookup": 15.0, "texel": 1.0},
-    making=lambda work, prices: FILLED * work.texels * per_ray(work, prices),
+    rays=lambda lights, resolution: lights * resolution**2,
     numbers=width,
     dials=("map_resolution", "map_source", "map_components", "map_memory", "map_file"),
     drawn="raymarch",
-    automatic=3,
-    trial=(128, 256),  # maps of so many lights fit no cache, and neither do a scene's
+    automatic=True,
 )

@@ -13,7 +13,7 @@ from .. import ops
 from ..bundle import density_where, safe_inverse
 from ..lights import LightTable
 from .light_rays import LightRays
-from .method import COARSEST, FILLED, Method, Options, queries
+from .method import COARSEST, Method, Options
 from .raymarch import MAX_OPTICAL_DEPTH
 
 ENTRIES = 1.5
@@ -99,13 +99,9 @@ METHOD = Method(
     name="transmittance_volume",
     summary="per light, τ tabulated along the rays of its map",
     build=build,
-    pair=lambda work, prices: prices.fetch,
-    prices={"fetch": 15.0, "cell": 2.0},
-    making=lambda work, prices: (
-        FILLED * work.texels * ENTRIES * work.samples * (prices.cell + queries(work, prices))),
+    rays=lambda lights, resolution: lights * resolution**2,
     numbers=lambda medium, table, options: depths(options),
     dials=("map_resolution", "map_memory"),
     resolution=lambda lights, voxels: COARSEST,  # its memory grows with the third power
     drawn="raymarch",
-    trial=(52, 4),
 )

@@ -45,7 +45,5 @@ METHOD = Method(
     name="visibility_mlp",
     summary="one query of a network of a point and a direction per point and light: the baseline",
     build=build,
-    pair=lambda work, prices: prices.mlp,
-    prices={"mlp": 1500.0},
     needs=lambda medium: medium.field.header.architecture.visibility is not None,
 )

@@ -47,7 +47,7 @@ class Lights:
     light_samples       0: every discrete light at every point, environments by texels, and a few samples of each
                         emitter that is no finite set of lights; n: n samples a point of all emitters together
     environment_lights  most directional lights that stand for an environment
-    dimmest             share of all light at the fields; the dimmest lights that have no more of it do not shine
+    brightest           number of rows that shine, those that bring most light to the fields; 0: all
     only                numbers of the emitters that shine; None: all
 
     kinds    plugin name of each emitter
@@ -60,7 +60,7 @@ class Lights:
     """
 
     def __init__(self, scene, media=(), light_samples: int = 0, environment_lights: int = 512,
-                 dimmest: float = 0.0, only: tuple[int, ...] | None = None):
+                 brightest: int = 0, only: tuple[int, ...] | None = None):
         self._wrapped: list = []
         outer = [e for i, e in enumerate(scene.emitters()) if (only is None or i in only) and _is_found(e)]
         emitters = [self._unwrap(e, scene, media) for e in outer]
@@ -75,33 +75,24 @@ class Lights:
         dark = light_gradients.attached([e for e, _ in discrete])
         every = light_rows.join([d.rows for d in self.discrete], dark)
         self._strength = every.strength([m.frame.origin for m in media])
-        self._dimmest = dimmest
-        self.rows = every.part(self._bright(dimmest)) if dimmest else every
+        self.rows = every
+        if brightest:
+            kept = np.sort(np.argsort(-self._strength, kind="stable")[:brightest])
+            self.rows, self._strength = every.part(kept), self._strength[kept]
         pairs = [(e, w) for e, w in zip(emitters, outer, strict=True) if light_samples or not is_discrete(e)]
         self.sampled = [_drawable(e, scene) for e, _ in pairs if _shines(e)]
         # Mitsuba leaves emitters of weight 0 to BSDF samples. Points of fields have emitter samples alone, so these
         # emitters get a weight.
         self._weights = [w.sampling_weight() or 1.0 for e, w in pairs if _shines(e)]
 
-    def _bright(self, dimmest: float) -> np.ndarray:
-        """Mask of the rows that remain without the dimmest ones."""
-        order = np.argsort(self._strength)
-        sums = np.empty(len(order))
-        sums[order] = np.cumsum(self._strength[order])
-        return sums > dimmest * self._strength.sum()
-
     def suns(self) -> np.ndarray:
         """(n,) which few of many rows bring a large share of all light each."""
-        strength = self._strength[self._bright(self._dimmest)] if self._dimmest else self._strength
+        strength = self._strength
         most = len(strength) // AMONG
         brightest = np.argsort(-strength, kind="stable")[:most]
         found = np.zeros(len(strength), bool)
         found[brightest] = strength[brightest] > SUN * strength.sum()
         return found
-
-    def brighter(self, dimmest: float) -> int:
-        """Number of rows without the dimmest ones."""
-        return int(self._bright(dimmest).sum()) if dimmest else len(self._strength)
 
     def _unwrap(self, emitter, scene, media):
         """Return the light that an ``ntf`` emitter wraps, if its medium is one of `media`; any other emitter itself."""
@@ -133,17 +124,16 @@ class Lights:
         light_gradients.attach(table, self.rows, self.discrete, frame)
         return table
 
-    def sources(self, table: LightTable, frame: Frame, points, seed, draws: int, resampled: int,
-                gradients: bool = False) -> list:
+    def sources(self, table: LightTable, frame: Frame, points, seed, draws: int, gradients: bool = False) -> list:
         """Return the light sources to sum over at `points`, in the coordinates of `frame`.
 
         They are pairs of a source, which has ``count`` and ``sample``, and a flag: its index is a row of `table`, which
-        maps are made for. `draws`: least number of lights drawn; `resampled`: candidates of each; `gradients`: lights
-        are attached (:class:`EmitterSamples`)."""
+        maps are made for. `draws`: least number of lights drawn; `gradients`: lights are attached
+        (:class:`EmitterSamples`)."""
         result: list[tuple[Any, bool]] = [(table, True)] if table.count else []
         if self.sampled:
             drawn = EmitterSamples(self.sampled, self._weights, frame, points, seed, self.light_samples, draws,
-                                   resampled=resampled, gradients=gradients)
+                                   gradients=gradients)
             result.append((drawn, False))
         return result
 

@@ -10,7 +10,7 @@ from ...infer.texels import DTYPES
 from ...infer.visibility import REGISTRY
 from ...infer.visibility.marched_suns import MarchedSuns
 from ...infer.visibility.method import Options
-from .. import log
+from .. import log, timing
 from . import map_cache
 
 
@@ -87,7 +87,7 @@ def build(method: str, medium, table, options: Options):
     if not REGISTRY[method].numbers:
         return REGISTRY[method].build(medium, table, options, mi, keep)
     size = "" if REGISTRY[method].per_field else f", {table.count} × {options.map_resolution}² texels"
-    with log.timed(f"nrf integrator: made the {method}{size}"):
+    with timing.building(), log.timed(f"nrf integrator: made the {method}{size}"):
         return REGISTRY[method].build(medium, table, options, mi, keep)
 
 

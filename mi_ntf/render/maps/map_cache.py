@@ -6,6 +6,8 @@ resolution, source and number of logistics (:mod:`mi_ntf.render.user_cache`).
 
 import threading
 from collections import OrderedDict
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -95,6 +97,17 @@ def _joined(each: list, some, count: int) -> np.ndarray | None:
     if len(missing):
         values[missing] = some(missing).values.reshape(len(missing), -1)
     return values.ravel()
+
+
+@contextmanager
+def in_memory() -> Iterator[None]:
+    """Keep maps in memory and in no file within the block, which begins and ends without any."""
+    with user_cache.switched("memory"):
+        forget()
+        try:
+            yield
+        finally:
+            forget()
 
 
 def forget() -> None:

@@ -8,7 +8,6 @@ import numpy as np
 
 from ...core.errors import MiNtfError
 from ...infer.visibility import REGISTRY
-from ..cost import model
 from . import gradient_checks
 from .media import lets_light_through, ordinary_shapes
 from .settings import Settings
@@ -75,7 +74,7 @@ def describe(scene, settings: Settings, sensor, spp: int, media: list, light) ->
                   and not lets_light_through(scene))
     width, height = sensor.film().crop_size()
     bounces = _bounces(settings, media, surfaces, gradients) if lit and not 0 <= depth <= 2 else ""
-    method, reason = _method(settings, width * height * spp, media, light, surfaces, bounces)
+    method, reason = _method(settings, width * height * spp, light)
     if collocated:
         reason += "; not needed where the camera's own transmittance is the light's"
     rims = [m.field.header.architecture.fresnel for m in media]
@@ -94,10 +93,6 @@ def describe(scene, settings: Settings, sensor, spp: int, media: list, light) ->
         bounces=bounces,
         gradients=gradients,
     )
-
-
-UNLIMITED = 4
-"""Bounces that paths without a limit have, about."""
 
 
 def _bounces(integrator, media: list, surfaces: bool, gradients: bool) -> str:
@@ -119,25 +114,35 @@ def drawn(integrator, light) -> int:
     return integrator.light_samples or 2 * len(light.sampled)
 
 
-def others(integrator, rays: int, surfaces: bool, bounces: str) -> float:
-    """Rays towards lights from surfaces and from further bounces, about."""
-    further = (integrator.max_depth - 2 if integrator.max_depth > 0 else UNLIMITED) if bounces == "paths" else 0
-    return float(rays * (surfaces + further))
-
-
-def _method(integrator, rays: int, media: list, light, surfaces: bool, bounces: str) -> tuple[str, str]:
-    """The visibility method that runs, and why."""
-    method = integrator.visibility
+def _method(settings, rays: int, light) -> tuple[str, str]:
+    """Return the visibility method that runs, and why."""
+    method = settings.visibility
     if method != "auto":
-        if REGISTRY[method].drawn and integrator.light_samples:
+        if REGISTRY[method].drawn and settings.light_samples:
             raise MiNtfError(
-                f"light_samples is {integrator.light_samples}, but visibility={method} holds one map or volume for "
+                f"light_samples is {settings.light_samples}, but visibility={method} holds one map or volume for "
                 "every light and sums all of them; remove light_samples or choose raymarch or transmittance_atlas"
             )
         return method, "chosen by name"
-    return model.choose(model.work(
-        integrator, media[0], method, rays, len(light.rows.power), drawn(integrator, light),
-        others(integrator, rays, surfaces, bounces)))
+    marched = rays * settings.frames * shadow_rays(settings, light)
+    filled = REGISTRY["transmittance_atlas"].rays(0, 0)
+    fewer = marched <= filled
+    return ("raymarch" if fewer else "transmittance_atlas",
+            f"camera rays times lights are {count(marched)}, {'no more' if fewer else 'more'} than the {count(filled)} "
+            "rays that fill an atlas")
+
+
+def shadow_rays(settings, light) -> int:
+    """Return the number of lights that a shading point asks for, all of the table and those drawn at random."""
+    return len(light.rows.power) + drawn(settings, light)
+
+
+def count(number: float) -> str:
+    """Return a large number in words of two digits."""
+    for size, word in ((1e9, " billion"), (1e6, " million"), (1e3, " thousand")):
+        if number >= size:
+            return f"{float(f'{number / size:.2g}'):g}{word}"
+    return f"{number:g}"
 
 
 def _at_camera(light, sensor, media) -> bool:

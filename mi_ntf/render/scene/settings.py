@@ -5,11 +5,14 @@ from dataclasses import dataclass, fields, replace
 
 @dataclass(frozen=True)
 class Settings:
-    """As in the plugin's table, and what is left out of what the scene calls for: `specular`, whether specular lobes
-    take part; `dimmest`, share of all light that the dimmest lights have which do not; `without`, numbers of the media
-    that do not; `share`, (part, parts): the discrete lights of one part, and in part 0 all else: parts add up to the
-    picture; `only`, numbers of the emitters that shine, None: all (of a scene without surfaces); `still`, whether
-    lights and fields are known to stand still, so that `frames` share what is made for each light, too."""
+    """Properties of the plugin's table, and what is left out of what the scene calls for.
+
+    specular   specular lobes take part
+    brightest  number of the table's lights that shine, the brightest ones; 0: all
+    without    numbers of the media that take no part
+    share      (part, parts): the discrete lights of one part, and in part 0 all else; parts add up to the picture
+    only       numbers of the emitters that shine; None: all (of a scene without surfaces)
+    """
 
     visibility: str
     samples: int
@@ -25,11 +28,10 @@ class Settings:
     frames: int
     hide_emitters: bool
     specular: bool = True
-    dimmest: float = 0.0
+    brightest: int = 0
     without: tuple[int, ...] = ()
     share: tuple[int, int] = (0, 1)
     only: tuple[int, ...] | None = None
-    still: bool = False
 
     @classmethod
     def of(cls, integrator) -> "Settings":

@@ -26,9 +26,10 @@ def trace(composition: Composition, ray, quadrature, stream, sums=None, seen: Se
 class _CameraLight:
     """The light along rays: `hit`, the surfaces that they meet (None without surfaces); `total`, the sum so far, a
     float a ray for each channel; `met`, the samples of the fields and the scene length of their t's unit; `crossing`,
-    the rays that go straight on through the surfaces (None without any); `way`, how far the rays have come already."""
+    the rays that go straight on through the surfaces (None without any); `way`, how far the rays have come already;
+    `number`, of each ray, which its random numbers follow from (None: its place)."""
 
-    def __init__(self, composition: Composition, ray, quadrature, stream, sums, seen: Seen, way=None):
+    def __init__(self, composition: Composition, ray, quadrature, stream, sums, seen: Seen, way=None, number=None):
         self.scene, self.ray, self.stream, self.sums, self.seen = composition, ray, stream, sums, seen
         self.offset, self.depth = quadrature
         self.effects, self.first_run = composition.effects, not composition.run
@@ -37,6 +38,7 @@ class _CameraLight:
         self.met: Any = None
         self.crossing: Paths | None = None
         self.way = mi.Float(0) if way is None else way
+        self.number = dr.arange(mi.UInt32, dr.width(ray.o)) if number is None else number
 
     def trace(self):
         surfaces, ray, found = self.scene.surfaces, self.ray, self.effects
@@ -77,14 +79,15 @@ class _CameraLight:
         """Add what the rays that cross surfaces meet behind them: ``(radiance, opacity)`` of all rays."""
         pixel = paths.pixel
         quadrature = tuple(dr.gather(mi.Float, a, pixel) for a in (self.offset, self.depth))
+        number = dr.gather(mi.UInt32, self.number, pixel)
         # Now, so that rays behind any number of surfaces are traced by the same kernels.
-        dr.eval(quadrature, paths.ray, paths.weight, paths.way, pixel, radiance, opacity, transmittance)
+        dr.eval(quadrature, paths.ray, paths.weight, paths.way, pixel, number, radiance, opacity, transmittance)
         sums = self.sums and self.sums.of_rays(dr.width(pixel))
         one: Any = dr.opaque(mi.UInt32, 1)
         stream = mi.sample_tea_32(self.stream, one)[0]
         dr.make_opaque(stream)
         light, covered = _CameraLight(self.scene, paths.ray, quadrature, stream, sums, Seen(keep=False),
-                                      paths.way).trace()
+                                      paths.way, number).trace()
         through = dr.gather(mi.Float, transmittance, pixel)
         if self.sums:
             self.sums.add_behind(sums, through, pixel)
@@ -101,7 +104,7 @@ class _CameraLight:
         wanted = found.lit or bool(sums and sums.needs_points)
         samples = self.seen.samples(wanted, found.collocated, lambda: march.camera_samples(
             strands, maxt, self.offset, self.depth, shade=wanted, view=found.collocated,
-            shares=tuple(march.share(p.medium.field.softness.opaque, self.scene.rough) for p in self.scene.in_view)))
+            shares=tuple(march.share(p.medium.field.softness.opaque) for p in self.scene.in_view)))
         self.met = samples, unit
         light = [dr.zeros(mi.Float, dr.width(samples.t)) for _ in range(3)]
         for i, part in enumerate(self.scene.in_view):
@@ -122,7 +125,7 @@ class _CameraLight:
             view = dr.gather(mi.Float, view, kept) if view is not None else None
         if not dr.width(index):
             return
-        points = self.seen.points(samples, i, lambda: self._points(i, part, samples, index, t))
+        points = self.seen.points(samples, i, lambda: self._points(i, part, samples, index, t, kept))
         if self.sums:
             distance = (dr.gather(mi.Float, samples.bundle.base, index) + t) * unit
             distance += self.way if dr.width(self.way) == 1 else dr.gather(mi.Float, self.way, index)
@@ -133,10 +136,12 @@ class _CameraLight:
                 where = dr.arange(mi.UInt32, dr.width(t)) if kept is None else kept
                 dr.scatter_reduce(dr.ReduceOp.Add, channel, value * weight, where, mode=dr.ReduceMode.NoConflicts)
 
-    @staticmethod
-    def _points(i: int, part: Part, samples, index, t) -> shade.Points:
+    def _points(self, i: int, part: Part, samples, index, t, kept) -> shade.Points:
         x, along = samples.place(i, index, t)
-        points = shade.Points(x, tuple(-c for c in along), part.medium.reflectance(x))
+        lane = dr.arange(mi.UInt32, dr.width(t)) if kept is None else kept
+        ordinal = lane - dr.gather(mi.UInt32, samples.first, index)
+        number = dr.gather(mi.UInt32, self.number, index)
+        points = shade.Points(x, tuple(-c for c in along), part.medium.reflectance(x), number, ordinal)
         points.evaluate()
         return points
 
@@ -148,15 +153,15 @@ class _CameraLight:
         return [a + b for a, b in zip(light, bounced.reflect(part, points), strict=True)]
 
     def _walk(self) -> Walk:
-        return Walk(self.scene, self.scene.settings.max_depth, self.total, self.stream)
+        return Walk(self.scene, self.scene.settings.max_depth, self.total, self.stream, self.number)
 
     def _camera(self, transmittance) -> Paths:
         """The camera rays behind the fields."""
         everyone = dr.arange(mi.UInt32, dr.width(self.ray.o))
         way = dr.zeros(mi.Float, dr.width(everyone)) + self.way
         transmitting = self.scene.surfaces and self.scene.surfaces.transmitting
-        return Paths(mi.Ray3f(self.ray), mi.Color3f(transmittance), everyone, mi.Float(-1), self._random(everyone),
-                     way if transmitting else None)
+        return Paths(mi.Ray3f(self.ray), mi.Color3f(transmittance), everyone, mi.Float(-1),
+                     self._random(self.number, 0), way if transmitting else None)
 
     def _bounces(self, transmittance):
         """Adds the light of surfaces that the camera sees, and of paths of more than one bounce."""
@@ -172,10 +177,13 @@ class _CameraLight:
         whole = join(onward)
         walk.run(whole.take(dr.compress(dr.max(whole.weight) > 0)))
 
-    def _random(self, sequence):
-        """A stream for each; those of one seed and other sequences begin elsewhere, or neighbours would be alike."""
-        start, sequence = mi.sample_tea_32(self.stream, sequence)
-        return mi.PCG32(dr.width(sequence), mi.UInt64(start), mi.UInt64(sequence))
+    def _random(self, number, purpose: int):
+        """Random streams of the rays of these numbers, other ones for each purpose."""
+        other: Any = dr.opaque(mi.UInt32, purpose)
+        stream = mi.sample_tea_32(self.stream, other)[1]
+        # One seed with other sequences would make neighbours alike.
+        start, sequence = mi.sample_tea_32(stream, number)
+        return mi.PCG32(dr.width(number), mi.UInt64(start), mi.UInt64(sequence))
 
     def _surface_paths(self, surfaces: Surfaces, walk: Walk, camera: Paths, lit: bool) -> list[Paths]:
         """Add the light of the surfaces that camera rays meet. Return the paths that scatter there, none unless `lit`.
@@ -183,7 +191,7 @@ class _CameraLight:
         met: Any = dr.compress(self.hit.is_valid())
         if not dr.width(met) or not (lit or surfaces.shining or surfaces.transmitting):
             return []
-        paths = replace(camera.take(met), rng=self._random(met + dr.opaque(mi.UInt32, dr.width(camera.pixel))))
+        paths = replace(camera.take(met), rng=self._random(dr.gather(mi.UInt32, self.number, met), 1))
         hit = dr.gather(type(self.hit), self.hit, met)
         si = hit.compute_surface_interaction(mi.Ray3f(paths.ray))
         if surfaces.shining and self.first_run:

@@ -1,306 +1,265 @@
-"""``visibility=auto`` under a limit: which method, with which dials, and what is not worth its price.
+"""``visibility=auto`` under a limit: a pilot decides which method renders the picture, and what is left out of it.
 
-Some pixels are rendered beforehand by the march and by what is cheaper: the difference is the error that a picture
-would have, and their seconds are this machine's own prices. The cheapest that keeps to `max_error` renders the picture;
-under a `time_budget` alone, what has the smallest error when the time is over, bias and noise together.
+Some camera rays are rendered by the march first, then by each candidate, on the same random numbers: the deviation is
+the error that a picture would have, the clock tells its seconds. Under `max_error` the fastest whose error is below it,
+with the confidence of the pilot, renders the picture; under `time_budget` the one whose error is least when the time is
+over, bias and noise together.
 """
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import mitsuba as mi
 
-from ...infer.visibility import REGISTRY
-from ..maps import building
+from ..scene import effects
 from ..scene.settings import Limits, Settings
-from . import estimate
-from .choice import Choice, Kept, Trial
-from .estimate import Estimate
-from .glints import Glints
-from .omissions import LIGHTS, OMISSIONS, halved
-from .probing import SAMPLES, Look, probed
-from .trials import RISKED, Trials
+from . import candidates
+from .composition import Composition
+from .pilot import BLOCKS, RAYS, Error, Look, Pilot
 
-LOOK, TRIAL, LEFT_OUT = 0.5, 0.08, 0.12
-"""Seconds of all frames: what takes less is rendered by the march without a look at it; what another method must save
-to be tried, twice what that takes with kernels compiled; and what leaving something out must. Under a `time_budget`
-a trial counts as `LOOK`: it may compile."""
-TOO_FAR = "off by more than max_error allows"
-SAVING = 0.1
-"""Of the predicted time, what leaving something out must save at least."""
-FINER = {"map_resolution": 256, "map_components": 2}
-"""Dials of a map for smaller errors."""
-SPARED, WORTH = 0.2, 0.7
-"""Of the time that is left, what a trial may take under a `time_budget`; `RISKED` of it where its error, as far as it
-can be foreseen, is below `WORTH` of the least so far: a march of two samples is far off, an atlas takes a second."""
-HOPELESS = 1.5
-"""Maps of one logistic are not tried where their usual error is so many times `max_error`."""
+SHARE = 0.1
+"""Fraction of a picture's time that the looks of a pilot may take."""
+GLINTS = 4
+"""Times as many rays look for glints, without shadows, where a specular lobe meets fewer lights: a glint is seen in a
+thousandth of the pixels."""
+IN_VAIN = 1 / 3
+"""Fraction of a picture's time that may go into building what is then not used."""
 
 
-class Chooser(Trials):
-    """Choice of method and dials for a render by `settings`.
+@dataclass(frozen=True)
+class Trial:
+    """A candidate: predicted `seconds` of a picture, `error` and its upper `bound` (nan: not tried); the verdict."""
 
-    `gone`: seconds that it has taken so far; `before`: :meth:`kept` of an earlier frame; `whole`: nothing is left out,
-    whatever it is worth. All else as in :class:`Trials`.
+    name: str
+    seconds: float = math.nan
+    error: float = math.nan
+    bound: float = math.nan
+    taken: bool = False
+    why: str = ""
+
+
+@dataclass
+class Choice:
+    """The composition to render with; the trials in order; predicted ``seconds``, ``error`` and ``bound``."""
+
+    composition: Composition
+    trials: list[Trial] = field(default_factory=list)
+    predicted: dict = field(default_factory=dict)
+
+    @property
+    def effects(self) -> effects.Effects:
+        """Effects of the composition, with the pilot's reason for the method."""
+        taken = [t for t in self.trials if t.taken]
+        return replace(self.composition.effects, reason=taken[-1].why) if taken else self.composition.effects
+
+
+@dataclass(frozen=True)
+class Kept:
+    """A choice for further frames of the same `key`."""
+
+    key: tuple
+    settings: Settings
+    trials: list[Trial]
+    predicted: dict
+
+
+class Chooser:
+    """The choice for a render of `scene` by `settings` under `limits`, with `spp` samples a pixel.
+
+    patches  of an earlier render of the same fields, or None
+    gone     function that returns the seconds since the render began
+    before   :meth:`kept` of an earlier frame, or None
+    whole    nothing may be left out
     """
 
-    def __init__(self, scene, settings: Settings, limits: Limits, sensor, spp: int, patches,
-                 gone: Callable[[], float] = lambda: 0.0, before=None, whole: bool = False):
-        super().__init__(scene, settings, limits, sensor, spp, patches)
-        self._gone, self._before, self._whole = gone, before, whole
-        self._moved = False
+    def __init__(self, scene, settings: Settings, limits: Limits, sensor, spp: int, patches=None,
+                 gone: Callable[[], float] = lambda: 0.0, before: Kept | None = None, whole: bool = False):
+        self._scene, self._settings, self._limits, self._sensor = scene, settings, limits, sensor
+        self._spp, self._patches, self._gone, self._before, self._whole = spp, patches, gone, before, whole
+        self._rays = math.prod(int(n) for n in sensor.film().crop_size()) * spp
+        self._trials: list[Trial] = []
+        self._spent = self._vain = 0.0
 
     def choose(self) -> Choice:
-        """Return the choice that keeps to the limits. A method that the user named stays, whatever its error."""
-        by_time = self.limits.seconds > 0 and self.settings.visibility == "auto"
-        if not self.limits.error and not by_time:
-            return Choice(self._composed(self.settings))
-        self.estimate = Estimate(self.scene, self.settings, self.sensor, self._size[0] * self._size[1], self._spp)
-        self.settings = building.resolved(self.settings, len(self.estimate.lights.rows.power), self.estimate.media)
-        self._glints = Glints(self._composed, self.estimate, self.sensor, self.settings)
-        found = self.estimate.effects
+        """Return the choice. A method that the user named stays, whatever its error."""
+        named = self._settings.visibility != "auto"
+        if not self._limits.error and (named or not self._limits.seconds):
+            return Choice(self._composed(self._settings))
+        march = self._composed(self._settings if named else self._settings.but(visibility="raymarch"))
+        self._key = (self._settings, self._limits, self._rays, tuple(march.lights.kinds), len(march.lights.rows.power))
+        if self._before and self._before.key == self._key:
+            return Choice(self._composed(self._before.settings), self._before.trials, self._before.predicted)
+        found = march.effects
         if found.gradients or not found.needs_visibility or found.visibility == "none":
-            return Choice(self._composed(self.settings))
-        before = self._before
-        if before and before.key == self._key():
-            self._moved = before.moved or before.placed != self._placed()
-            again = self._worth_again(before)
-            if not again and not (before.settings.still and self._moved):
-                self.trials = before.trials
-                return Choice(self._composed(before.settings), self.trials, before.predicted)
-            self.settings = self.settings.but(still=again)
-        return self._by_error() if self.limits.error else self._by_time()
+            return Choice(march)
+        if self._limits.error:
+            return self._by_error(march, named)
+        return self._by_time(march)
 
     def kept(self, choice: Choice) -> Kept | None:
-        """For the next frame: where it is one of the same scene with as many lights, the choice is made once."""
+        """Return the choice for further frames of as many lights and the same settings; None where none was made."""
         if not choice.trials:
             return None
-        return Kept(self._key(), self._placed(), self._moved, self.estimate.dearer, choice.composition.settings,
-                    choice.trials, choice.predicted)
+        return Kept(self._key, choice.composition.settings, choice.trials, choice.predicted)
 
-    def _key(self) -> tuple:
-        lights = self.estimate.lights
-        return (id(self.scene), self.settings.but(still=False), self.limits, self._size, self._spp,
-                tuple(lights.kinds), len(lights.rows.power))
+    def explain(self) -> Choice:
+        """Return the choice with a prediction, also where no limit asks for one."""
+        choice = self.choose()
+        if choice.predicted or not choice.composition.effects.lit:
+            return choice
+        self._pilot = Pilot(self._sensor, choice.composition.media)
+        look = self._look(choice.composition.settings, choice.composition)
+        self._truth = look
+        if look.composition.effects.needs_visibility and look.composition.effects.visibility != "raymarch":
+            self._truth = self._look(self._settings.but(visibility="raymarch"))
+        error = self._pilot.error(look, self._truth, self._samples())
+        return Choice(look.composition, choice.trials, self._predicted(self._seconds(look), *error))
 
-    def _placed(self) -> tuple:
-        """Return the places of fields and lights."""
-        rows = self.estimate.lights.rows
-        return rows.where.tobytes(), *(m.frame.placement() for m in self.estimate.media)
+    def _composed(self, settings: Settings) -> Composition:
+        composition = Composition(self._scene, settings, self._sensor, self._spp, self._patches)
+        self._patches = composition.patches  # where light bounces between is the same for all of them
+        return composition
 
-    def _worth_again(self, before: Kept) -> bool:
-        """Return True if maps may pay, since the lights have not moved so far and further frames share the maps."""
-        if before.settings.still or self._moved or self.settings.visibility != "auto" or not self.limits.error:
-            return False
-        self.estimate.dearer = before.dearer
-        off = {t.name for t in before.trials if t.why == TOO_FAR}
-        found = [self.estimate.seconds(self._whole_of(s))
-                 for s in self._candidates(self._plain(self.settings.but(still=True)), False)
-                 if self._name(s) not in off and not self._hopeless(s)]
-        return bool(found) and self._pays(before.predicted["seconds"] - min(found), LOOK + TRIAL)
-
-    def _pays(self, saved: float, lost: float) -> bool:
-        """Return True if `saved` seconds a picture are worth `lost` seconds of a trial and of building."""
-        return saved * self.settings.frames >= lost
-
-    def _by_error(self) -> Choice:
-        named = self.settings.visibility != "auto"
-        first = self.settings if named else self.settings.but(visibility="raymarch")
-        seconds = self.estimate.seconds(first)
-        if seconds * self.settings.frames < LOOK:
-            error, why = (math.nan, "named") if named else (0.0, "all else saves less than a trial takes")
-            best = self._tried(first, seconds, error, True, why)
-            return Choice(self._composed(first), self.trials, {"seconds": best.seconds, "error": best.error})
-        plain = self._plain(self.settings)
-        march = plain.but(visibility="raymarch")
-        self._marched(march, whole=named and not REGISTRY[plain.visibility].per_field)
-        best, look = self._as_named(plain) if named else self._for_all_lights(plain)
-        look = self._all_probes(look)
-        if plain != self.settings:
-            best, look = self._with_bounces(best, look)
-        if not self._whole:
-            best, look = self._without(best, look, OMISSIONS, self._most)
-        if not named:
-            maps = self._candidates(look.composition.settings, False)
-            best, look = self._cheaper(best, maps, self._looked, lambda _: 0.0) or (best, look)
-        return Choice(look.composition, self.trials, {"seconds": best.seconds, "error": best.error})
-
-    def _plain(self, settings: Settings) -> Settings:
-        """Without bounces between patches, which the march would light at the price of a picture; as they only add to
-        what is seen, they come afterwards."""
-        return settings.but(max_depth=2) if self.estimate.effects.bounces == "radiosity" else settings
-
-    def _whole_of(self, plain: Settings) -> Settings:
-        """With the bounces again that :meth:`_plain` left out."""
-        return plain.but(max_depth=self.settings.max_depth)
-
-    def _bouncing(self, plain: Settings) -> float:
-        """Seconds of those, predicted."""
-        return self.estimate.seconds(self._whole_of(plain)) - self.estimate.seconds(plain)
-
-    def _with_bounces(self, best: Trial, look: Look) -> tuple[Trial, Look]:
-        """`best` and its `look`, as well as the truth, with the further bounces that they lack, of the method chosen:
-        its error is a small part of a small part of the light."""
-        whole = self._looked(self._whole_of(look.composition.settings))
-        self.trials[-1] = best = replace(best, seconds=self._price(whole))
-        self.known = False
-        self.truth = replace(self.truth, radiance=self.truth.radiance + whole.radiance - look.radiance)
-        return best, whole
-
-    def _as_named(self, plain: Settings) -> tuple[Trial, Look]:
-        return self._judged(look := self._looked_at(plain), True, "named"), look
-
-    def _for_all_lights(self, plain: Settings) -> tuple[Trial, Look]:
-        """The cheapest that keeps to the error, of what no light needs for itself: fewer lights may do for any method,
-        are looked for afterwards, and want fewer maps."""
-        march = plain.but(visibility="raymarch")
-        full = self.estimate.seconds(self._whole_of(march))
-        found = self._cheaper(Trial("raymarch", full), self._candidates(plain, True), self._looked_at, self._bouncing)
-        if found:
-            return found
-        if self.truth.composition.settings != march:
-            self.truth, self._others = self._looked(march), None
-        self._reckon()
-        why = "nothing that serves all lights is cheaper and keeps to max_error"
-        return self._tried(march, self._price(self.truth) + self._bouncing(march), 0.0, True, why), self.truth
-
-    def _cheaper(self, best: Trial, candidates: list[Settings], looked: Callable[[Settings], Look],
-                 more: Callable[[Settings], float]) -> tuple[Trial, Look] | None:
-        """The first of `candidates`, by price, that keeps to the error and is cheaper than `best`; None: none is.
-        `more`: seconds of what is not looked at."""
-        found = [(self.estimate.seconds(s) + more(s), s) for s in candidates]
-        for seconds, candidate in sorted(found, key=lambda pair: pair[0]):
-            hopeless = self._hopeless(candidate)
-            if hopeless or not self._pays(best.seconds - seconds, TRIAL + self._in_vain(candidate)):
-                self._tried(candidate, seconds, why="usually off by more than max_error allows" if hopeless else
-                            "saves less than a trial takes")
-                continue
-            tried = looked(candidate)
-            tried = self._closer(tried, best.seconds - self._price(tried) - more(candidate))
-            good = self._error(tried) <= self._most
-            if good and len(tried.composition.runs) == 1 and self._price(tried) + more(candidate) < best.seconds:
-                return self._judged(tried, True, "the cheapest that keeps to max_error"), tried
-            self._judged(tried, False, "no cheaper" if good else TOO_FAR)
-        return None
-
-    def _in_vain(self, settings: Settings) -> float:
-        """Seconds of what is built for a trial, which may come to nothing: maps of lights keep to a limit half of the
-        time, an atlas two times of three."""
-        built = self._served(settings) * self.estimate.built(settings)
-        return built / 2 if REGISTRY[settings.visibility].per_field else built
-
-    def _hopeless(self, settings: Settings) -> bool:
-        return estimate.one_logistic(settings) and estimate.usual_error(settings) > HOPELESS * self._most
-
-    def _looked_at(self, settings: Settings) -> Look:
-        """By a method of which a look costs little: the truth has all lights from then on."""
-        look = self._looked(settings)
-        self._with_all_lights(look)
+    def _look(self, settings: Settings, composition: Composition | None = None) -> Look:
+        look = self._pilot.look(lambda: composition or self._composed(settings))
+        self._spent += look.wall - look.built
         return look
 
+    def _samples(self) -> float:
+        """Return the samples a pixel of the picture, as far as they are known."""
+        if self._limits.noise > 0:
+            return self._pilot.samples_for(self._limits.noise, self._truth)
+        return self._spp
+
+    def _seconds(self, look: Look) -> float:
+        """Return the seconds of a picture."""
+        return look.built / self._shared(look.composition.settings) + look.each * self._samples()
+
+    def _shared(self, settings: Settings) -> int:
+        """Return the frames that share what is built: lights may move from one to the next."""
+        return self._settings.frames if candidates.per_field(settings) else 1
+
     @staticmethod
-    def _candidates(settings: Settings, of_all: bool) -> list[Settings]:
-        """Return what ``auto`` may choose in place of the march, with the settings' own dials and finer ones.
+    def _predicted(seconds: float, error: float, bound: float) -> dict:
+        return {"seconds": seconds, "error": error, "bound": bound}
 
-        `of_all`: methods that are built for all lights together, else for each light.
-        """
-        found = []
-        for name, method in REGISTRY.items():
-            if method.automatic and name != "raymarch" and method.per_field == of_all:
-                found.append(settings.but(visibility=name))
-                if set(FINER) <= set(method.dials):
-                    finer = {dial: max(value, getattr(settings, dial)) for dial, value in FINER.items()}
-                    found.append(settings.but(visibility=name, **finer))
-        return found
+    def _by_error(self, first: Composition, named: bool) -> Choice:
+        """Return the fastest choice whose error has an upper bound below `max_error`."""
+        pictures = self._rays * self._settings.frames
+        if SHARE * pictures < RAYS and not self._limits.of_samples:
+            return Choice(first)  # the pilot would be a large part of the picture
+        self._pilot = Pilot(self._sensor, first.media)
+        look = self._truth = self._look(first.settings, first)
+        if named and first.effects.visibility != "raymarch":
+            self._truth = self._look(first.settings.but(visibility="raymarch"))
+        error = self._pilot.error(look, self._truth, self._samples())
+        best = Trial(candidates.name(first.settings), self._seconds(look), *error, True, "named" if named else
+                     "the march, whose error is 0 by definition")
+        self._trials.append(best)
+        if not named:
+            best, look = self._faster(best, look, first)
+        if not self._whole:
+            best, look = self._leaner(best, look)
+        return Choice(look.composition, self._trials, self._predicted(best.seconds, best.error, best.bound))
 
-    def _without(self, best: Trial, look: Look, omissions: dict, limit: float) -> tuple[Trial, Look]:
-        """Like `best`, without what the picture hardly shows, by `limit`."""
-        for name, of in omissions.items():
-            kept = [(best, look)]
-            while (settings := of(look.composition.settings, look.composition)) is not None:
-                saved, anew = self._saved(settings, best, look)
-                foreseen = self._errors.get(settings, halved([t.error for t, _ in kept]) if name in LIGHTS else 0.0)
-                if saved < SAVING * best.seconds or not self._pays(saved, LEFT_OUT + anew) or foreseen > limit:
-                    break
-                tried = self._closer(self._looked(settings), saved)
-                good = self._error(tried) <= limit
-                cheaper = self._price(tried) < best.seconds
-                why = (f"kept: it is off by more than {limit:.2%}" if not good else
-                       "left out: the picture keeps to max_error" if cheaper else "kept: it costs nothing")
-                trial = self._judged(tried, good and cheaper, why, name)
-                if not trial.taken:
-                    break
-                best, look = trial, tried
-                kept.append((best, look))
-            if name in LIGHTS:
-                best, look = self._without_glints(kept, limit)
+    def _faster(self, best: Trial, look: Look, march: Composition) -> tuple[Trial, Look]:
+        """Try other methods in place of the march."""
+        for name, settings, rays in candidates.methods(march):
+            building = self._building(rays)
+            if building / self._shared(settings) > best.seconds or not self._affordable(best, building):
+                self._trials.append(Trial(name, why="not tried: it would take too much of the time it might save"))
+                continue
+            best, look = self._tried(name, settings, best, look)
         return best, look
 
-    def _without_glints(self, kept: list[tuple[Trial, Look]], limit: float) -> tuple[Trial, Look]:
-        """The last of `kept`, each of fewer lights than the one before, that glints no more than `limit` allows."""
-        for best, look in reversed(kept[1:]):
-            settings = look.composition.settings
-            error = self._glints.error(settings, self._spp)
-            if error <= limit:
-                return best, look
-            self._errors[settings] = error
-            self.trials[self.trials.index(best)] = replace(
-                best, error=error, taken=False, why="kept: fewer lights would glint")
-        return kept[0]
+    def _leaner(self, best: Trial, look: Look) -> tuple[Trial, Look]:
+        """Leave out what the picture hardly shows."""
+        for what, of in candidates.OMISSIONS.items():
+            while (settings := of(look.composition)) is not None and self._affordable(best, 0.0):
+                name = f"{candidates.name(settings)} {what}"
+                before = best
+                best, look = self._tried(name, settings, best, look)
+                if best is before:
+                    break
+        return best, look
 
-    def _by_time(self) -> Choice:
-        """The smallest error when the time is over: samples that a march cannot have may be worth a bias."""
-        march = self.settings.but(visibility="raymarch")
-        samples = SAMPLES * probed(self._size[0] * self._size[1])
-        if max(self.estimate.each(march) * samples, LOOK) > SPARED * self._left():
-            return self._untried(march)
-        self._marched(march)
-        best, least = self.truth, self._ends_at(self.truth)
-        self._tried(march, self._price(best), least, True, "smallest error when the time is over")
-        # What is built fast goes first: what it finds spares the others.
-        both = [s for of_all in (True, False) for s in self._candidates(self.settings, of_all)]
-        for settings in sorted(both, key=self.estimate.built):
-            left, taken = self._left(), self.estimate.built(settings) + LOOK
-            samples = (left - taken) / max(self.estimate.each(settings), 1e-9)
-            hoped = math.hypot(estimate.usual_error(settings), self._noise(samples))
-            late = best.each > left  # not even one sample of it fits: whatever is faster
-            most = (RISKED if hoped < WORTH * least else SPARED) * left
-            if self.estimate.each(settings) > best.each if late else hoped > least or taken > most:
+    def _tried(self, name: str, settings: Settings, best: Trial, look: Look) -> tuple[Trial, Look]:
+        """Look at a candidate; return it and its look if it is better than `best`, else `best` and its look."""
+        other = self._look(settings)
+        error, seconds = self._pilot.error(other, self._truth, self._samples()), self._seconds(other)
+        if error.bound <= self._limits.error and settings.environment_lights < self._settings.environment_lights:
+            error = max(error, self._glints(other.composition), key=lambda e: e.bound)
+        good = error.bound <= self._limits.error
+        taken = good and seconds < best.seconds
+        why = ("its error may exceed max_error" if not good else
+               "the fastest within max_error" if taken else "no faster")
+        trial = Trial(name, seconds, *error, taken, why)
+        self._trials.append(trial)
+        if taken:
+            return trial, other
+        self._vain += other.built
+        return best, look
+
+    def _glints(self, fewer: Composition) -> Error:
+        """Return the error that fewer lights of an environment make without shadows, seen by many rays."""
+        if not fewer.effects.specular:
+            return Error(0.0, 0.0)
+        pilot = Pilot(self._sensor, fewer.media, GLINTS * BLOCKS)
+        wanted = fewer.settings.but(visibility="none", max_depth=2)
+        counts = fewer.settings.environment_lights, self._settings.environment_lights
+        look, truth = (pilot.look(partial(self._composed, wanted.but(environment_lights=n))) for n in counts)
+        self._spent += look.wall + truth.wall
+        return pilot.error(look, truth, self._samples())
+
+    def _affordable(self, best: Trial, building: float) -> bool:
+        """Return True if another look is a small part of the time of all frames, and so is what it builds in vain."""
+        frames, looks = self._settings.frames, self._spent / max(len(self._trials), 1)
+        return (self._spent + looks <= SHARE * best.seconds * frames
+                and self._vain + building <= IN_VAIN * best.seconds * frames)
+
+    def _building(self, rays: int) -> float:
+        """Return the expected seconds of filling a map or an atlas by so many rays: each costs about a march."""
+        composition = self._truth.composition
+        pixels = self._rays / self._spp
+        marched = pixels * max(effects.shadow_rays(composition.settings, composition.lights), 1)
+        return rays * self._truth.each / marched
+
+    def _by_time(self, march: Composition) -> Choice:
+        """Return the choice whose error is least when the time is over, bias and noise together."""
+        self._pilot = Pilot(self._sensor, march.media)
+        look = self._truth = self._look(march.settings, march)
+        least = self._end(look)
+        self._trials.append(Trial("raymarch", self._limits.seconds, *least, True, "the least error in this time"))
+        for name, settings, rays in candidates.methods(march):
+            if self._spent / len(self._trials) + self._building(rays) > IN_VAIN * self._left():
+                self._trials.append(Trial(name, why="not tried: it would take too much of the time"))
                 continue
-            look = self._looked(settings)
-            error = self._ends_at(look)
-            better = error < least and len(look.composition.runs) == 1
-            self._tried(settings, self._price(look), error, better,
-                        "smallest error when the time is over" if better else "a larger error when the time is over")
-            best, least = (look, error) if better else (best, least)
-        self._warn(best.each, best.composition.settings)
-        return Choice(best.composition, self.trials, {"seconds": self.limits.seconds, "error": least})
-
-    def _untried(self, march: Settings) -> Choice:
-        """By the prices alone: the march, which has no error of its own, if the samples that the scene asks for fit
-        into half of the time; else the cheapest."""
-        fits = self.estimate.seconds(march) < 0.5 * self._left()
-        settings = march if fits else self.settings.but(visibility=self.estimate.effects.visibility)
-        self._warn(self.estimate.each(settings), settings)
-        return Choice(self._composed(settings), predicted={"seconds": self.limits.seconds, "error": math.nan})
-
-    def _ends_at(self, look: Look) -> float:
-        """Error of a picture by what is left of the time."""
-        samples = self._left() / max(look.each, 1e-9)
-        return math.hypot(self.probes.error(look, self.truth, max(samples, 1.0)), self._noise(samples))
-
-    def _noise(self, samples: float) -> float:
-        """Return the noise of so many samples; fewer than one tell methods apart that there is no time for."""
-        return self.probes.noise(self.truth) / math.sqrt(max(samples, 1e-3))
+            other = self._look(settings)
+            end = self._end(other)
+            taken = end[1] < least[1]
+            self._trials.append(Trial(name, self._limits.seconds, *end, taken,
+                                      "the least error in this time" if taken else "a larger error in this time"))
+            if taken:
+                look, least = other, end
+        self._warn(look)
+        return Choice(look.composition, self._trials, self._predicted(self._limits.seconds, *least))
 
     def _left(self) -> float:
-        return max(self.limits.seconds - self._gone(), 1e-3)
+        return max(self._limits.seconds - self._gone(), 1e-3)
 
-    def _warn(self, each: float, settings: Settings) -> None:
+    def _end(self, look: Look) -> tuple[float, float]:
+        """Return the error of a picture by the time that is left, and its upper bound."""
+        samples = self._left() / max(look.each, 1e-9)
+        noise = self._pilot.noise(self._truth) / math.sqrt(max(samples, 1e-3))
+        error = self._pilot.error(look, self._truth, max(samples, 1.0))
+        return math.hypot(error.estimate, noise), math.hypot(error.bound, noise)
+
+    def _warn(self, look: Look) -> None:
         """Warn before a render that cannot end in time."""
-        if each > self._left():
+        if look.each > self._left():
             mi.Log(  # type: ignore[operator]  # an object in the stub
                 mi.LogLevel.Warn,
-                f"nrf integrator: time_budget is {self.limits.seconds:.3g} s, but one sample a pixel takes about "
-                f"{each:.3g} s by {settings.visibility}; that will be rendered")
+                f"nrf integrator: time_budget is {self._limits.seconds:.3g} s, but one sample a pixel takes about "
+                f"{look.each:.3g} s by {look.composition.effects.visibility}; that will be rendered")

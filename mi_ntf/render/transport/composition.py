@@ -13,8 +13,7 @@ from ...infer import march, shade
 from ...infer.bundle import Strand
 from ...infer.visibility import REGISTRY
 from ...infer.visibility.marched_suns import DRAWN
-from .. import log
-from ..cost import measurement
+from .. import log, timing
 from ..lights import scene_lights
 from ..maps import building
 from ..scene import effects
@@ -57,20 +56,21 @@ class Part:
 class Composition:
     """The scene prepared for one render. What it lacks is not built (:mod:`mi_ntf.render.scene.effects`). `patches`:
     of an earlier render of the same fields, None unless they are needed. `smoke`: the camera sees what has no opaque
-    skin; `rough`: fewer points of that are shaded, for much noise in little time."""
+    skin."""
 
     def __init__(self, scene, settings: Settings, sensor, spp: int, patches: Patches | None = None):
         self.scene, self.settings, self.sensor, self.patches = scene, settings, sensor, patches
         self.media = media = [m for number, m in enumerate(find_media(scene)) if number not in settings.without]
         self.lights = scene_lights.Lights(scene, media, settings.light_samples, settings.environment_lights,
-                                          settings.dimmest, settings.only)
+                                          settings.brightest, settings.only)
         self.settings = settings = building.resolved(settings, len(self.lights.rows.power), media)
         self.effects = effects.describe(scene, settings, sensor, spp, media, self.lights)
         if settings.visibility == "auto" and self.effects.needs_visibility:
             log.info(f"nrf integrator: auto takes visibility={self.effects.visibility}: {self.effects.reason}")
+        self.settings = settings = settings.but(visibility=self.effects.visibility)
         self._media = [m for m in media if m.field.grid.majorant > 0]
         self._seen = [m for m, visible in zip(media, self.effects.in_view, strict=True) if visible]
-        self.smoke, self.rough = not all(m.field.softness.opaque for m in self._seen), False
+        self.smoke = not all(m.field.softness.opaque for m in self._seen)
         self.runs, self.run = self._runs(), -1  # none yet
         self.own = self._own()
         self.select(self.own[0] if self.own else 0)
@@ -80,7 +80,7 @@ class Composition:
             self.surfaces = Surfaces(scene, shapes, settings.hide_emitters, self.transmittance)
         self.bounced = None
         if self.effects.bounces == "radiosity" and self.parts and 0 in self.own:
-            with measurement.by_clock("bounces"):
+            with timing.building():
                 found = patches if patches and patches.of(self) else Patches(self)
                 self.bounced = self.with_all_lights(lambda: Bounced(self, found, settings.max_depth))
                 self.patches = found
@@ -211,8 +211,7 @@ class Composition:
         """Radiance that `points` of `part` reflect from all lights; `view`: their transmittance, if lights share it;
         `surface`: whether they are diffuse points of a surface above the skin; `draws`: least number of those drawn."""
         total = [dr.zeros(mi.Float, dr.width(points.x[0])) for _ in range(3)]
-        candidates = REGISTRY[REGISTRY[self.effects.visibility].for_drawn].candidates
-        for source, mapped in self.lights.sources(part.table, part.frame, points, stream, draws, candidates,
+        for source, mapped in self.lights.sources(part.table, part.frame, points, stream, draws,
                                                   self.effects.gradients):
             if self.run and not mapped:
                 continue

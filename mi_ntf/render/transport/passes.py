@@ -16,9 +16,6 @@ SHARE = 0.6
 """Of the time or the samples that are left, what a pass is meant to take: the machine may be slower then, the noise
 less. `REST`: of the time, what is no longer worth a pass."""
 REST = 0.03
-ROUGH = 0.06
-"""Noise from which on the first two passes shade fewer points of smoke: as a rule two samples have less than is asked
-for (`cloud`: 0.045), and take twice the time. Where that is not enough, all begins anew."""
 
 
 def noise(one: np.ndarray, other: np.ndarray, weights: tuple[float, float]) -> float:
@@ -63,11 +60,6 @@ class Passes:
         self._each = (now - self._started) / samples
         self._started, self.seconds = now, now - self._begin
         self.count, self.passes, self.noise = self.count + samples, self.passes + 1, noise
-
-    def again(self) -> int:
-        """Samples of the next pass, where what there is so far does not count."""
-        self.count, self.noise = 0, math.nan
-        return 1
 
     def gone(self) -> float:
         """Seconds since the render began."""

@@ -12,7 +12,7 @@ from .. import log
 from ..scene.camera import Camera, Reconstruction
 from ..scene.settings import Limits, Settings
 from . import aovs, camera_light, choosing, passes
-from .choice import Choice
+from .choosing import Choice
 from .composition import IN_SMOKE
 
 CHUNK = 1 << 18
@@ -46,7 +46,6 @@ def render(integrator, scene, sensor, seed, spp: int, develop: bool):
     film.prepare(picture.names if picture else [])
     halves = _Halves(film, len(picture.names) if picture else 0)
     samples = counted.first(camera.spp, len(composition.runs))
-    composition.rough = composition.smoke and samples == 1 and integrator.limits.noise >= passes.ROUGH and not picture
     while samples:
         if samples != camera.spp:
             camera = Camera(sensor, samples)
@@ -61,8 +60,6 @@ def render(integrator, scene, sensor, seed, spp: int, develop: bool):
             halves.wait()
         counted.done(camera.spp, halves.noise() if integrator.limits.noise > 0 else math.nan)
         samples = counted.next() if integrator.limits.of_samples else 0
-        if samples and composition.rough and counted.noise > integrator.limits.noise:
-            composition.rough, halves, samples = False, _Halves(film, 0), counted.again()
     if not composition.effects.gradients:
         halves.wait()  # the program develops the film next
         width, height = film.crop_size()
@@ -186,15 +183,17 @@ def _achieved(limits: Limits, choice: Choice, counted: passes.Passes) -> dict:
     effects = choice.effects
     found = {
         "visibility": effects.visibility, "reason": effects.reason, "spp": counted.count, "passes": counted.passes,
-        "noise": counted.noise, "seconds": counted.seconds, "ended": counted.ended, **choice.told(),
+        "noise": counted.noise, "seconds": counted.seconds, "ended": counted.ended,
+        "predicted": choice.predicted, "trials": [vars(t) for t in choice.trials],
     }
     if limits != Limits():
+        taken = [t for t in choice.trials if t.taken]
+        error = f", error below {taken[-1].bound:.1%}" if taken else ""
         noise = "" if math.isnan(counted.noise) else f", noise {counted.noise:.3g}"
-        said = "".join(f"; {t.name}: {t.seconds:.2g} s, {t.error:.2%} off, {t.why}" for t in choice.trials)
-        mi.Log(  # type: ignore[operator]  # an object in the stub
-            mi.LogLevel.Info,
-            f"nrf integrator: {counted.count} samples a pixel in {counted.passes} passes and {counted.seconds:.3g} s"
-            f"{noise}; ended by {counted.ended}; visibility {found['visibility']}, {found['reason']}{said}")
+        log.info(f"nrf integrator: {taken[-1].name if taken else found['visibility']}{error}{noise}, "
+                 f"{counted.count} samples, ended by {counted.ended}")
+        for trial in choice.trials:
+            mi.Log(mi.LogLevel.Debug, f"nrf integrator: {trial}")  # type: ignore[operator]  # an object in the stub
     return found
 
 

@@ -59,10 +59,11 @@ def join(parts: list[Paths]) -> Paths:
 
 class Walk:
     """`composition`: the scene; `max_depth`: longest path in edges, −1 for any; `total`: three arrays of a float a
-    pixel, which light is added to."""
+    pixel, which light is added to; `number`: of each pixel's camera ray, which random lights follow from."""
 
-    def __init__(self, composition, max_depth: int, total, stream):
+    def __init__(self, composition, max_depth: int, total, stream, number):
         self.scene, self.max_depth, self.total, self.stream = composition, max_depth, total, stream
+        self.number = number
 
     def run(self, paths: Paths, depth: int = 2) -> None:
         """Follow `paths`, whose light would arrive over `depth` edges."""
@@ -127,7 +128,9 @@ class Walk:
         """Paths that meet a point of `part` at the distance `t`; at `depth` 2 its direct light is known already."""
         frame = part.frame
         x = frame.point_to_field(paths.ray.o + t * paths.ray.d)
-        points = shade.Points(x, tuple(-c for c in frame.direction_to_field(paths.ray.d)), part.medium.reflectance(x))
+        number = dr.gather(mi.UInt32, self.number, paths.pixel)
+        points = shade.Points(x, tuple(-c for c in frame.direction_to_field(paths.ray.d)), part.medium.reflectance(x),
+                              number)
         points.evaluate()
         if depth > 2:
             self.add(paths, mi.Color3f(*self.scene.reflect(part, points, self.stream + dr.opaque(mi.UInt32, depth))))

@@ -1,0 +1,99 @@
+"""Ways to render a picture for less, in the order in which a pilot tries them.
+
+First other visibility methods in place of the march. Then, with the method that was taken, effects that the picture
+hardly shows are left out, one after the other, and each as often as the error allows.
+"""
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from ...infer.visibility import REGISTRY
+from ..maps import building
+from ..scene import effects
+from ..scene.settings import Settings
+from .composition import Composition
+
+FINER = {"map_resolution": 256, "map_components": 2}
+"""Dials of a map for smaller errors: the coarsest map in which a second logistic errs less."""
+
+
+def methods(march: Composition) -> Iterator[tuple[str, Settings, int]]:
+    """Yield ``(name, settings, rays)`` of what may take the place of the `march`.
+
+    `rays` fill what the method holds. Maps that do not fit into `map_memory` at once are left out, since every pass
+    would build them anew.
+    """
+    found = []
+    for method in REGISTRY.values():
+        if not method.automatic or method.name == "raymarch":
+            continue
+        settings = march.settings.but(visibility=method.name)
+        finer = {dial: max(value, getattr(settings, dial)) for dial, value in FINER.items() if dial in method.dials}
+        for dials in ({}, finer) if len(finer) == len(FINER) else ({},):
+            found.append((settings.but(**dials), method))
+    for settings, method in sorted(found, key=lambda pair: _rays(march, *pair)):
+        if (method.per_field or _fits(march, settings)) and (method.per_field or len(march.lights.rows.power)):
+            yield name(settings), settings, _rays(march, settings, method)
+
+
+def name(settings: Settings) -> str:
+    """Return a method and its dials in words."""
+    if not REGISTRY[settings.visibility].drawn:
+        return settings.visibility
+    logistics = ", two logistics" if settings.map_components == 2 else ""
+    return f"{settings.visibility} of {settings.map_resolution}²{logistics}"
+
+
+def per_field(settings: Settings) -> bool:
+    """Return True if what the method holds serves all lights of a field."""
+    return REGISTRY[settings.visibility].per_field
+
+
+def _rays(march: Composition, settings: Settings, method) -> int:
+    return len(march.media) * method.rays(len(march.lights.rows.power), settings.map_resolution)
+
+
+def _fits(march: Composition, settings: Settings) -> bool:
+    table, options = march.lights.table(march.media[0].frame), building.options(settings)
+    size = sum(building.size_per_light(settings.visibility, m, table, options) for m in march.media)
+    return size * table.count <= options.map_memory * 2**20
+
+
+def _no_bounces(now: Composition) -> Settings | None:
+    return now.settings.but(max_depth=2) if now.effects.bounces else None
+
+
+def _no_smallest_field(now: Composition) -> Settings | None:
+    boxes = [effects.on_film(now.sensor, m.frame) for m in now.media]
+    sizes = [np.inf if box is None else float(np.prod(box[1] - box[0])) for box in boxes]
+    if len(sizes) < 2 or min(sizes) == np.inf:
+        return None
+    numbers = [i for i in range(len(sizes) + len(now.settings.without)) if i not in now.settings.without]
+    return now.settings.but(without=(*now.settings.without, numbers[int(np.argmin(sizes))]))
+
+
+def _half_of_an_environment(now: Composition) -> Settings | None:
+    most = max((light.shining for light in now.lights.discrete), default=0)
+    return now.settings.but(environment_lights=most // 2) if most > 1 else None
+
+
+def _dimmer_half(now: Composition) -> Settings | None:
+    """Environments are none of these: their lights are of about equal power, and have a way of their own."""
+    if len(now.lights.rows.power) < 2 or any(light.shining for light in now.lights.discrete):
+        return None
+    return now.settings.but(brightest=len(now.lights.rows.power) // 2)
+
+
+def _no_lobes(now: Composition) -> Settings | None:
+    return now.settings.but(specular=False) if now.effects.specular else None
+
+
+OMISSIONS: dict[str, Callable[[Composition], Settings | None]] = {
+    "without further bounces": _no_bounces,
+    "without the smallest field": _no_smallest_field,
+    "with half of the environment's lights": _half_of_an_environment,
+    "without the dimmer half of the lights": _dimmer_half,
+    "without specular lobes": _no_lobes,
+}
+"""Name → function of a composition, which returns settings that leave something out; None if there is nothing."""
