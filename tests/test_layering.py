@@ -47,7 +47,7 @@ FORBIDDEN = {
 }
 """Third parties that a folder must not import, not even inside a function."""
 
-ROOMS = ("log", "user_cache", "cost", "scene", "lights", "maps", "transport", "plugins", "commands")
+ROOMS = ("log", "timing", "machine", "user_cache", "scene", "lights", "maps", "transport", "plugins", "commands")
 """Of `render`: each may import those before it."""
 
 PACKAGE_OF = {"cv2": "opencv-python-headless", "drjit": "mitsuba", "flip_evaluator": "flip-evaluator",

@@ -98,8 +98,9 @@ def table(rows: list[list[str]]) -> str:
 
 def methods() -> str:
     """The table of visibility methods."""
-    cheapest = ", ".join(f"`{method.name}`" for method in REGISTRY.values() if method.automatic)
-    auto = ["auto", f"of the integrator: the cheapest of {cheapest}, by the machine's measured prices", "", "", ""]
+    automatic = ", ".join(f"`{method.name}`" for method in REGISTRY.values() if method.automatic)
+    auto = ["auto", "of the integrator: `transmittance_atlas` or `raymarch`, by the number of rays; under a limit by a "
+            f"pilot one of {automatic}", "", "", ""]
     head = ["name", "what it does", "holds per light", "lights", "parameters that it reads"]
     return table([head, *(described(method) for method in REGISTRY.values()), auto])
 
@@ -109,7 +110,7 @@ def described(method: Method) -> list[str]:
     return [
         method.name,
         method.summary,
-        "nothing" if not method.making else "maps, for the field" if method.per_field else "a table",
+        "nothing" if not method.numbers else "maps, for the field" if method.per_field else "a table",
         f"discrete, others by `{method.drawn}`" if method.drawn else "any",
         ", ".join(f"`{dial}`" for dial in method.dials),
     ]

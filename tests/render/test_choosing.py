@@ -137,7 +137,7 @@ def test_a_sharp_lobe_keeps_lights_that_would_glint(tmp_path, monkeypatch, light
     plain = choosing.Chooser._glints
     monkeypatch.setattr(choosing.Chooser, "_glints", lambda self, fewer: calls.append(
         plain(self, fewer)) or calls[-1])
-    path = scenes.write_blobs(tmp_path, log_density=3.0, specular=0.9, roughness=0.2)
+    path = scenes.write_blobs(tmp_path, log_density=3.0, specular=0.3, roughness=0.5)
     options = {"light_samples": light_samples, "environment_lights": 128}
     loaded = scenes.scene(path, nrf(visibility="raymarch", max_error=0.6, **options), {"light": scenes.light("env")},
                           size=32, spp=2)

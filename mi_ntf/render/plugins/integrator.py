@@ -20,8 +20,10 @@ def integrator_class() -> type:
         =================== ======= ===================================================================================
         visibility          string  how light reaches a point: ``raymarch``, ``transmittance_map``,
                                     ``transmittance_atlas``, ``neural_transmittance``, ``ray_network``,
-                                    ``transmittance_volume``, ``visibility_mlp``, ``none``, or ``auto``, the least
-                                    biased of the first three that is about as cheap as the cheapest (default: auto)
+                                    ``transmittance_volume``, ``visibility_mlp``, ``none``, or ``auto``:
+                                    ``transmittance_atlas`` where camera rays times lights a point (times `frames`) are
+                                    more than the 3.4 million rays that fill an atlas, else ``raymarch``; by a pilot
+                                    under `max_error` or `time_budget` (default: auto)
         samples             integer steps across the unit sphere's diameter (default: 384); flights of further bounces
                                     take 128 at most, between patches 256
         light_samples       integer lights per shading point, drawn from Mitsuba's emitter sampling and resampled, from
@@ -50,13 +52,13 @@ def integrator_class() -> type:
                                     :mod:`mi_ntf.render.transport.aovs` (default: none)
         hide_emitters       boolean leave the environment and shapes that shine out of the picture (default: false)
         noise_threshold     float   Monte Carlo noise to render down to, on the scale of Cycles: |I − A| over √I, A of
-                                    half of the samples, mean over lit pixels; 0: the sampler's sample_count
+                                    half of the samples, summed over the picture; 0: the sampler's sample_count
                                     (default: 0)
-        max_error           float   bias against ``raymarch`` that the picture may have, relative RMSE: some pixels are
-                                    rendered beforehand, ``auto`` takes the cheapest method that keeps to it, and what
-                                    the picture hardly shows is left out; 0: nothing is (default: 0)
-        time_budget         float   seconds that a render may take, maps and compilation included; 0 or below: any
-                                    (default: 0)
+        max_error           float   relative RMSE against ``raymarch`` that the picture may have: by a pilot of 2048
+                                    camera rays ``auto`` takes the fastest method whose error is below it with a chance
+                                    of 97.5 %, and what the picture hardly shows is left out; 0: nothing is (default: 0)
+        time_budget         float   seconds that a render may take, maps and compilation included: ``auto`` takes the
+                                    method with the least error by then; 0 or below: any (default: 0)
         frames              integer pictures that will be rendered of the same fields: ``auto`` shares among them what
                                     is built for a field (default: 1)
         timeout             float   seconds after which rendering ends with what is there; below 0: never (default: -1)

@@ -183,7 +183,7 @@ class _CameraLight:
         stream = mi.sample_tea_32(self.stream, other)[1]
         # One seed with other sequences would make neighbours alike.
         start, sequence = mi.sample_tea_32(stream, number)
-        return mi.PCG32(dr.width(number), mi.UInt64(start), mi.UInt64(sequence))
+        return mi.PCG32(dr.width(number), mi.UInt64(start), mi.UInt64(sequence))  # type: ignore[operator]
 
     def _surface_paths(self, surfaces: Surfaces, walk: Walk, camera: Paths, lit: bool) -> list[Paths]:
         """Add the light of the surfaces that camera rays meet. Return the paths that scatter there, none unless `lit`.
