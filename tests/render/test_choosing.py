@@ -163,8 +163,9 @@ def test_other_lights_are_another_choice(blobs):
         before = choices[0] if choices else None
         chooser = choosing.Chooser(loaded, Settings.of(loaded.integrator()), Limits(error=0.3), loaded.sensors()[0], 1,
                                    before=before)
-        choices.append(chooser.kept(chooser.choose()))
-    assert choices[0].key != choices[1].key and choices[0].trials != choices[1].trials
+        choices.append(chooser.choose().kept())
+    (one, _, first, _), (other, _, second, _) = choices
+    assert one != other and first != second
 
 
 def chosen_in(blobs, monkeypatch, budget: float, each, gone: float = 0.0):

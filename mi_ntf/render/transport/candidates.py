@@ -14,27 +14,19 @@ from ..scene import effects
 from ..scene.settings import Settings
 from .composition import Composition
 
-FINER = {"map_resolution": 256, "map_components": 2}
-"""Dials of a map for smaller errors: the coarsest map in which a second logistic errs less."""
-
 
 def methods(march: Composition) -> Iterator[tuple[str, Settings, int]]:
     """Yield ``(name, settings, rays)`` of what may take the place of the `march`.
 
     `rays` fill what the method holds. Maps that do not fit into `map_memory` at once are left out, since every pass
-    would build them anew.
+    would build them anew, and so are maps of no light.
     """
-    found = []
-    for method in REGISTRY.values():
-        if not method.automatic or method.name == "raymarch":
-            continue
-        settings = march.settings.but(visibility=method.name)
-        finer = {dial: max(value, getattr(settings, dial)) for dial, value in FINER.items() if dial in method.dials}
-        for dials in ({}, finer) if len(finer) == len(FINER) else ({},):
-            found.append((settings.but(**dials), method))
-    for settings, method in sorted(found, key=lambda pair: _rays(march, *pair)):
-        if (method.per_field or _fits(march, settings)) and (method.per_field or len(march.lights.rows.power)):
-            yield name(settings), settings, _rays(march, settings, method)
+    ways = [march.settings.but(visibility=method.name, map_components=logistics) for method in REGISTRY.values()
+            if method.automatic and method.name != "raymarch"
+            for logistics in ((1, 2) if "map_components" in method.dials else (march.settings.map_components,))]
+    for settings in sorted(ways, key=lambda s: _rays(march, s)):
+        if per_field(settings) or _fits(march, settings):
+            yield name(settings), settings, _rays(march, settings)
 
 
 def name(settings: Settings) -> str:
@@ -50,14 +42,15 @@ def per_field(settings: Settings) -> bool:
     return REGISTRY[settings.visibility].per_field
 
 
-def _rays(march: Composition, settings: Settings, method) -> int:
-    return len(march.media) * method.rays(len(march.lights.rows.power), settings.map_resolution)
+def _rays(march: Composition, settings: Settings) -> int:
+    rays = REGISTRY[settings.visibility].rays(len(march.lights.rows.power), settings.map_resolution)
+    return len(march.media) * rays * (1 if per_field(settings) else settings.map_components)
 
 
 def _fits(march: Composition, settings: Settings) -> bool:
     table, options = march.lights.table(march.media[0].frame), building.options(settings)
-    size = sum(building.size_per_light(settings.visibility, m, table, options) for m in march.media)
-    return size * table.count <= options.map_memory * 2**20
+    size = table.count * sum(building.size_per_light(settings.visibility, m, table, options) for m in march.media)
+    return 0 < size <= options.map_memory * 2**20
 
 
 def _no_bounces(now: Composition) -> Settings | None:

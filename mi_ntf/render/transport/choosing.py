@@ -21,11 +21,11 @@ from .pilot import BLOCKS, RAYS, Error, Look, Pilot
 
 SHARE = 0.1
 """Fraction of a picture's time that the looks of a pilot may take."""
+IN_VAIN = 1 / 3
+"""Fraction of a picture's time that may go into building what is then not used."""
 GLINTS = 4
 """Times as many rays look for glints, without shadows, where a specular lobe meets fewer lights: a glint is seen in a
 thousandth of the pixels."""
-IN_VAIN = 1 / 3
-"""Fraction of a picture's time that may go into building what is then not used."""
 
 
 @dataclass(frozen=True)
@@ -42,11 +42,15 @@ class Trial:
 
 @dataclass
 class Choice:
-    """The composition to render with; the trials in order; predicted ``seconds``, ``error`` and ``bound``."""
+    """The composition to render with; the trials in order; predicted ``seconds``, ``error`` and ``bound``.
+
+    `key`: what further frames must have in common with this one to be rendered alike.
+    """
 
     composition: Composition
     trials: list[Trial] = field(default_factory=list)
     predicted: dict = field(default_factory=dict)
+    key: tuple = ()
 
     @property
     def effects(self) -> effects.Effects:
@@ -54,15 +58,9 @@ class Choice:
         taken = [t for t in self.trials if t.taken]
         return replace(self.composition.effects, reason=taken[-1].why) if taken else self.composition.effects
 
-
-@dataclass(frozen=True)
-class Kept:
-    """A choice for further frames of the same `key`."""
-
-    key: tuple
-    settings: Settings
-    trials: list[Trial]
-    predicted: dict
+    def kept(self) -> tuple | None:
+        """Return what a further frame needs of this choice, which holds no scene; None where none was made."""
+        return (self.key, self.composition.settings, self.trials, self.predicted) if self.trials else None
 
 
 class Chooser:
@@ -70,12 +68,12 @@ class Chooser:
 
     patches  of an earlier render of the same fields, or None
     gone     function that returns the seconds since the render began
-    before   :meth:`kept` of an earlier frame, or None
+    before   :meth:`Choice.kept` of an earlier frame, or None
     whole    nothing may be left out
     """
 
     def __init__(self, scene, settings: Settings, limits: Limits, sensor, spp: int, patches=None,
-                 gone: Callable[[], float] = lambda: 0.0, before: Kept | None = None, whole: bool = False):
+                 gone: Callable[[], float] = lambda: 0.0, before: tuple | None = None, whole: bool = False):
         self._scene, self._settings, self._limits, self._sensor = scene, settings, limits, sensor
         self._spp, self._patches, self._gone, self._before, self._whole = spp, patches, gone, before, whole
         self._rays = math.prod(int(n) for n in sensor.film().crop_size()) * spp
@@ -87,22 +85,20 @@ class Chooser:
         named = self._settings.visibility != "auto"
         if not self._limits.error and (named or not self._limits.seconds):
             return Choice(self._composed(self._settings))
-        march = self._composed(self._settings if named else self._settings.but(visibility="raymarch"))
-        self._key = (self._settings, self._limits, self._rays, tuple(march.lights.kinds), len(march.lights.rows.power))
-        if self._before and self._before.key == self._key:
-            return Choice(self._composed(self._before.settings), self._before.trials, self._before.predicted)
-        found = march.effects
-        if found.gradients or not found.needs_visibility or found.visibility == "none":
-            return Choice(march)
-        if self._limits.error:
-            return self._by_error(march, named)
-        return self._by_time(march)
-
-    def kept(self, choice: Choice) -> Kept | None:
-        """Return the choice for further frames of as many lights and the same settings; None where none was made."""
-        if not choice.trials:
-            return None
-        return Kept(self._key, choice.composition.settings, choice.trials, choice.predicted)
+        first = self._composed(self._settings if named else self._settings.but(visibility="raymarch"))
+        key = self._settings, self._limits, self._rays, tuple(first.lights.kinds), len(first.lights.rows.power)
+        if self._before and self._before[0] == key:
+            _, settings, trials, predicted = self._before
+            return Choice(self._composed(settings), trials, predicted, key)
+        scene = first.effects
+        if scene.gradients or not scene.needs_visibility or scene.visibility == "none":
+            return Choice(first)
+        small = SHARE * self._rays * self._settings.frames < RAYS  # the pilot would be a large part of the picture
+        if self._limits.error and small and not self._limits.of_samples:
+            return Choice(first)
+        self._pilot = Pilot(self._sensor, first.media)
+        choice = self._by_error(first, named) if self._limits.error else self._by_time(first)
+        return replace(choice, key=key)
 
     def explain(self) -> Choice:
         """Return the choice with a prediction, also where no limit asks for one."""
@@ -110,12 +106,8 @@ class Chooser:
         if choice.predicted or not choice.composition.effects.lit:
             return choice
         self._pilot = Pilot(self._sensor, choice.composition.media)
-        look = self._look(choice.composition.settings, choice.composition)
-        self._truth = look
-        if look.composition.effects.needs_visibility and look.composition.effects.visibility != "raymarch":
-            self._truth = self._look(self._settings.but(visibility="raymarch"))
-        error = self._pilot.error(look, self._truth, self._samples())
-        return Choice(look.composition, choice.trials, self._predicted(self._seconds(look), *error))
+        look, error = self._judged(choice.composition)
+        return Choice(look.composition, choice.trials, self._predicted(self._seconds(look), error))
 
     def _composed(self, settings: Settings) -> Composition:
         composition = Composition(self._scene, settings, self._sensor, self._spp, self._patches)
@@ -127,11 +119,17 @@ class Chooser:
         self._spent += look.wall - look.built
         return look
 
+    def _judged(self, first: Composition) -> tuple[Look, Error]:
+        """Return the first look, and its error against the march, which is the truth from then on."""
+        look = self._truth = self._look(first.settings, first)
+        if first.effects.needs_visibility and first.effects.visibility != "raymarch":
+            self._truth = self._look(first.settings.but(visibility="raymarch"))
+        return look, self._pilot.error(look, self._truth, self._samples())
+
     def _samples(self) -> float:
         """Return the samples a pixel of the picture, as far as they are known."""
-        if self._limits.noise > 0:
-            return self._pilot.samples_for(self._limits.noise, self._truth)
-        return self._spp
+        noise = self._limits.noise
+        return self._pilot.samples_for(noise, self._truth) if noise > 0 else self._spp
 
     def _seconds(self, look: Look) -> float:
         """Return the seconds of a picture."""
@@ -142,48 +140,28 @@ class Chooser:
         return self._settings.frames if candidates.per_field(settings) else 1
 
     @staticmethod
-    def _predicted(seconds: float, error: float, bound: float) -> dict:
-        return {"seconds": seconds, "error": error, "bound": bound}
+    def _predicted(seconds: float, error: tuple[float, float]) -> dict:
+        return {"seconds": seconds, "error": error[0], "bound": error[1]}
 
     def _by_error(self, first: Composition, named: bool) -> Choice:
         """Return the fastest choice whose error has an upper bound below `max_error`."""
-        pictures = self._rays * self._settings.frames
-        if SHARE * pictures < RAYS and not self._limits.of_samples:
-            return Choice(first)  # the pilot would be a large part of the picture
-        self._pilot = Pilot(self._sensor, first.media)
-        look = self._truth = self._look(first.settings, first)
-        if named and first.effects.visibility != "raymarch":
-            self._truth = self._look(first.settings.but(visibility="raymarch"))
-        error = self._pilot.error(look, self._truth, self._samples())
-        best = Trial(candidates.name(first.settings), self._seconds(look), *error, True, "named" if named else
-                     "the march, whose error is 0 by definition")
+        look, error = self._judged(first)
+        why = "named" if named else "the march, whose error is 0 by definition"
+        best = Trial(candidates.name(first.settings), self._seconds(look), *error, True, why)
         self._trials.append(best)
-        if not named:
-            best, look = self._faster(best, look, first)
-        if not self._whole:
-            best, look = self._leaner(best, look)
-        return Choice(look.composition, self._trials, self._predicted(best.seconds, best.error, best.bound))
-
-    def _faster(self, best: Trial, look: Look, march: Composition) -> tuple[Trial, Look]:
-        """Try other methods in place of the march."""
-        for name, settings, rays in candidates.methods(march):
+        for name, settings, rays in () if named else candidates.methods(first):
             building = self._building(rays)
             if building / self._shared(settings) > best.seconds or not self._affordable(best, building):
                 self._trials.append(Trial(name, why="not tried: it would take too much of the time it might save"))
                 continue
             best, look = self._tried(name, settings, best, look)
-        return best, look
-
-    def _leaner(self, best: Trial, look: Look) -> tuple[Trial, Look]:
-        """Leave out what the picture hardly shows."""
-        for what, of in candidates.OMISSIONS.items():
-            while (settings := of(look.composition)) is not None and self._affordable(best, 0.0):
-                name = f"{candidates.name(settings)} {what}"
+        for what, of in {} if self._whole else candidates.OMISSIONS.items():
+            while (less := of(look.composition)) is not None and self._affordable(best, 0.0):
                 before = best
-                best, look = self._tried(name, settings, best, look)
+                best, look = self._tried(f"{candidates.name(less)} {what}", less, best, look)
                 if best is before:
                     break
-        return best, look
+        return Choice(look.composition, self._trials, self._predicted(best.seconds, (best.error, best.bound)))
 
     def _tried(self, name: str, settings: Settings, best: Trial, look: Look) -> tuple[Trial, Look]:
         """Look at a candidate; return it and its look if it is better than `best`, else `best` and its look."""
@@ -193,8 +171,7 @@ class Chooser:
             error = max(error, self._glints(other.composition), key=lambda e: e.bound)
         good = error.bound <= self._limits.error
         taken = good and seconds < best.seconds
-        why = ("its error may exceed max_error" if not good else
-               "the fastest within max_error" if taken else "no faster")
+        why = "the fastest within max_error" if taken else "no faster" if good else "its error may exceed max_error"
         trial = Trial(name, seconds, *error, taken, why)
         self._trials.append(trial)
         if taken:
@@ -215,21 +192,19 @@ class Chooser:
 
     def _affordable(self, best: Trial, building: float) -> bool:
         """Return True if another look is a small part of the time of all frames, and so is what it builds in vain."""
-        frames, looks = self._settings.frames, self._spent / max(len(self._trials), 1)
-        return (self._spent + looks <= SHARE * best.seconds * frames
-                and self._vain + building <= IN_VAIN * best.seconds * frames)
+        seconds = best.seconds * self._settings.frames
+        spent = self._spent * (1 + 1 / len(self._trials))
+        return spent <= SHARE * seconds and self._vain + building <= IN_VAIN * seconds
 
     def _building(self, rays: int) -> float:
         """Return the expected seconds of filling a map or an atlas by so many rays: each costs about a march."""
-        composition = self._truth.composition
-        pixels = self._rays / self._spp
-        marched = pixels * max(effects.shadow_rays(composition.settings, composition.lights), 1)
+        march = self._truth.composition
+        marched = self._rays / self._spp * max(effects.shadow_rays(march.settings, march.lights), 1)
         return rays * self._truth.each / marched
 
     def _by_time(self, march: Composition) -> Choice:
         """Return the choice whose error is least when the time is over, bias and noise together."""
-        self._pilot = Pilot(self._sensor, march.media)
-        look = self._truth = self._look(march.settings, march)
+        look, _ = self._judged(march)
         least = self._end(look)
         self._trials.append(Trial("raymarch", self._limits.seconds, *least, True, "the least error in this time"))
         for name, settings, rays in candidates.methods(march):
@@ -238,28 +213,22 @@ class Chooser:
                 continue
             other = self._look(settings)
             end = self._end(other)
-            taken = end[1] < least[1]
-            self._trials.append(Trial(name, self._limits.seconds, *end, taken,
-                                      "the least error in this time" if taken else "a larger error in this time"))
-            if taken:
-                look, least = other, end
-        self._warn(look)
-        return Choice(look.composition, self._trials, self._predicted(self._limits.seconds, *least))
-
-    def _left(self) -> float:
-        return max(self._limits.seconds - self._gone(), 1e-3)
-
-    def _end(self, look: Look) -> tuple[float, float]:
-        """Return the error of a picture by the time that is left, and its upper bound."""
-        samples = self._left() / max(look.each, 1e-9)
-        noise = self._pilot.noise(self._truth) / math.sqrt(max(samples, 1e-3))
-        error = self._pilot.error(look, self._truth, max(samples, 1.0))
-        return math.hypot(error.estimate, noise), math.hypot(error.bound, noise)
-
-    def _warn(self, look: Look) -> None:
-        """Warn before a render that cannot end in time."""
+            taken = end.bound < least.bound
+            why = "the least error in this time" if taken else "a larger error in this time"
+            self._trials.append(Trial(name, self._limits.seconds, *end, taken, why))
+            look, least = (other, end) if taken else (look, least)
         if look.each > self._left():
             mi.Log(  # type: ignore[operator]  # an object in the stub
                 mi.LogLevel.Warn,
                 f"nrf integrator: time_budget is {self._limits.seconds:.3g} s, but one sample a pixel takes about "
                 f"{look.each:.3g} s by {look.composition.effects.visibility}; that will be rendered")
+        return Choice(look.composition, self._trials, self._predicted(self._limits.seconds, least))
+
+    def _left(self) -> float:
+        return max(self._limits.seconds - self._gone(), 1e-3)
+
+    def _end(self, look: Look) -> Error:
+        """Return the error of a picture by the time that is left, bias and noise together."""
+        samples = self._left() / max(look.each, 1e-9)
+        noise = self._pilot.noise(self._truth) / math.sqrt(max(samples, 1e-3))
+        return Error(*(math.hypot(e, noise) for e in self._pilot.error(look, self._truth, max(samples, 1.0))))

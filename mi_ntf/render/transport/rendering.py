@@ -37,7 +37,7 @@ def render(integrator, scene, sensor, seed, spp: int, develop: bool):
         scene, Settings.of(integrator), integrator.limits, sensor, camera.spp, integrator.patches, counted.gone,
         integrator.chosen, whole=any(name in aovs.OF_LIGHTS for name in integrator.aovs))
     choice = chooser.choose()
-    composition, integrator.chosen = choice.composition, chooser.kept(choice)
+    composition, integrator.chosen = choice.composition, choice.kept()
     integrator.patches = composition.patches
     picture = None
     if integrator.aovs:
