@@ -47,6 +47,9 @@ def integrator_class() -> type:
                                     ``radiosity``, without noise and biased, between opaque fields alone, whose
                                     skins count as diffuse; ``auto``: ``radiosity`` where nothing else takes part
                                     (default: auto)
+        unbiased            boolean march to a sixteenth of the pairs of point and light, drawn at random, which corrects
+                                    what maps and atlases err by: the mean over seeds is that of ``raymarch``; their
+                                    error becomes noise (default: false)
         aovs                string  further outputs, a comma-separated list of ``depth``, ``normal``, ``albedo``,
                                     ``roughness``, ``opacity``, ``visibility``, ``visibility_lights``: see
                                     :mod:`mi_ntf.render.transport.aovs` (default: none)
@@ -105,6 +108,7 @@ def integrator_class() -> type:
             self.map_file = read.text("map_file", "")
             self.max_depth = read.whole("max_depth", 2, -1, 1 << 20)
             self.bounces = read.choice("bounces", "auto", ("auto", "paths", "radiosity"))
+            self.unbiased = read.flag("unbiased", False)
             self.aovs = aovs.parse(read.text("aovs", ""))
             read.flag("hide_emitters", False)
             self.limits = Limits(noise=read.number("noise_threshold", 0.0, 0.0, 1e6),

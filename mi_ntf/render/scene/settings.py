@@ -27,6 +27,7 @@ class Settings:
     bounces: str
     frames: int
     hide_emitters: bool
+    unbiased: bool = False
     specular: bool = True
     brightest: int = 0
     without: tuple[int, ...] = ()

@@ -13,6 +13,7 @@ from ...infer import march, shade
 from ...infer.bundle import Strand
 from ...infer.visibility import REGISTRY
 from ...infer.visibility.marched_suns import DRAWN
+from ...infer.visibility.unbiased import Unbiased
 from .. import log, timing
 from ..lights import scene_lights
 from ..maps import building
@@ -140,6 +141,9 @@ class Composition:
             drawn = "raymarch"
         method = found.visibility if table.count else drawn  # maps of no light are no maps
         mapped = building.build(method, medium, table, options)
+        if self.settings.unbiased and REGISTRY[method].numbers:
+            march = building.build("raymarch", medium, table, options)
+            mapped = Unbiased(mapped, march, self._media.index(medium), mi)
         if drawn != method:
             other = building.build(drawn, medium, table, options)
             return Part(medium, whole, table, mapped, other, other)
@@ -158,9 +162,10 @@ class Composition:
         and chunk of pixels."""
         for part in self.parts:
             for method in (part.mapped, part.drawn):
-                looked_up = getattr(method, "looked_up", method)
-                if hasattr(looked_up, "stream"):
-                    looked_up.stream = stream
+                while method:
+                    if hasattr(method, "stream"):
+                        method.stream = stream
+                    method = getattr(method, "looked_up", None)
 
     def transmittance(self, p, d, distance, active, sun=False):
         """Return the transmittance of the fields from scene point `p` along `d`, as far as `distance`.

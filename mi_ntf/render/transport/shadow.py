@@ -23,9 +23,9 @@ class Shadow:
         p, d = self.frame.point_to_world(x), self.frame.direction_to_world(wi)
         length = distance * self.frame.length
         for frame, other in self.others:
-            tau = tau * between(frame, other, p, d, length, index, active & (tau > 0))
+            tau = tau * between(frame, other, p, d, length, index, active & (tau != 0))
         if self.surfaces:
-            tau = tau * self.surfaces.transmission(p, d, length, active & (tau > 0))
+            tau = tau * self.surfaces.transmission(p, d, length, active & (tau != 0))
         return tau
 
 
