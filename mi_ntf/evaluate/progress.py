@@ -1,0 +1,27 @@
+"""Progress of work that has a budget of seconds."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+Tell = Callable[[float, str, bool], None]
+"""Is called with the seconds spent so far, what is done now, and True for a line that stays."""
+
+
+@contextmanager
+def progress(budget: float, quiet: bool = False) -> Iterator[Tell]:
+    """Show on stderr how much of `budget` seconds is used and what is done, unless `quiet`."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.progress import BarColumn, Progress, TextColumn
+
+    console = Console(stderr=True, quiet=quiet)
+    columns = (TextColumn("{task.completed:.0f} of {task.total:.0f} s"), BarColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, console=console) as bar:
+        task = bar.add_task("", total=budget)
+
+        def tell(seconds: float, text: str, done: bool) -> None:
+            bar.update(task, completed=min(seconds, budget), description=escape(text))
+            if done:
+                console.print(f"{seconds:5.0f} s  {text}", highlight=False, markup=False, soft_wrap=True)
+
+        yield tell
