@@ -285,13 +285,14 @@ class Tradeoff:
 
     def run(self) -> None:
         parameters = _definitions(self.define)
+        from mi_ntf.evaluate.budget import seconds
         from mi_ntf.evaluate.tradeoff import study
 
         try:
-            seconds = study.seconds(self.budget)
+            budget = seconds(self.budget)
         except ValueError as error:
             raise UsageError(str(error)) from None
-        _report(study.tradeoff(self.scene, self.output, parameters, seconds, self.reference, self.json),
+        _report(study.tradeoff(self.scene, self.output, parameters, budget, self.reference, self.json),
                 self.json, study.print_table)
 
 

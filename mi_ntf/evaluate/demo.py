@@ -81,7 +81,7 @@ def study(command: list[str], scene: Path, out: Path, budget: str, size: int, sp
 
     Returns what ``tradeoff.json`` holds. Raises MiNtfError where the study fails, or every way of it.
     """
-    from .tradeoff.state import NAME
+    from .kept import NAME
 
     if (out / NAME).is_file():
         print(f"{out}: what an earlier study measured there is dropped, the demo measures anew", file=sys.stderr)
@@ -105,7 +105,7 @@ def study(command: list[str], scene: Path, out: Path, budget: str, size: int, sp
 
 def seconds_of(budget: str) -> float:
     """The seconds of a budget such as 90s or 5m. Raises MiNtfError."""
-    from .tradeoff.study import seconds
+    from .budget import seconds
 
     return seconds(budget)
 

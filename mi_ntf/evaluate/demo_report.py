@@ -12,6 +12,7 @@ from mi_ntf.core import files
 from mi_ntf.core.errors import MiNtfError
 
 from .compare import compare_arrays
+from .curves import draw
 from .metrics import relative_rmse, srgb
 
 LIGHTS = {"point": "point light", "env": "environment map"}
@@ -91,16 +92,16 @@ def picture(path: Path, shots: list[Shot], references: dict[str, np.ndarray], me
 def curves(part, study: dict) -> None:
     """Draw the curves of `study` onto an empty `part` of a matplotlib figure, under a title that says what they are of.
     """
-    from .tradeoff import figures, report
+    from .tradeoff.report import unsteady
 
     axes = part.subplots()
     count, (width, height) = sum(bool(row["points"]) for row in study["ways"]), study["size"]
     if count:
-        figures.draw(axes, study)
+        draw(axes, study)
     else:
         axes.set_axis_off()
         axes.text(0.5, 0.5, "no way was measured: a larger --budget measures some", ha="center", fontsize=11)
-    noisy = ". The machine was noisy" if report.unsteady(study) else ""
+    noisy = ". The machine was noisy" if unsteady(study) else ""
     axes.set_title(f"{LIGHTS['env']}: what accuracy costs, {count} ways to render {width}×{height} pixels, held "
                    f"against the converged field{noisy}", fontsize=11)
 

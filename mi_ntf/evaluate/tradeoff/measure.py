@@ -68,7 +68,8 @@ def follow(render: Callable[[int, int], tuple[np.ndarray, float]], truth: Truth,
 
     `render` takes samples and a seed and returns a picture and seconds, as :class:`Renderer`; what it builds, it builds
     anew in the first pass, which is rendered whatever it takes. `tell` is called with each error. Passes double the
-    samples of all before them, so that what each costs besides its samples does not dominate.
+    samples of all before them, so that what each costs besides its samples does not dominate. Where building uses most
+    of the share, but less than two of them, a quarter of it is left for samples.
     """
     curve, mean, other = Curve(), Mean(truth), Mean(mesh) if mesh else None
     begin, seconds, samples = time.perf_counter(), 0.0, 1
@@ -82,10 +83,12 @@ def follow(render: Callable[[int, int], tuple[np.ndarray, float]], truth: Truth,
                 other.add(picture, samples)
             curve.add(seconds, mean, other)
             tell(curve.points[-1]["error"])
-            now = time.perf_counter()
-            if now - begin >= share or (mean.pictures > 1 and _settled(mean, truth)):
+            used, last = time.perf_counter() - begin, time.perf_counter() - start
+            if mean.pictures == 1 and share / 2 < used < 2 * share:  # for building, so that samples have some of it
+                share = max(share, used + share / 4)
+            if used >= share or (mean.pictures > 1 and _settled(mean, truth)):
                 break
-            fit = (share - (now - begin)) / (now - start) * samples if mean.pictures > 1 else 1.0
+            fit = (share - used) / last * samples if mean.pictures > 1 else 1.0
             mark = next(((t - seconds) / took * samples for t in TIMES if t > seconds), 0.0)
             samples = following(mean.samples, fit, mark, LARGEST_PASS // picture[..., 0].size)
     return curve

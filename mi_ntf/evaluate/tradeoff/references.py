@@ -1,6 +1,5 @@
 """What the ways are held against: the same field by ``raymarch``, taken to convergence, and the captured mesh."""
 
-import re
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -9,13 +8,10 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from ...core.errors import MiNtfError
-from ...render.scene import changed
-from ..compare import read_image
+from .. import mesh_reference
 from .errors import Truth
 from .measure import LARGEST_PASS, Renderer
-from .subject import Subject
-from .ways import DRAWN, Way
+from .ways import DRAWN, Subject, Way
 
 ERRORS = (0.1, 0.05, 0.02, 0.01)
 """Relative errors that a reader asks for. The reference's noise need not be below a quarter of the last."""
@@ -38,19 +34,18 @@ def renderer(subject: Subject, way: Way, shrink: int, scene: Any = None) -> Rend
     return Renderer(scene or subject.scene(shrink), mi.load_dict({"type": way.plugin, **way.properties(subject)}))
 
 
-def _rates(render: Renderer) -> tuple[float, float]:
-    """Return the seconds of a sample of every pixel, and those of a pass besides, after a pass that builds."""
+def _rate(render: Renderer) -> float:
+    """Return the seconds of a sample of every pixel, after a pass that builds."""
     render(1, 1)
-    few, many = (render(n, 2 * n + 1)[1] for n in (2, 6))
-    per_sample = max(many - few, 0.1 * many) / 4
-    return per_sample, max(0.0, few - 2 * per_sample)
+    few, many = (render(n, 2 * n + 1)[1] for n in (2, 8))
+    return max(many - few, 0.1 * many) / 6
 
 
 def choose_shrink(subject: Subject, seconds: float) -> int:
     """Return the least power of two that shrinks the picture so far that a reference of `SAMPLES` samples a pixel takes
     no more than `seconds`, judged by a pilot on a small picture, beyond which it is not shrunk."""
     pilot = max(1, 2 ** int(np.log2(max(min(subject.size) / SMALLEST, 1))))
-    per_sample, _ = _rates(renderer(subject, marched(subject), pilot))
+    per_sample = _rate(renderer(subject, marched(subject), pilot))
     shrink = pilot
     while shrink > 1 and SAMPLES * per_sample * (2 * pilot / shrink) ** 2 <= seconds:
         shrink //= 2
@@ -61,9 +56,8 @@ def converge(render: Renderer, pixels: int, seconds: float, tell: Callable[[str]
     """Render a reference until its noise is negligible or its time is used, in four passes at least. Returns it and the
     seconds of a sample of every pixel."""
     start = time.perf_counter()
-    per_sample, fixed = _rates(render)
-    left = max(seconds - (time.perf_counter() - start), 0.0)
-    spp = max(1, min(int((left / 8 - fixed) / per_sample), LARGEST_PASS // pixels))
+    per_sample = _rate(render)
+    spp = max(1, min(int((seconds - (time.perf_counter() - start)) / 8 / per_sample), LARGEST_PASS // pixels))
     total: Any = 0.0
     squares: Any = 0.0
     count, spent = 0, 0.0
@@ -80,39 +74,11 @@ def converge(render: Renderer, pixels: int, seconds: float, tell: Callable[[str]
     return truth, per_sample
 
 
-def find_mesh(subject: Subject) -> Path | None:
-    """Return ``reference_LIGHT.exr`` beside the scene, LIGHT the value of its ``$light``, as shipped scenes have it;
-    None where there is none."""
-    text = subject.path.read_text(encoding="utf-8", errors="replace")
-    default = re.search(r'<default\s+name="light"\s+value="([^"]*)"', text)
-    light = subject.parameters.get("light") or (default.group(1) if default else "")
-    path = subject.path.parent / f"reference_{light}.exr"
-    return path if light and path.is_file() else None
-
-
 def captured(subject: Subject, path: Path, shrink: int, seconds: float) -> Truth:
-    """Return the picture of the captured mesh: that of an EXR file, or of a scene file, rendered by its own integrator
-    for `seconds`. Raises MiNtfError where a picture has another shape than the study's."""
-    width, height = subject.pixels(shrink)
+    """Return the picture of the captured mesh: that of an EXR file, or of a scene file, rendered for `seconds`."""
     if path.suffix.lower() != ".xml":
-        image = read_image(path)[..., :3]
-        block = image.shape[0] // height
-        if not block or image.shape[:2] != (block * height, block * width):
-            raise MiNtfError(f"reference {path} has {image.shape[1]}×{image.shape[0]} pixels, the study's pictures "
-                             f"{width}×{height}; give one of a whole multiple of them")
-        image = image.reshape(height, block, width, block, 3).mean((1, 3))
+        image = mesh_reference.of_file(path, *subject.pixels(shrink))
         return Truth(image, 0.0, f"{path.name}, whose own noise is not known")
-
-    def change(node) -> None:
-        if node.type == mi.ObjectType.Film:
-            changed.shrink_film(node.props, shrink)
-
-    start = time.perf_counter()
-    images: list[np.ndarray] = []
-    scene = changed.load(path, subject.parameters, change, strict=False)
-    render = Renderer(scene, scene.integrator())
-    while len(images) < 4 or time.perf_counter() - start < seconds:
-        images.append(render(16, 2 * len(images) + 1)[0])
-    a = np.stack(images)
+    a = np.stack(mesh_reference.traced(path, subject.parameters, shrink, seconds))
     return Truth(a.mean(0), float(a.var(0, ddof=1).mean()) / len(a),
                  f"{path.name}, path-traced with {16 * len(a)} samples a pixel")

@@ -1,4 +1,4 @@
-"""The report of a study: a page to read offline, a table for programs, and JSON."""
+"""The report of a study: a page to read offline with its figure of curves, a table for programs, and JSON."""
 
 import csv
 import io
@@ -11,10 +11,10 @@ import numpy as np
 
 from ...core import files
 from ...data.page import Page, encode, new_figure, plain
-from . import errors, figures
+from ..curves import draw
+from . import errors
 from .measure import TIMES
 from .references import ERRORS
-from .state import State
 from .ways import BOUND, MESH, STOCK
 
 SPREAD = 0.1
@@ -25,9 +25,12 @@ HEADER = ("way", *(f"to {limit:.0%}" for limit in ERRORS), "at the end: error", 
           "to the mesh")
 
 
-def write(result: dict[str, Any], reference: np.ndarray, state: State, out: Path) -> None:
-    """Write ``index.html``, ``tradeoff.csv`` and ``tradeoff.json`` to `out`. `result`: the study's; `reference`:
-    (h, w, 3) linear; `state` has the pictures of the ways."""
+def write(result: dict[str, Any], reference: np.ndarray, pictures: dict[str, dict[str, np.ndarray]], out: Path) -> None:
+    """Write ``index.html``, ``tradeoff.csv`` and ``tradeoff.json`` to `out`.
+
+    `result`: the study's; `reference`: (h, w, 3) linear; `pictures`: those of each way, by the seconds after which they
+    are compared.
+    """
     files.write(out / "tradeoff.json", json.dumps(result, indent=1) + "\n")
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -36,12 +39,11 @@ def write(result: dict[str, Any], reference: np.ndarray, state: State, out: Path
         for point in row["points"] or [{}]:
             writer.writerow([row["title"], row["method"], *(point.get(name) for name in COLUMNS), row["reason"]])
     files.write(out / "tradeoff.csv", text.getvalue())
-    page(result, reference, {row["way"]: state.pictures(row["way"]) for row in result["ways"]}).write(
-        out / "index.html")
+    page(result, reference, pictures).write(out / "index.html")
 
 
 def page(result: dict[str, Any], reference: np.ndarray, pictures: dict[str, dict[str, np.ndarray]]) -> Page:
-    """Return the page; `pictures`: those of each way, by the seconds after which they are compared."""
+    """Return the page."""
     found = Page(f"What accuracy costs: {result['title']}")
     if not result["finished"]:
         found.warning("The study was interrupted, and this is what it has measured so far. The same command goes on.")
@@ -56,7 +58,7 @@ def page(result: dict[str, Any], reference: np.ndarray, pictures: dict[str, dict
         figure = new_figure(10.5, 5.2)
         axes = figure.add_subplot()
         plain(axes)
-        figures.draw(axes, result)
+        draw(axes, result)
         found.drawing(figure, "Error over seconds, one curve for each way to render", 760)
     found.section("Seconds to an error")
     found.text("In brackets: how early or late it may be, since errors are estimates, ± one standard error. Nothing is "

@@ -1,6 +1,5 @@
 """``mi-ntf tradeoff``: the study of one scene, from its references to its report."""
 
-import re
 import statistics
 import sys
 import threading
@@ -14,29 +13,20 @@ from ... import __version__
 from ...core import files, interruption
 from ...core.errors import MiNtfError, sentence
 from ...render.cost.model import machine
+from .. import mesh_reference
+from ..budget import Tell, progress
 from ..exported_mesh import ExportedMesh
-from ..progress import Tell, progress
-from . import errors, recipes, references, report
+from ..kept import State
+from . import errors, references, report
 from .errors import Truth
 from .measure import TIMES, Renderer, follow
-from .state import State
-from .subject import Subject
-from .ways import BOUND, MESH, Way, plan
+from .ways import BOUND, MESH, Subject, Way, command, plan, xml
 
 print_table = report.print_table
 
 REFERENCE = 0.2
 """Share of the budget for the reference. All errors are held against it, so that it has twice the time that one of ten
 ways gets."""
-
-
-def seconds(text: str) -> float:
-    """Return the seconds of a text such as 90s, 5m or 1h. Raises MiNtfError."""
-    match = re.fullmatch(r"(\d+(?:\.\d*)?)\s*([smh])", text.strip())
-    found = float(match[1]) * {"s": 1, "m": 60, "h": 3600}[match[2]] if match else 0.0
-    if found < 1:
-        raise MiNtfError(f"--budget is '{text}', expected a time of a second or more such as 90s, 5m or 1h")
-    return found
 
 
 class Study:
@@ -49,10 +39,11 @@ class Study:
     def __init__(self, subject: Subject, out: Path, budget: float, reference: Path | None, tell: Tell,
                  pressed: threading.Event):
         self.subject, self.budget, self._tell, self._pressed = subject, budget, tell, pressed
-        self._mesh_path, self._must_have_mesh = reference or references.find_mesh(subject), reference is not None
+        self._mesh_path, self._must_have_mesh = reference or mesh_reference.shipped(subject.path, subject.parameters), (
+            reference is not None)
+        stamp = reference and [str(reference), reference.stat().st_mtime_ns]
         self.state = State(out, {"scene": subject.key(), "version": __version__, "machine": machine(),
-                                 "budget": budget, "reference": reference and [str(reference),
-                                                                               reference.stat().st_mtime_ns]})
+                                 "budget": budget, "reference": stamp})
         self._start = time.perf_counter() - max(line.get("clock", 0.0) for line in self.state.lines.values())
         self.truth: Truth | None = None
         self.mesh: Truth | None = None
@@ -139,14 +130,14 @@ class Study:
                                "points": [], "reason": "", "note": "", "command": ""}
         self.tell(way.title)
         try:
-            row["xml"] = recipes.xml(way, self.subject)
+            row["xml"] = xml(way, self.subject)
             render = self._renderer(way, shrink, row)
             curve = follow(render, self.truth, self.mesh, share, lambda e: self.tell(f"{way.title}: error {e:.1%}"))
             end = curve.points[-1]
             if len(curve.points) == 1:
                 row["note"] += (f"A single pass takes longer than this way's share of the budget, {share:.0f} s, so "
                                 "that its noise and bias are not known.")
-            row["command"] = row["command"] or recipes.command(way, self.subject, end["samples"])
+            row["command"] = row["command"] or command(way, self.subject, end["samples"])
             self.state.keep(way.name, curve.pictures)
             row |= {"points": curve.points, "shift": curve.shift, "compile": render.compile, "peak": render.peak}
             text = f"error {end['error']:.1%} after {end['seconds']:.1f} s"
@@ -231,5 +222,6 @@ def tradeoff(scene: Path, out: Path = Path("tradeoff"), parameters: dict[str, st
             raise KeyboardInterrupt from None
         finally:
             if study and study.truth is not None:
-                report.write(study.result(), study.truth.image, study.state, out)
+                pictures = {row["way"]: study.state.pictures(row["way"]) for row in study.lines("way")}
+                report.write(study.result(), study.truth.image, pictures, out)
     return study.result()

@@ -1,11 +1,27 @@
-"""The ways to render a scene that a study compares: visibility methods with their dials, and what stock Mitsuba has."""
+"""The scene of a study, the ways to render it that are compared, and how a reader renders one of them by hand."""
 
+import hashlib
+import re
+import shlex
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
+from xml.sax.saxutils import quoteattr
 
+import mitsuba as mi
+
+from ...core.errors import MiNtfError
 from ...infer.visibility import REGISTRY
-from .subject import Subject
+from ...render.lights import scene_lights
+from ...render.plugins.registration import load_scene
+from ...render.scene import changed
+from ...render.scene.media import find_media
 
+PROPERTIES = ("samples", "light_samples", "environment_lights", "map_resolution", "map_source", "map_components",
+              "map_memory", "max_depth", "bounces", "hide_emitters")
+"""Properties of the scene's integrator that all ways take over: not its method, nor limits, files of maps and further
+outputs."""
 STOCK, MESH, BOUND = "volpath", "mesh", "none"
 """Ways besides the visibility methods, and the method that looks for no visibility: a bound, and no choice."""
 DRAWN = 4
@@ -20,6 +36,61 @@ _TITLES = {STOCK: "stock volpath", MESH: "exported mesh, stock path", BOUND: "no
 _WORDS = {"samples": "{} steps", "light_samples": "{} lights drawn at each point",
           "environment_lights": "{} environment lights", "map_resolution": "{0}×{0} texels",
           "map_components": "{} logistics a texel"}
+_TAGS = {bool: "boolean", int: "integer", float: "float", str: "string"}
+
+
+class Subject:
+    """A scene file and the values of its $names.
+
+    size          width and height of the scene's film
+    media         the ``nrf`` media
+    lights        number of lights with the scene's own dials
+    environment   true if an environment is cut into lights
+    properties    those of the scene's integrator, see `PROPERTIES`
+    serves        names of the visibility methods that serve all media
+
+    Raises MiNtfError where the scene cannot be rendered.
+    """
+
+    def __init__(self, path: Path, parameters: dict[str, str]):
+        self.path, self.parameters = Path(path), dict(parameters)
+        if not self.path.is_file():
+            raise MiNtfError(f"scene {path} does not exist; give the XML file of a scene with an nrf medium")
+        scene = load_scene(self.path, self.parameters)
+        own = scene.integrator()
+        self.media = find_media(scene)
+        self.size = tuple(int(n) for n in scene.sensors()[0].film().crop_size())
+        self.properties: dict[str, Any] = {name: getattr(own, name) for name in PROPERTIES}
+        light = scene_lights.Lights(scene, self.media, 0, own.environment_lights)
+        self.environment = any(d.cells for d in light.discrete)
+        self.lights = len(light.rows.power) + len(light.sampled)
+        self.serves = [name for name, method in REGISTRY.items() if all(map(method.needs, self.media))]
+        self._scenes: dict[int, Any] = {}
+
+    def texels(self, method: str) -> int:
+        """Return the texels along a side of the maps of `method`, where the scene does not name their number."""
+        return REGISTRY[method].resolution(self.lights, max(m.field.grid.resolution for m in self.media))
+
+    def scene(self, shrink: int):
+        """Return the scene, loaded once, with one pixel for `shrink` of its own along each side."""
+
+        def change(node) -> None:
+            if node.type == mi.ObjectType.Film:
+                changed.shrink_film(node.props, shrink)
+
+        if shrink not in self._scenes:
+            self._scenes[shrink] = changed.load(self.path, self.parameters, change)
+        return self._scenes[shrink]
+
+    def pixels(self, shrink: int) -> tuple[int, int]:
+        """Return width and height of that picture."""
+        width, height = (n // shrink for n in self.size)
+        return width, height
+
+    def key(self) -> str:
+        """Return a hash of the scene's text, includes and $names in it, and of its fields."""
+        text = mi.parser.write_string(changed.parsed(self.path, self.parameters))
+        return hashlib.sha256(repr((text, [m.field.digest for m in self.media])).encode()).hexdigest()
 
 
 @dataclass(frozen=True)
@@ -86,3 +157,54 @@ def finer(subject: Subject, methods: list[str]) -> list[Way]:
         found += [(name, "environment_lights", min(4 * cells, 65536) if name in summed else max(cells // 4, 1))
                   for name in methods]
     return [Way(name, ((dial, value),)) for name, dial, value in found]
+
+
+def xml(way: Way, subject: Subject) -> str:
+    """Return the element ``<integrator>`` of `way`. Properties that have the plugin's defaults are left out."""
+    default: Any = mi.load_dict({"type": "nrf"})
+    lines = [f'    <{_TAGS[type(value)]} name="{name}" value={quoteattr(_text(value))}/>'
+             for name, value in way.properties(subject).items()
+             if way.plugin != "nrf" or value != getattr(default, name)]
+    return "\n".join([f'<integrator type="{way.plugin}">', *lines, "</integrator>"]) + "\n"
+
+
+def command(way: Way, subject: Subject, samples: int) -> str:
+    """Return the shell command that renders `way` with so many samples a pixel, where the scene has a $name for these,
+    or "" where the scene's $names cannot say all of the rest."""
+    names, own = _names(subject), subject.properties | {"visibility": None}
+    wanted = {name: value for name, value in way.properties(subject).items() if value != own[name]}
+    if way.plugin != "nrf" or not set(wanted) <= set(names):
+        return ""
+    parameters = subject.parameters | {names[name]: _text(value) for name, value in wanted.items()}
+    for known, count in ((parameters | {"spp": str(samples)}, samples), (parameters, 0)):
+        if _says(known, way, subject, count):
+            defined = [word for name, value in known.items() for word in ("-D", f"{name}={value}")]
+            return shlex.join(["mi-ntf", "render", *defined, "-o", "picture.exr", str(subject.path)])
+    return ""
+
+
+def _text(value: Any) -> str:
+    return str(value).lower() if isinstance(value, bool) else f"{value:.9g}" if isinstance(value, float) else str(value)
+
+
+def _names(subject: Subject) -> dict[str, str]:
+    """Return the $name of each property of the scene's integrator that is nothing but a $name."""
+    found = ElementTree.parse(subject.path).getroot().find("integrator")
+    pairs = {} if found is None else {e.get("name", ""): e.get("value", "") for e in found}
+    return {name: value[1:] for name, value in pairs.items() if re.fullmatch(r"\$\w+", value)}
+
+
+def _says(parameters: dict[str, str], way: Way, subject: Subject, samples: int) -> bool:
+    """Return True if the scene with `parameters` renders `way`, without limits and files of maps, and with so many
+    samples a pixel unless they are 0."""
+    try:
+        nodes = changed.parsed(subject.path, parameters).nodes
+    except RuntimeError:  # a name that the scene does not have
+        return False
+    integrator = next(node.props for node in nodes if node.type == mi.ObjectType.Integrator)
+    known = {name: integrator[name] for name in integrator.keys() if name not in ("frames", "timeout")}
+    default = mi.load_dict({"type": "nrf"})
+    same = all(known.get(name, getattr(default, name)) == value for name, value in way.properties(subject).items())
+    others = any(value for name, value in known.items() if name not in (*PROPERTIES, "visibility"))
+    counts = [node.props["sample_count"] for node in nodes if node.type == mi.ObjectType.Sampler]
+    return same and not others and (not samples or counts == [samples])

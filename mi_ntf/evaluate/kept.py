@@ -1,4 +1,4 @@
-"""What a study knows so far, on the disk: one JSON line each, and pictures, so that an interrupted study goes on."""
+"""Findings of long work on the disk, one JSON line each, and pictures, so that interrupted work goes on."""
 
 import json
 from pathlib import Path
@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from ...core import files
+from ..core import files
 
 NAME, PICTURES = "study.jsonl", "pictures"
+"""File of the lines, and folder of the pictures."""
 
 
 class State:

@@ -1,14 +1,13 @@
-"""The figure of a study: error over seconds, one curve for each way."""
+"""The figure of `mi-ntf tradeoff` and of `make demo`: error over seconds, one curve for each way to render."""
 
 from typing import Any
 
-from ...data.page import GREY
-from .ways import BOUND
+from ..data.page import GREY
 
 COLOURS = {
     "raymarch": "#3b82e0", "transmittance_map": "#e0433a", "transmittance_atlas": "#2f9e44",
     "neural_transmittance": "#8b5cf6", "ray_network": "#0ea5b7", "transmittance_volume": "#e39b1a",
-    "visibility_mlp": "#d6409f", "volpath": "#8a6d3b", "mesh": "#84a100", BOUND: GREY,
+    "visibility_mlp": "#d6409f", "volpath": "#8a6d3b", "mesh": "#64748b", "none": GREY,
 }
 """Colour of each method in every figure."""
 DASHES: tuple[Any, ...] = ((0, (5, 2)), (0, (1, 1.5)), (0, (5, 2, 1, 2)), (0, (9, 3)), (0, (3, 1, 1, 1, 1, 1)))
@@ -28,7 +27,7 @@ def draw(axes, result: dict[str, Any], fontsize: float = 11.0) -> None:
     finer: dict[str, int] = {}
     for row in result["ways"]:
         points = [p for p in row["points"] if p["error"] > 0]
-        bound, dash = row["method"] == BOUND, "-"
+        bound, dash = row["method"] == "none", "-"
         if row["finer"]:
             count = finer[row["method"]] = finer.get(row["method"], -1) + 1
             dash = DASHES[count % len(DASHES)]

@@ -1,10 +1,22 @@
-"""Progress of work that has a budget of seconds."""
+"""A budget of seconds: its text, and the progress of work that has one."""
 
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from ..core.errors import MiNtfError
+
 Tell = Callable[[float, str, bool], None]
 """Is called with the seconds spent so far, what is done now, and True for a line that stays."""
+
+
+def seconds(text: str) -> float:
+    """Return the seconds of a text such as 90s, 5m or 1h. Raises MiNtfError."""
+    match = re.fullmatch(r"(\d+(?:\.\d*)?)\s*([smh])", text.strip())
+    found = float(match[1]) * {"s": 1, "m": 60, "h": 3600}[match[2]] if match else 0.0
+    if found < 1:
+        raise MiNtfError(f"--budget is '{text}', expected a time of a second or more such as 90s, 5m or 1h")
+    return found
 
 
 @contextmanager
