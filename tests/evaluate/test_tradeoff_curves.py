@@ -11,7 +11,7 @@ from helpers.programs import run_program
 from helpers.variants import VARIANT
 
 from mi_ntf.core.errors import MiNtfError
-from mi_ntf.evaluate import budget, mesh_reference
+from mi_ntf.evaluate import budget, mesh_reference, recipes
 from mi_ntf.evaluate.curves import COLOURS
 from mi_ntf.evaluate.exported_mesh import ExportedMesh
 from mi_ntf.evaluate.tradeoff import measure, references, ways
@@ -133,16 +133,21 @@ def test_many_lights_may_be_drawn_and_are_summed_by_maps(folder):
 def test_the_xml_of_a_way_renders_the_same_picture(folder, subject, way):
     text = (folder / "one.xml").read_text()
     begin, end = text.index("<integrator"), text.index("</integrator>") + len("</integrator>")
-    (folder / "pasted.xml").write_text(text[:begin] + ways.xml(way, subject) + text[end:])
+    ours = recipes.integrator_xml(way.plugin, way.properties(subject))
+    (folder / "pasted.xml").write_text(text[:begin] + ours + text[end:])
     pasted = mi.load_file(str(folder / "pasted.xml"))
     render = references.renderer(subject, way, 1)
     ours, _ = render(2, 5)
     np.testing.assert_array_equal(np.array(once(pasted, pasted.integrator(), 2, 5)[0])[..., :3], ours)
 
 
+def command(way, subject, samples):
+    return recipes.render_command(subject.path, subject.parameters, way.properties(subject), samples)
+
+
 def test_the_command_of_a_way_runs_and_renders_the_way(folder, subject):
     way = Way("transmittance_map")
-    text = ways.command(way, subject, 3)
+    text = command(way, subject, 3)
     assert text.startswith("mi-ntf render ") and "-D visibility=transmittance_map" in text and "-D spp=3" in text
     done = run_program(*shlex.split(text), "-m", VARIANT, cwd=folder)
     assert done.returncode == 0, done.stderr
@@ -152,11 +157,10 @@ def test_the_command_of_a_way_runs_and_renders_the_way(folder, subject):
 
 
 def test_a_scene_without_the_names_has_no_command(folder, subject):
-    assert ways.command(Way("raymarch", (("samples", 96),)), subject, 4) == ""  # steps are no $name of it
-    assert ways.command(Way(ways.STOCK), subject, 4) == ""
-    assert ways.command(Way("raymarch"), Subject(folder / "sky.xml", {}), 4) == ""
+    assert command(Way("raymarch", (("samples", 96),)), subject, 4) == ""  # steps are no $name of it
+    assert command(Way("raymarch"), Subject(folder / "sky.xml", {}), 4) == ""
     limited = Subject(folder / "one.xml", {"noise": "0.1"})
-    assert ways.command(Way("raymarch"), limited, 4) == ""  # would end at a noise
+    assert command(Way("raymarch"), limited, 4) == ""  # would end at a noise
 
 
 def test_stock_volpath_agrees_with_the_converged_march(subject):

@@ -20,7 +20,7 @@ LARGEST_PASS = 1 << 22
 
 @dataclass
 class Renderer:
-    """Renders a scene by an integrator again and again; what it builds stays. `compile`: seconds of compilation so far;
+    """Renders a scene by an integrator again and again. What that builds stays. `compile`: seconds of compilation;
     `peak`: most bytes that Dr.Jit held."""
 
     scene: Any
@@ -64,7 +64,8 @@ class Curve:
 
 def follow(render: Callable[[int, int], tuple[np.ndarray, float]], truth: Truth, mesh: Truth | None, share: float,
            tell: Callable[[float], None]) -> Curve:
-    """Render passes until `share` seconds by the clock are used, or more of them would change the error no more.
+    """Render passes until `share` seconds by the clock are used, or the noise is below the reference's own or a tenth
+    of the bias, where more samples would change the error no more.
 
     `render` takes samples and a seed and returns a picture and seconds, as :class:`Renderer`; what it builds, it builds
     anew in the first pass, which is rendered whatever it takes. `tell` is called with each error. Passes double the
@@ -86,18 +87,13 @@ def follow(render: Callable[[int, int], tuple[np.ndarray, float]], truth: Truth,
             used, last = time.perf_counter() - begin, time.perf_counter() - start
             if mean.pictures == 1 and share / 2 < used < 2 * share:  # for building, so that samples have some of it
                 share = max(share, used + share / 4)
-            if used >= share or (mean.pictures > 1 and _settled(mean, truth)):
+            noise, bias = (e.value for e in mean.split()) if mean.pictures > 1 else (1.0, 0.0)
+            if used >= share or noise < max(truth.noise, bias / 10):
                 break
             fit = (share - used) / last * samples if mean.pictures > 1 else 1.0
             mark = next(((t - seconds) / took * samples for t in TIMES if t > seconds), 0.0)
             samples = following(mean.samples, fit, mark, LARGEST_PASS // picture[..., 0].size)
     return curve
-
-
-def _settled(mean: Mean, truth: Truth) -> bool:
-    """Return True if the noise is below the reference's own, or too small beside the bias to be seen in the error."""
-    noise, bias = (estimate.value for estimate in mean.split())
-    return noise < max(truth.noise, bias / 10)
 
 
 def following(samples: int, fit: float, mark: float, largest: int) -> int:

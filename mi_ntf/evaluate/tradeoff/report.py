@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import sys
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from ...core import files
-from ...data.page import Page, encode, new_figure, plain
+from ...data.images import levels
+from ...data.page import Page, new_figure, plain
 from ..curves import draw
 from . import errors
 from .measure import TIMES
@@ -26,11 +28,8 @@ HEADER = ("way", *(f"to {limit:.0%}" for limit in ERRORS), "at the end: error", 
 
 
 def write(result: dict[str, Any], reference: np.ndarray, pictures: dict[str, dict[str, np.ndarray]], out: Path) -> None:
-    """Write ``index.html``, ``tradeoff.csv`` and ``tradeoff.json`` to `out`.
-
-    `result`: the study's; `reference`: (h, w, 3) linear; `pictures`: those of each way, by the seconds after which they
-    are compared.
-    """
+    """Write ``index.html``, ``tradeoff.csv`` and ``tradeoff.json`` to `out`. `result`: the study's; `reference`:
+    (h, w, 3) linear; `pictures`: those of each way, by the seconds after which they are compared."""
     files.write(out / "tradeoff.json", json.dumps(result, indent=1) + "\n")
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -128,21 +127,20 @@ def _pictures(found: Page, result, reference, pictures) -> None:
     found.text("What each way shows after the same time, and below it the difference from the reference: white is half "
                "of the reference's root mean square, or more. Ways that had built nothing by then, or ended well "
                "before, are left out.")
-    found.pictures([("reference", np.clip(reference * scale, 0, 1))], 144)
+    found.pictures([("reference", levels(reference * scale))], 144)
     for mark in TIMES:
-        parts = []
+        pairs = []
         for row in result["ways"]:
             image = pictures[row["way"]].get(str(mark))
             if image is None or 2 * row["points"][-1]["seconds"] < mark:
                 continue
             point = [p for p in row["points"] if p["seconds"] <= mark][-1]
             heat = colormaps["inferno"](np.clip(2 * np.abs(image - reference).mean(-1) / rms, 0, 1))[..., :3]
-            shown = "".join(f'<img class="small" width="144" src="{encode(array)}" alt="{word}">' for array, word in (
-                (np.clip(image * scale, 0, 1), "picture"), ((255 * heat).astype(np.uint8), "difference")))
-            parts.append(f'<figure style="width: 150px">{shown}<figcaption>{escape(row["title"])}: error '
-                         f'{point["error"]:.1%} after {point["seconds"]:.2g} s</figcaption></figure>')
-        if parts:
-            found.markup(f"<h3>After {mark} s</h3><div class=\"row\">{''.join(parts)}</div>")
+            pairs.append((f"{row['title']}: error {point['error']:.1%} after {point['seconds']:.2g} s",
+                          np.vstack([levels(image * scale), (255 * heat).astype(np.uint8)])))
+        if pairs:
+            found.markup(f"<h3>After {mark} s</h3>")
+            found.pictures(pairs, 144)
 
 
 def _about(found: Page, result: dict[str, Any]) -> None:
@@ -185,11 +183,7 @@ def print_table(result: dict[str, Any]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    console = Console()
-    console = console if console.is_terminal else Console(width=150)
     table = Table(*HEADER[:7])
     for row in result["ways"]:
         table.add_row(*cells(row)[:7])
-    console.print(table)
-    if warning := unsteady(result):
-        console.print(warning, highlight=False, markup=False)
+    Console(width=None if sys.stdout.isatty() else 150).print(table, unsteady(result))

@@ -17,10 +17,11 @@ from .. import mesh_reference
 from ..budget import Tell, progress
 from ..exported_mesh import ExportedMesh
 from ..kept import State
+from ..recipes import integrator_xml, render_command
 from . import errors, references, report
 from .errors import Truth
 from .measure import TIMES, Renderer, follow
-from .ways import BOUND, MESH, Subject, Way, command, plan, xml
+from .ways import BOUND, MESH, Subject, Way, plan
 
 print_table = report.print_table
 
@@ -130,14 +131,21 @@ class Study:
                                "points": [], "reason": "", "note": "", "command": ""}
         self.tell(way.title)
         try:
-            row["xml"] = xml(way, self.subject)
-            render = self._renderer(way, shrink, row)
+            scene, properties = None, way.properties(self.subject)
+            row["xml"] = integrator_xml(way.plugin, properties)
+            if way.method == MESH:
+                made = ExportedMesh(self.subject.scene(shrink), self.subject.media, self.state.folder)
+                scene, row["command"], row["xml"] = made.scene, made.commands, row["xml"] + made.shapes
+                row["note"] = (f"Making the mesh took {made.seconds:.0f} s, which are not counted, as those of the "
+                               "field's voxels are not for the other ways. ")
+            render = references.renderer(self.subject, way, shrink, scene)
             curve = follow(render, self.truth, self.mesh, share, lambda e: self.tell(f"{way.title}: error {e:.1%}"))
             end = curve.points[-1]
             if len(curve.points) == 1:
                 row["note"] += (f"A single pass takes longer than this way's share of the budget, {share:.0f} s, so "
                                 "that its noise and bias are not known.")
-            row["command"] = row["command"] or command(way, self.subject, end["samples"])
+            if way.plugin == "nrf":
+                row["command"] = render_command(self.subject.path, self.subject.parameters, properties, end["samples"])
             self.state.keep(way.name, curve.pictures)
             row |= {"points": curve.points, "shift": curve.shift, "compile": render.compile, "peak": render.peak}
             text = f"error {end['error']:.1%} after {end['seconds']:.1f} s"
@@ -145,16 +153,6 @@ class Study:
             row["reason"] = text = sentence(error)
         self._add(f"way {way.name}", row)
         self.tell(f"{way.title}: {text}", True)
-
-    def _renderer(self, way: Way, shrink: int, row: dict[str, Any]) -> Renderer:
-        """Return what renders a way; add to its row what the mesh needs besides the integrator."""
-        if way.method != MESH:
-            return references.renderer(self.subject, way, shrink)
-        made = ExportedMesh(self.subject.scene(shrink), self.subject.media, self.state.folder)
-        row["note"] = (f"Making the mesh took {made.seconds:.0f} s, which are not counted, as those of the field's "
-                       "voxels are not for the other ways. ")
-        row |= {"xml": row["xml"] + made.shapes, "command": made.commands}
-        return references.renderer(self.subject, way, shrink, made.scene)
 
     def result(self) -> dict[str, Any]:
         """Return what ``tradeoff.json`` holds."""
@@ -192,17 +190,8 @@ def tradeoff(scene: Path, out: Path = Path("tradeoff"), parameters: dict[str, st
     quiet
         True: no progress on stderr.
 
-    Returns
-    -------
-    dict
-        What ``tradeoff.json`` holds.
-
-    Raises
-    ------
-    MiNtfError
-        If the scene cannot be rendered.
-    KeyboardInterrupt
-        As it comes, after the report of what is there.
+    Returns what ``tradeoff.json`` holds. Raises MiNtfError where the scene cannot be rendered, and KeyboardInterrupt as
+    it comes, after the report of what is there.
     """
     if reference is not None and not reference.is_file():
         raise MiNtfError(f"reference {reference} does not exist; give an EXR picture or the XML file of a mesh scene")

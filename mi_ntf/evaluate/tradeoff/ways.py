@@ -1,13 +1,9 @@
-"""The scene of a study, the ways to render it that are compared, and how a reader renders one of them by hand."""
+"""The scene of a study, and the ways to render it that are compared."""
 
 import hashlib
-import re
-import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
-from xml.sax.saxutils import quoteattr
 
 import mitsuba as mi
 
@@ -36,7 +32,6 @@ _TITLES = {STOCK: "stock volpath", MESH: "exported mesh, stock path", BOUND: "no
 _WORDS = {"samples": "{} steps", "light_samples": "{} lights drawn at each point",
           "environment_lights": "{} environment lights", "map_resolution": "{0}×{0} texels",
           "map_components": "{} logistics a texel"}
-_TAGS = {bool: "boolean", int: "integer", float: "float", str: "string"}
 
 
 class Subject:
@@ -157,54 +152,3 @@ def finer(subject: Subject, methods: list[str]) -> list[Way]:
         found += [(name, "environment_lights", min(4 * cells, 65536) if name in summed else max(cells // 4, 1))
                   for name in methods]
     return [Way(name, ((dial, value),)) for name, dial, value in found]
-
-
-def xml(way: Way, subject: Subject) -> str:
-    """Return the element ``<integrator>`` of `way`. Properties that have the plugin's defaults are left out."""
-    default: Any = mi.load_dict({"type": "nrf"})
-    lines = [f'    <{_TAGS[type(value)]} name="{name}" value={quoteattr(_text(value))}/>'
-             for name, value in way.properties(subject).items()
-             if way.plugin != "nrf" or value != getattr(default, name)]
-    return "\n".join([f'<integrator type="{way.plugin}">', *lines, "</integrator>"]) + "\n"
-
-
-def command(way: Way, subject: Subject, samples: int) -> str:
-    """Return the shell command that renders `way` with so many samples a pixel, where the scene has a $name for these,
-    or "" where the scene's $names cannot say all of the rest."""
-    names, own = _names(subject), subject.properties | {"visibility": None}
-    wanted = {name: value for name, value in way.properties(subject).items() if value != own[name]}
-    if way.plugin != "nrf" or not set(wanted) <= set(names):
-        return ""
-    parameters = subject.parameters | {names[name]: _text(value) for name, value in wanted.items()}
-    for known, count in ((parameters | {"spp": str(samples)}, samples), (parameters, 0)):
-        if _says(known, way, subject, count):
-            defined = [word for name, value in known.items() for word in ("-D", f"{name}={value}")]
-            return shlex.join(["mi-ntf", "render", *defined, "-o", "picture.exr", str(subject.path)])
-    return ""
-
-
-def _text(value: Any) -> str:
-    return str(value).lower() if isinstance(value, bool) else f"{value:.9g}" if isinstance(value, float) else str(value)
-
-
-def _names(subject: Subject) -> dict[str, str]:
-    """Return the $name of each property of the scene's integrator that is nothing but a $name."""
-    found = ElementTree.parse(subject.path).getroot().find("integrator")
-    pairs = {} if found is None else {e.get("name", ""): e.get("value", "") for e in found}
-    return {name: value[1:] for name, value in pairs.items() if re.fullmatch(r"\$\w+", value)}
-
-
-def _says(parameters: dict[str, str], way: Way, subject: Subject, samples: int) -> bool:
-    """Return True if the scene with `parameters` renders `way`, without limits and files of maps, and with so many
-    samples a pixel unless they are 0."""
-    try:
-        nodes = changed.parsed(subject.path, parameters).nodes
-    except RuntimeError:  # a name that the scene does not have
-        return False
-    integrator = next(node.props for node in nodes if node.type == mi.ObjectType.Integrator)
-    known = {name: integrator[name] for name in integrator.keys() if name not in ("frames", "timeout")}
-    default = mi.load_dict({"type": "nrf"})
-    same = all(known.get(name, getattr(default, name)) == value for name, value in way.properties(subject).items())
-    others = any(value for name, value in known.items() if name not in (*PROPERTIES, "visibility"))
-    counts = [node.props["sample_count"] for node in nodes if node.type == mi.ObjectType.Sampler]
-    return same and not others and (not samples or counts == [samples])
