@@ -42,7 +42,9 @@ def render_command(scene: Path, parameters: dict[str, str], properties: dict[str
     found = ElementTree.parse(scene).getroot().find("integrator")
     texts = {} if found is None else {e.get("name", ""): e.get("value", "") for e in found}
     names = {name: text[1:] for name, text in texts.items() if re.fullmatch(r"\$\w+", text)}
-    known = parameters | {names[name]: _text(value) for name, value in properties.items() if name in names}
+    own, default = _integrator(scene, parameters)[0], mi.load_dict({"type": "nrf"})
+    known = parameters | {names[name]: _text(value) for name, value in properties.items()
+                          if name in names and own.get(name, getattr(default, name)) != value}
     for more, count in (({"spp": str(samples)}, samples), ({}, 0)):
         if _says(scene, known | more, properties, count):
             defined = [word for name, value in (known | more).items() for word in ("-D", f"{name}={value}")]
@@ -54,17 +56,22 @@ def _text(value: Any) -> str:
     return str(value).lower() if isinstance(value, bool) else f"{value:.9g}" if isinstance(value, float) else str(value)
 
 
+def _integrator(scene: Path, parameters: dict[str, str]) -> tuple[dict[str, Any], list[int]]:
+    """Return the properties of a scene's integrator, and its samplers' samples a pixel."""
+    nodes = changed.parsed(scene, parameters).nodes
+    found = next(node.props for node in nodes if node.type == mi.ObjectType.Integrator)
+    counts = [node.props.get("sample_count", 0) for node in nodes if node.type == mi.ObjectType.Sampler]
+    return {name: found[name] for name in found.keys()}, counts
+
+
 def _says(scene: Path, parameters: dict[str, str], properties: dict[str, Any], samples: int) -> bool:
     """Return True if the scene with `parameters` has an integrator of these properties, and so many samples a pixel
     unless they are 0."""
     try:
-        nodes = changed.parsed(scene, parameters).nodes
+        known, counts = _integrator(scene, parameters)
     except RuntimeError:  # a name that the scene does not have
         return False
-    integrator = next(node.props for node in nodes if node.type == mi.ObjectType.Integrator)
-    known = {name: integrator[name] for name in integrator.keys() if name not in ("frames", "timeout")}
     default = mi.load_dict({"type": "nrf"})
     same = all(known.get(name, getattr(default, name)) == value for name, value in properties.items())
-    others = any(value for name, value in known.items() if name not in properties)
-    counts = [node.props.get("sample_count", 0) for node in nodes if node.type == mi.ObjectType.Sampler]
+    others = any(value for name, value in known.items() if name not in (*properties, "frames", "timeout"))
     return same and not others and (not samples or counts == [samples])

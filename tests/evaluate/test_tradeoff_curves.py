@@ -174,6 +174,21 @@ def test_stock_volpath_agrees_with_the_converged_march(subject):
     assert bias[0] < 3 * bias[1] + 0.05
 
 
+def test_further_light_of_the_reference_is_traced(folder):
+    """Light between patches is biased, and the reference must not share that with the ways that are held against it."""
+    subject = Subject(folder / "one.xml", {})
+    subject.properties["max_depth"] = 4
+    assert references.marched(subject).properties(subject)["bounces"] == "paths"
+    assert Way("raymarch").properties(subject)["bounces"] == "auto"
+    finer = {way.method for way in ways.plan(subject, False) if ("bounces", "paths") in way.changes}
+    assert "transmittance_map" in finer
+    marching, between = (references.renderer(subject, way, 1) for way in (references.marched(subject), Way("raymarch")))
+    truth, _ = references.converge(marching, 24 * 24, 2.0, lambda text: None)
+    stock = follow(references.renderer(subject, Way(ways.STOCK), 1), 4.0, truth=truth)
+    assert abs(stock.shift[0]) < 4 * stock.shift[1] and stock.shift[1] < 0.03
+    assert between(1, 0)[0].mean() > 0
+
+
 def test_the_exported_mesh_stands_where_the_field_is(folder):
     """Of a field that is turned and of two beside each other, silhouettes are the same; and a ball is as bright."""
     for name, least in (("moved", 0.9), ("many", 0.85)):

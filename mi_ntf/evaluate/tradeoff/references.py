@@ -22,11 +22,11 @@ SMALLEST = 64
 
 
 def marched(subject: Subject) -> Way:
-    """Return the reference's way: twice the steps, and where there are many lights, drawn ones, whose noise goes away
-    with the pixels' and which cut no environment into cells."""
+    """Return the reference's way, which has noise in place of bias: twice the steps; light that scatters again traced,
+    not taken from between patches; of many lights drawn ones, which cut no environment into cells."""
     own = subject.properties
     drawn = own["light_samples"] or (DRAWN if subject.lights > DRAWN else 0)
-    return Way("raymarch", (("samples", min(2 * own["samples"], 8192)), ("light_samples", drawn)))
+    return Way("raymarch", (("samples", min(2 * own["samples"], 8192)), ("light_samples", drawn), ("bounces", "paths")))
 
 
 def renderer(subject: Subject, way: Way, shrink: int, scene: Any = None) -> Renderer:

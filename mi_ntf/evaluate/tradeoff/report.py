@@ -175,7 +175,7 @@ def check(result: dict[str, Any]) -> str:
             f"samples a pixel, differs from it by {gap:+.2%} ± {sigma:.2%}")
     if sigma > 0.02:
         return f"{text}, too noisy to show differences below {2 * sigma:.0%}."
-    return f"{text}, which is {'no difference' if abs(gap) < 2 * sigma else 'a difference'} at two standard errors."
+    return f"{text}, {'no' if abs(gap) < 2 * sigma else 'perhaps a' if abs(gap) < 3 * sigma else 'a'} difference."
 
 
 def print_table(result: dict[str, Any]) -> None:

@@ -31,7 +31,7 @@ _TITLES = {STOCK: "stock volpath", MESH: "exported mesh, stock path", BOUND: "no
            "visibility_mlp": "visibility MLP"}
 _WORDS = {"samples": "{} steps", "light_samples": "{} lights drawn at each point",
           "environment_lights": "{} environment lights", "map_resolution": "{0}×{0} texels",
-          "map_components": "{} logistics a texel"}
+          "map_components": "{} logistics a texel", "bounces": "further light by {}"}
 
 
 class Subject:
@@ -121,7 +121,7 @@ class Way:
         if self.plugin != "nrf":
             return {name: own[name] for name in ("max_depth", "hide_emitters")}
         whole = {"light_samples": 0} if REGISTRY[self.method].drawn else {}  # its maps are of all lights
-        return own | whole | {"visibility": self.method} | dict(self.changes)
+        return {"visibility": self.method} | own | whole | dict(self.changes)
 
 
 def plan(subject: Subject, mesh: bool) -> list[Way]:
@@ -139,7 +139,7 @@ def finer(subject: Subject, methods: list[str]) -> list[Way]:
     """Return `methods` with one other dial each, of one kind of dial after the other."""
     own, methods = subject.properties, [name for name in methods if name != BOUND]
     summed = [name for name in methods if not REGISTRY[name].drawn]
-    found = []
+    found: list[tuple[str, str, Any]] = []
     if subject.lights > DRAWN and not own["light_samples"]:
         found += [(name, "light_samples", DRAWN) for name in summed]
     found += [(name, "map_resolution", 2 * (own["map_resolution"] or subject.texels(name))) for name in methods
@@ -147,6 +147,8 @@ def finer(subject: Subject, methods: list[str]) -> list[Way]:
     if own["map_components"] == 1 and own["map_source"] == "field":
         found += [(name, "map_components", 2) for name in methods if "map_components" in REGISTRY[name].dials]
     found.append(("raymarch", "samples", min(2 * own["samples"], 8192)))
+    if own["bounces"] == "auto" and not 0 <= own["max_depth"] <= 2:
+        found += [(name, "bounces", "paths") for name in methods if REGISTRY[name].automatic]
     if subject.environment and not own["light_samples"]:
         cells = own["environment_lights"]
         found += [(name, "environment_lights", min(4 * cells, 65536) if name in summed else max(cells // 4, 1))
