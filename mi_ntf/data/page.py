@@ -86,8 +86,7 @@ class Page:
         lines += ["".join(f"<th>{escape(str(cell))}</th>" for cell in header)]
         lines += ["".join(f"<td>{escape(str(cell))}</td>" for cell in row) for row in rows]
         table = "<table>" + "".join(f"<tr>{line}</tr>\n" for line in lines) + "</table>"
-        self.scrolling(f"<details><summary>{escape(folded)}</summary>{table}</details>" if folded else table,
-                       folded or "table")
+        self.scrolling(f"<details><summary>{escape(folded)}</summary>{table}</details>" if folded else table, "table")
 
     def pictures(self, pictures: Iterable[tuple[str, np.ndarray]], width: int = 240) -> None:
         """A row of pictures (caption, (H, W, 3)), each shown `width` CSS pixels wide."""

@@ -318,7 +318,7 @@ def test_an_unsteady_machine_is_said(spread, warned):
 
 
 @pytest.mark.parametrize(("shift", "said"), [
-    ((0.003, 0.002), ", no difference."), ((0.03, 0.002), ", a difference."), ((-0.005, 0.002), ", perhaps a difference."),
+    ((0.003, 0.002), ", no difference."), ((0.03, 0.002), ", a difference."), ((-0.005, 0.002), "perhaps a"),
     ((0.03, 0.05), "too noisy to show differences below 10%")])
 def test_what_stock_volpath_says_of_the_reference(shift, said):
     assert said in report.check({"ways": [row([1.0], [0.3], method="volpath", shift=shift)]})
