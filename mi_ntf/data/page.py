@@ -93,7 +93,7 @@ class Page:
         self._parts.append('<div class="row">')
         for caption, array in pictures:
             small = ' class="small"' if array.shape[1] < width else ""
-            self._image(encode(array), caption, f'{small} width="{width}"')
+            self._image(encode(array), caption, f'{small} width="{width}"', f' style="max-width: {max(width, 150)}px"')
         self._parts.append("</div>")
 
     def figure(self, figure, caption: str = "", vector: bool = False) -> None:
@@ -167,9 +167,9 @@ class Page:
         """Write the page to `path`, whole or not at all. Raises MiNtfError."""
         files.write(path, self.html())
 
-    def _image(self, uri: str, caption: str, attributes: str) -> None:
+    def _image(self, uri: str, caption: str, attributes: str, frame: str = "") -> None:
         caption = escape(caption)
-        self._parts.append(f'<figure><img src="{uri}" alt="{caption}"{attributes}>'
+        self._parts.append(f'<figure{frame}><img src="{uri}" alt="{caption}"{attributes}>'
                            f"<figcaption>{caption}</figcaption></figure>")
 
 

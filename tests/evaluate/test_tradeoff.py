@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from html.parser import HTMLParser
 
@@ -342,3 +343,15 @@ def test_a_captured_mesh_adds_the_exported_one_and_a_second_error(folder, tmp_pa
 
 def test_a_budget_that_is_none_is_bad_usage(folder):
     assert cli.main(["tradeoff", str(folder / "one.xml"), "--budget=soon"]) == 2
+
+
+def test_the_bound_is_no_choice(folder, tmp_path):
+    """It is left out of the front, though nothing is faster or more accurate."""
+    begun = study.Study(ways.Subject(folder / "one.xml", {}), tmp_path, 9.0, None, lambda *a: None, threading.Event())
+    begun.state.add("picture", {"shrink": 1})
+    begun.state.add("reference", {})
+    for method, seconds in (("none", 0.1), ("raymarch", 1.0), ("volpath", 2.0)):
+        begun.state.add(f"way {method}", row([seconds], [seconds / 9], method=method))
+        del begun.state.lines[f"way {method}"]["points"][0]["front"]
+    marks = {row["method"]: row["points"][0].get("front") for row in begun.result()["ways"]}
+    assert marks == {"none": None, "raymarch": True, "volpath": False}

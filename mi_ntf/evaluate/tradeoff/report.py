@@ -23,7 +23,7 @@ SPREAD = 0.1
 """Standard deviation of equal renders, over their mean, above which pyperf calls a machine too noisy to trust."""
 COLUMNS = ("seconds", "samples", "error", "error_uncertainty", "noise", "noise_uncertainty", "bias", "bias_uncertainty",
            "mesh_error", "mesh_error_uncertainty", "front")
-HEADER = ("way", *(f"to {limit:.0%}" for limit in ERRORS), "at the end: error", "seconds", "samples", "noise", "bias",
+HEADER = ("way", *(f"to {limit:.0%}" for limit in ERRORS), "error at the end", "after s", "samples", "noise", "bias",
           "to the mesh")
 
 
@@ -68,7 +68,8 @@ def page(result: dict[str, Any], reference: np.ndarray, pictures: dict[str, dict
         lines.append("".join(f'<td style="white-space: nowrap">{escape(cell)}</td>' for cell in cells(row)))
         if row["points"]:
             lines.append(f'<td colspan="{len(HEADER)}">{_recipe(row)}</td>')
-    found.scrolling("<table>" + "".join(f"<tr>{line}</tr>\n" for line in lines) + "</table>", "Seconds to an error")
+    table = "".join(f"<tr>{line}</tr>\n" for line in lines)
+    found.scrolling(f'<table style="font-size: 13px">{table}</table>', "Seconds to an error")
     _pictures(found, result, reference, pictures)
     _about(found, result)
     return found
