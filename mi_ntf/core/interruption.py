@@ -8,8 +8,10 @@ from contextlib import contextmanager
 
 @contextmanager
 def noticed() -> Iterator[threading.Event]:
-    """Within, Ctrl-C raises KeyboardInterrupt as always, and also sets the event that this gives. In other threads than
-    the main one, which hear of no signals, the event stays unset."""
+    """Give an event that Ctrl-C sets within the block, besides raising KeyboardInterrupt as always.
+
+    In other threads than the main one, which receive no signals, the event stays unset.
+    """
     pressed = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield pressed

@@ -7,16 +7,16 @@ from contextlib import contextmanager
 from ..core.errors import MiNtfError
 
 Tell = Callable[[float, str, bool], None]
-"""Is called with the seconds spent so far, what is done now, and True for a line that stays."""
+"""Function that is called with the seconds spent so far, what is done now, and True for a line that stays."""
 
 
 def seconds(text: str) -> float:
     """Return the seconds of a text such as 90s, 5m or 1h. Raises MiNtfError."""
     match = re.fullmatch(r"(\d+(?:\.\d*)?)\s*([smh])", text.strip())
-    found = float(match[1]) * {"s": 1, "m": 60, "h": 3600}[match[2]] if match else 0.0
-    if found < 1:
+    value = float(match[1]) * {"s": 1, "m": 60, "h": 3600}[match[2]] if match else 0.0
+    if value < 1:
         raise MiNtfError(f"--budget is '{text}', expected a time of a second or more such as 90s, 5m or 1h")
-    return found
+    return value
 
 
 @contextmanager

@@ -51,11 +51,11 @@ class State:
 
 def _read(path: Path) -> dict[str, Any]:
     """Return the lines of a file as far as they are whole."""
-    found: dict[str, Any] = {}
+    lines: dict[str, Any] = {}
     try:
         for line in filter(None, path.read_text(encoding="utf-8", errors="replace").split("\n")):
             value = json.loads(line)
-            found[value["name"]] = value["values"]
+            lines[value["name"]] = value["values"]
     except (OSError, ValueError, KeyError, TypeError):
         pass
-    return found
+    return lines

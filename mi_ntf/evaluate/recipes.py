@@ -1,4 +1,4 @@
-"""How a reader renders a scene with other properties of its integrator: XML to paste, and a shell command."""
+"""Recipes that render a scene with other properties of its integrator: XML to paste, and a shell command."""
 
 import re
 import shlex
@@ -39,12 +39,12 @@ def render_command(scene: Path, parameters: dict[str, str], properties: dict[str
     str
         "" where the scene's $names cannot say all of the properties.
     """
-    found = ElementTree.parse(scene).getroot().find("integrator")
-    texts = {} if found is None else {e.get("name", ""): e.get("value", "") for e in found}
+    element = ElementTree.parse(scene).getroot().find("integrator")
+    texts = {} if element is None else {e.get("name", ""): e.get("value", "") for e in element}
     names = {name: text[1:] for name, text in texts.items() if re.fullmatch(r"\$\w+", text)}
-    own, default = _integrator(scene, parameters)[0], mi.load_dict({"type": "nrf"})
+    written, default = _integrator(scene, parameters)[0], mi.load_dict({"type": "nrf"})
     known = parameters | {names[name]: _text(value) for name, value in properties.items()
-                          if name in names and own.get(name, getattr(default, name)) != value}
+                          if name in names and written.get(name, getattr(default, name)) != value}
     for more, count in (({"spp": str(samples)}, samples), ({}, 0)):
         if _says(scene, known | more, properties, count):
             defined = [word for name, value in (known | more).items() for word in ("-D", f"{name}={value}")]
@@ -59,9 +59,9 @@ def _text(value: Any) -> str:
 def _integrator(scene: Path, parameters: dict[str, str]) -> tuple[dict[str, Any], list[int]]:
     """Return the properties of a scene's integrator, and its samplers' samples a pixel."""
     nodes = changed.parsed(scene, parameters).nodes
-    found = next(node.props for node in nodes if node.type == mi.ObjectType.Integrator)
+    properties = next(node.props for node in nodes if node.type == mi.ObjectType.Integrator)
     counts = [node.props.get("sample_count", 0) for node in nodes if node.type == mi.ObjectType.Sampler]
-    return {name: found[name] for name in found.keys()}, counts
+    return {name: properties[name] for name in properties.keys()}, counts
 
 
 def _says(scene: Path, parameters: dict[str, str], properties: dict[str, Any], samples: int) -> bool:

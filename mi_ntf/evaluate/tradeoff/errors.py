@@ -120,9 +120,9 @@ def crossing(seconds: Sequence[float], values: Sequence[float], limit: float) ->
 
 def front(points: Sequence[tuple[float, float]]) -> list[int]:
     """Return the indices of the points (seconds, error) that no other point beats in both, by seconds."""
-    best, kept = np.inf, []
+    best, indices = np.inf, []
     for i in sorted(range(len(points)), key=lambda i: points[i]):
         if points[i][1] < best:
             best = points[i][1]
-            kept.append(i)
-    return kept
+            indices.append(i)
+    return indices

@@ -20,8 +20,8 @@ LARGEST_PASS = 1 << 22
 
 @dataclass
 class Renderer:
-    """Renders a scene by an integrator again and again. What that builds stays. `compile`: seconds of compilation;
-    `peak`: most bytes that Dr.Jit held."""
+    """Renderer of many pictures of a scene by one integrator, which keeps what it has built. `compile`: seconds of
+    compilation; `peak`: most bytes that Dr.Jit held."""
 
     scene: Any
     integrator: Any
@@ -62,15 +62,15 @@ class Curve:
         self.pictures |= {str(mark): mean.image for mark in TIMES if seconds <= mark}
 
 
-def follow(render: Callable[[int, int], tuple[np.ndarray, float]], truth: Truth, mesh: Truth | None, share: float,
+def follow(render: Callable[[int, int], tuple[np.ndarray, float]], truth: Truth, mesh: Truth | None, budget: float,
            tell: Callable[[float], None]) -> Curve:
-    """Render passes until `share` seconds by the clock are used, or the noise is below the reference's own or a tenth
+    """Render passes until `budget` seconds by the clock are used, or the noise is below the reference's own or a tenth
     of the bias, where more samples would change the error no more.
 
     `render` takes samples and a seed and returns a picture and seconds, as :class:`Renderer`; what it builds, it builds
     anew in the first pass, which is rendered whatever it takes. `tell` is called with each error. Passes double the
     samples of all before them, so that what each costs besides its samples does not dominate. Where building uses most
-    of the share, but less than two of them, a quarter of it is left for samples.
+    of the budget, but less than twice as much, a quarter of it is added for samples.
     """
     curve, mean, other = Curve(), Mean(truth), Mean(mesh) if mesh else None
     begin, seconds, samples = time.perf_counter(), 0.0, 1
@@ -85,12 +85,12 @@ def follow(render: Callable[[int, int], tuple[np.ndarray, float]], truth: Truth,
             curve.add(seconds, mean, other)
             tell(curve.points[-1]["error"])
             used, last = time.perf_counter() - begin, time.perf_counter() - start
-            if mean.pictures == 1 and share / 2 < used < 2 * share:  # for building, so that samples have some of it
-                share = max(share, used + share / 4)
+            if mean.pictures == 1 and budget / 2 < used < 2 * budget:  # for building, so that samples have some of it
+                budget = max(budget, used + budget / 4)
             noise, bias = (e.value for e in mean.split()) if mean.pictures > 1 else (1.0, 0.0)
-            if used >= share or noise < max(truth.noise, bias / 10):
+            if used >= budget or noise < max(truth.noise, bias / 10):
                 break
-            fit = (share - used) / last * samples if mean.pictures > 1 else 1.0
+            fit = (budget - used) / last * samples if mean.pictures > 1 else 1.0
             mark = next(((t - seconds) / took * samples for t in TIMES if t > seconds), 0.0)
             samples = following(mean.samples, fit, mark, LARGEST_PASS // picture[..., 0].size)
     return curve

@@ -1,4 +1,4 @@
-"""What the ways are held against: the same field by ``raymarch``, taken to convergence, and the captured mesh."""
+"""References for the ways of a study: the same field by ``raymarch``, taken to convergence, and the captured mesh."""
 
 import time
 from collections.abc import Callable
@@ -24,9 +24,10 @@ SMALLEST = 64
 def marched(subject: Subject) -> Way:
     """Return the reference's way, which has noise in place of bias: twice the steps; light that scatters again traced,
     not taken from between patches; of many lights drawn ones, which cut no environment into cells."""
-    own = subject.properties
-    drawn = own["light_samples"] or (DRAWN if subject.lights > DRAWN else 0)
-    return Way("raymarch", (("samples", min(2 * own["samples"], 8192)), ("light_samples", drawn), ("bounces", "paths")))
+    properties = subject.properties
+    light_samples = properties["light_samples"] or (DRAWN if subject.lights > DRAWN else 0)
+    return Way("raymarch", (("samples", min(2 * properties["samples"], 8192)), ("light_samples", light_samples),
+                            ("bounces", "paths")))
 
 
 def renderer(subject: Subject, way: Way, shrink: int, scene: Any = None) -> Renderer:

@@ -43,14 +43,14 @@ def write(result: dict[str, Any], reference: np.ndarray, pictures: dict[str, dic
 
 def page(result: dict[str, Any], reference: np.ndarray, pictures: dict[str, dict[str, np.ndarray]]) -> Page:
     """Return the page."""
-    found = Page(f"What accuracy costs: {result['title']}")
+    sheet = Page(f"What accuracy costs: {result['title']}")
     if not result["finished"]:
-        found.warning("The study was interrupted, and this is what it has measured so far. The same command goes on.")
+        sheet.warning("The study was interrupted, and this is what it has measured so far. The same command goes on.")
     if noisy := unsteady(result):
-        found.warning(noisy)
+        sheet.warning(noisy)
     if any(row["points"] for row in result["ways"]):
-        found.section("Error over time")
-        found.text("Each curve is one way to render the scene, with more samples from left to right. Lower is better. "
+        sheet.section("Error over time")
+        sheet.text("Each curve is one way to render the scene, with more samples from left to right. Lower is better. "
                    "Seconds include what is built, such as maps, and leave out the compilation of kernels. Bands are "
                    "one standard error wide. The thick grey line, the Pareto front, joins the least errors of each "
                    "time. Without shadows is a bound: the error of not looking for visibility at all.")
@@ -58,9 +58,9 @@ def page(result: dict[str, Any], reference: np.ndarray, pictures: dict[str, dict
         axes = figure.add_subplot()
         plain(axes)
         draw(axes, result)
-        found.drawing(figure, "Error over seconds, one curve for each way to render", 760)
-    found.section("Seconds to an error")
-    found.text("In brackets: how early or late it may be, since errors are estimates, ± one standard error. Nothing is "
+        sheet.drawing(figure, "Error over seconds, one curve for each way to render", 760)
+    sheet.section("Seconds to an error")
+    sheet.text("In brackets: how early or late it may be, since errors are estimates, ± one standard error. Nothing is "
                "extrapolated: where an error is not reached, the time of that way was over before. More samples take "
                "noise away; bias stays.")
     lines = ["".join(f"<th>{h}</th>" for h in HEADER)]
@@ -69,10 +69,10 @@ def page(result: dict[str, Any], reference: np.ndarray, pictures: dict[str, dict
         if row["points"]:
             lines.append(f'<td colspan="{len(HEADER)}">{_recipe(row)}</td>')
     table = "".join(f"<tr>{line}</tr>\n" for line in lines)
-    found.scrolling(f'<table style="font-size: 13px">{table}</table>', "Seconds to an error")
-    _pictures(found, result, reference, pictures)
-    _about(found, result)
-    return found
+    sheet.scrolling(f'<table style="font-size: 13px">{table}</table>', "Seconds to an error")
+    _pictures(sheet, result, reference, pictures)
+    _about(sheet, result)
+    return sheet
 
 
 def unsteady(result: dict[str, Any]) -> str:
@@ -118,17 +118,17 @@ def _recipe(row: dict[str, Any]) -> str:
     return f"<details><summary>How to render by {escape(row['title'])}</summary>{note}{text}</details>"
 
 
-def _pictures(found: Page, result, reference, pictures) -> None:
+def _pictures(sheet: Page, result, reference, pictures) -> None:
     """Add what the ways show after equal times, those that went on for half of a time at least, and the difference."""
     from matplotlib import colormaps
 
     scale = 0.9 / max(float(np.percentile(reference.max(-1), 99.5)), 1e-12)
     rms = max(float(np.sqrt(np.mean(np.square(reference, dtype=np.float64)))), 1e-12)
-    found.section("Equal time")
-    found.text("What each way shows after the same time, and below it the difference from the reference: white is half "
+    sheet.section("Equal time")
+    sheet.text("What each way shows after the same time, and below it the difference from the reference: white is half "
                "of the reference's root mean square, or more. Ways that had built nothing by then, or ended well "
                "before, are left out.")
-    found.pictures([("reference", levels(reference * scale))], 144)
+    sheet.pictures([("reference", levels(reference * scale))], 144)
     for mark in TIMES:
         pairs = []
         for row in result["ways"]:
@@ -140,29 +140,29 @@ def _pictures(found: Page, result, reference, pictures) -> None:
             pairs.append((f"{row['title']}: error {point['error']:.1%} after {point['seconds']:.2g} s",
                           np.vstack([levels(image * scale), (255 * heat).astype(np.uint8)])))
         if pairs:
-            found.markup(f"<h3>After {mark} s</h3>")
-            found.pictures(pairs, 144)
+            sheet.markup(f"<h3>After {mark} s</h3>")
+            sheet.pictures(pairs, 144)
 
 
-def _about(found: Page, result: dict[str, Any]) -> None:
+def _about(sheet: Page, result: dict[str, Any]) -> None:
     """Add what errors are held against, the machine, and what was left out."""
-    found.section("References and machine")
+    sheet.section("References and machine")
     reference, machine = result["reference"], result["machine"]
-    found.text("Errors are root mean square differences, relative to the root mean square of the reference: the same "
+    sheet.text("Errors are root mean square differences, relative to the root mean square of the reference: the same "
                f"field by {reference['about']}. Its noise, {reference['noise']:.2%}, is taken off.")
-    found.text(check(result))
+    sheet.text(check(result))
     if result["mesh"]:
-        found.text(f"Errors to the mesh, the object that was captured, hold all that is lost: {result['mesh']}.")
+        sheet.text(f"Errors to the mesh, the object that was captured, hold all that is lost: {result['mesh']}.")
     (width, height), (whole, _) = result["size"], result["scene_size"]
     if width != whole:
-        found.text(f"Pictures are {width}×{height} pixels, so that the reference fits into the budget. At the scene's "
+        sheet.text(f"Pictures are {width}×{height} pixels, so that the reference fits into the budget. At the scene's "
                    f"own size a sample takes about {whole ** 2 // width ** 2} times as long, building does not.")
     spread = "" if machine["spread"] is None else (
         f" The same small render, {len(machine['probe_seconds'])} times, varied by {machine['spread']:.0%}.")
-    found.text(f"{machine['what']}, Mitsuba {machine['mitsuba']}. The study took {result['spent_seconds']:.0f} s of "
+    sheet.text(f"{machine['what']}, Mitsuba {machine['mitsuba']}. The study took {result['spent_seconds']:.0f} s of "
                f"{result['budget_seconds']:.0f} s.{spread}")
     if result["left_out"]:
-        found.table(["way"], [[name] for name in result["left_out"]], f"{len(result['left_out'])} finer ways were left "
+        sheet.table(["way"], [[name] for name in result["left_out"]], f"{len(result['left_out'])} finer ways were left "
                     f"out, since the budget has less than {TIMES[-1]} s for each")
 
 

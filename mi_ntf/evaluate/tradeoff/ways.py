@@ -52,11 +52,11 @@ class Subject:
         if not self.path.is_file():
             raise MiNtfError(f"scene {path} does not exist; give the XML file of a scene with an nrf medium")
         scene = load_scene(self.path, self.parameters)
-        own = scene.integrator()
+        integrator = scene.integrator()
         self.media = find_media(scene)
         self.size = tuple(int(n) for n in scene.sensors()[0].film().crop_size())
-        self.properties: dict[str, Any] = {name: getattr(own, name) for name in PROPERTIES}
-        light = scene_lights.Lights(scene, self.media, 0, own.environment_lights)
+        self.properties: dict[str, Any] = {name: getattr(integrator, name) for name in PROPERTIES}
+        light = scene_lights.Lights(scene, self.media, 0, integrator.environment_lights)
         self.environment = any(d.cells for d in light.discrete)
         self.lights = len(light.rows.power) + len(light.sampled)
         self.serves = [name for name, method in REGISTRY.items() if all(map(method.needs, self.media))]
@@ -117,11 +117,11 @@ class Way:
 
     def properties(self, subject: Subject) -> dict[str, Any]:
         """Return the properties of the integrator."""
-        own = subject.properties
+        values = subject.properties
         if self.plugin != "nrf":
-            return {name: own[name] for name in ("max_depth", "hide_emitters")}
-        whole = {"light_samples": 0} if REGISTRY[self.method].drawn else {}  # its maps are of all lights
-        return {"visibility": self.method} | own | whole | dict(self.changes)
+            return {name: values[name] for name in ("max_depth", "hide_emitters")}
+        all_lights = {"light_samples": 0} if REGISTRY[self.method].drawn else {}  # its maps are of all lights
+        return {"visibility": self.method} | values | all_lights | dict(self.changes)
 
 
 def plan(subject: Subject, mesh: bool) -> list[Way]:
@@ -137,20 +137,20 @@ def plan(subject: Subject, mesh: bool) -> list[Way]:
 
 def finer(subject: Subject, methods: list[str]) -> list[Way]:
     """Return `methods` with one other dial each, of one kind of dial after the other."""
-    own, methods = subject.properties, [name for name in methods if name != BOUND]
+    values, methods = subject.properties, [name for name in methods if name != BOUND]
     summed = [name for name in methods if not REGISTRY[name].drawn]
-    found: list[tuple[str, str, Any]] = []
-    if subject.lights > DRAWN and not own["light_samples"]:
-        found += [(name, "light_samples", DRAWN) for name in summed]
-    found += [(name, "map_resolution", 2 * (own["map_resolution"] or subject.texels(name))) for name in methods
+    dials: list[tuple[str, str, Any]] = []
+    if subject.lights > DRAWN and not values["light_samples"]:
+        dials += [(name, "light_samples", DRAWN) for name in summed]
+    dials += [(name, "map_resolution", 2 * (values["map_resolution"] or subject.texels(name))) for name in methods
               if "map_resolution" in REGISTRY[name].dials]
-    if own["map_components"] == 1 and own["map_source"] == "field":
-        found += [(name, "map_components", 2) for name in methods if "map_components" in REGISTRY[name].dials]
-    found.append(("raymarch", "samples", min(2 * own["samples"], 8192)))
-    if own["bounces"] == "auto" and not 0 <= own["max_depth"] <= 2:
-        found += [(name, "bounces", "paths") for name in methods if REGISTRY[name].automatic]
-    if subject.environment and not own["light_samples"]:
-        cells = own["environment_lights"]
-        found += [(name, "environment_lights", min(4 * cells, 65536) if name in summed else max(cells // 4, 1))
+    if values["map_components"] == 1 and values["map_source"] == "field":
+        dials += [(name, "map_components", 2) for name in methods if "map_components" in REGISTRY[name].dials]
+    dials.append(("raymarch", "samples", min(2 * values["samples"], 8192)))
+    if values["bounces"] == "auto" and not 0 <= values["max_depth"] <= 2:
+        dials += [(name, "bounces", "paths") for name in methods if REGISTRY[name].automatic]
+    if subject.environment and not values["light_samples"]:
+        cells = values["environment_lights"]
+        dials += [(name, "environment_lights", min(4 * cells, 65536) if name in summed else max(cells // 4, 1))
                   for name in methods]
-    return [Way(name, ((dial, value),)) for name, dial, value in found]
+    return [Way(name, ((dial, value),)) for name, dial, value in dials]
