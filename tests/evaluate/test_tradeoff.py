@@ -173,6 +173,19 @@ def test_another_scene_or_budget_begins_anew(folder, done, tmp_path, monkeypatch
     assert list(kept.State(out, {"budget": 1}).lines) == ["key"]
 
 
+@pytest.mark.parametrize("lost", [False, True])
+def test_what_begins_anew_renders_its_own_reference(folder, done, tmp_path, lost):
+    """Pictures of the earlier study lie there, perhaps without the file that says what they are of."""
+    out = tmp_path / "out"
+    shutil.copytree(done, out)
+    if lost:
+        (out / kept.NAME).unlink()
+    result = study.tradeoff(folder / "one.xml", out, {"res": "16"}, 1.0, quiet=True)
+    assert result["finished"] and result["size"] == (16, 16)
+    with np.load(out / kept.PICTURES / "reference.npz") as file:
+        assert file["image"].shape == (16, 16, 3)
+
+
 def interrupting(monkeypatch, method: str):
     """Ctrl-C in the first render by a method, as Mitsuba hands it on."""
     once, calls = measure.once, []

@@ -102,7 +102,7 @@ class Study:
         shrink = lines["picture"]["shrink"]
         width, height = subject.pixels(shrink)
         render = references.renderer(subject, references.marched(subject), shrink)
-        if not self.state.pictures("reference"):
+        if "reference" not in lines or not self.state.pictures("reference"):
             made, rate = references.converge(render, width * height, max(share - self.spent, 0.0), self.tell)
             self.state.keep("reference", {"image": made.image})
             self._add("reference", {"variance": made.variance, "noise": made.noise, "about": made.about,
