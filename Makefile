@@ -8,7 +8,7 @@ setup:
 	@$(PYTHON) tools/setup_env.py
 
 demo:
-	@$(PYTHON) tools/setup_env.py eval
+	@$(PYTHON) tools/setup_env.py eval mesh
 	@$(RUN) -m mi_ntf.evaluate.demo
 
 # Two workers: tracing in Python is serial, and Dr.Jit's own threads fill what is left.

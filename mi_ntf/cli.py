@@ -266,7 +266,7 @@ class Bench:
 
 @dataclass
 class Tradeoff:
-    """Show what accuracy costs on a scene: seconds, memory and error of every method and its dials, as a page."""
+    """Show what accuracy costs on a scene: the error of every method over seconds, as a page of curves."""
 
     scene: Positional[Path]
     """Scene with an nrf medium and integrator."""
@@ -277,24 +277,23 @@ class Tradeoff:
     )
     """Value of $KEY in the scene."""
     budget: str = "5m"
-    """How long the study may take: 90s, 5m, 1h."""
+    """Time that the study may take: 90s, 5m, 1h."""
     reference: Annotated[Path | None, arg(metavar="FILE")] = None
     """The path-traced mesh, an EXR picture or the XML file of its scene; shipped scenes have theirs."""
-    workers: Shared = field(default_factory=Workers)
     json: bool = False
     """Print JSON in place of a table, and no progress."""
 
     def run(self) -> None:
-        _fitting(self.workers)
         parameters = _definitions(self.define)
+        from mi_ntf.evaluate.budget import seconds
         from mi_ntf.evaluate.tradeoff import study
 
         try:
-            seconds = study.seconds(self.budget)
+            budget = seconds(self.budget)
         except ValueError as error:
             raise UsageError(str(error)) from None
-        _report(study.tradeoff(self.scene, self.output, parameters, seconds, self.reference, self.json,
-                               workers=self.workers), self.json, study.print_table)
+        _report(study.tradeoff(self.scene, self.output, parameters, budget, self.reference, self.json),
+                self.json, study.print_table)
 
 
 @dataclass

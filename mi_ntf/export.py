@@ -14,6 +14,7 @@ attribute of its name) and Mitsuba's plugin `ply`, which has no place for single
 """
 
 import importlib.util
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -29,13 +30,34 @@ from mi_ntf.infer.surface import RESOLUTIONS, Surface, surface
 SUFFIXES = (".ply", ".obj", ".glb", ".stl")
 """OBJ and GLB have colours, STL the shape alone."""
 
+_SHAPE = """<shape type="ply">
+    <string name="filename" value="{file}"/>
+    <transform name="to_world"><matrix value="{place}"/></transform>
+    <bsdf type="twosided">
+        <bsdf type="blendbsdf">
+            <float name="weight" value="{specular:.4g}"/>
+            <bsdf type="diffuse">
+                <texture type="mesh_attribute" name="reflectance">
+                    <string name="name" value="vertex_albedo_color"/>
+                </texture>
+            </bsdf>
+            <bsdf type="roughconductor">
+                <string name="material" value="none"/>
+                <string name="distribution" value="ggx"/>
+                <float name="alpha" value="{alpha:.4g}"/>
+            </bsdf>
+        </bsdf>
+    </bsdf>
+</shape>
+"""
+
 
 def export(field: Path, output: Path, resolution: int = 256, level: float | None = None) -> dict[str, Any]:
     """Write the surface of a field file as a mesh, whose kind is that of `output`'s suffix.
 
     `resolution`: voxels per side of the field's unit sphere; `level`: density of the surface, 1/(unit-sphere radius),
     found where None (:func:`mi_ntf.infer.surface.surface`). Returns ``file``, ``vertices``, ``faces``, ``level``,
-    ``size``: its sides in scene units. Raises MiNtfError.
+    ``size``: its sides in scene units, and the means of ``roughness`` and ``specular``. Raises MiNtfError.
     """
     field, output = Path(field), Path(output)
     if output.suffix.lower() not in SUFFIXES:
@@ -52,7 +74,25 @@ def export(field: Path, output: Path, resolution: int = 256, level: float | None
     vertices = found.vertices * header.similarity.radius + np.array(header.similarity.center)
     files.write(output, _encoded(found, vertices, output.suffix.lower()))
     return {"file": str(output), "vertices": len(vertices), "faces": len(found.faces), "level": found.level,
-            "size": np.ptp(vertices, axis=0).round(6).tolist()}
+            "size": np.ptp(vertices, axis=0).round(6).tolist(),
+            "roughness": float(found.roughness.mean()), "specular": float(found.specular.mean())}
+
+
+def mitsuba_shape(mesh: Path, made: dict[str, Any], to_world: np.ndarray) -> str:
+    """Return the ``<shape>`` of a PLY file for Mitsuba's stock integrators.
+
+    Parameters
+    ----------
+    mesh
+        The file as the XML names it.
+    made
+        What :func:`export` returned for it; roughness and specular weight are the same all over the mesh, since the
+        plugin ``ply`` has no place for single numbers.
+    to_world
+        (4, 4) matrix from the capture's coordinates to the scene's.
+    """
+    return _SHAPE.format(file=escape(str(mesh)), place=" ".join(f"{value:.9g}" for value in to_world.ravel()),
+                         specular=made["specular"], alpha=made["roughness"] ** 2)
 
 
 def _libraries() -> None:

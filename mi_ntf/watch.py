@@ -6,20 +6,17 @@ do not come from network file systems, where clusters keep theirs.
 The protocol of tev, the viewer of https://github.com/Tom94/tev, is spoken by its author's package `tevclient`.
 """
 
-import signal
 import socket
 import sys
-import threading
 import time
 import traceback
 from collections.abc import Callable
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mi_ntf.core import errors
+from mi_ntf.core import errors, interruption
 from mi_ntf.core.errors import MiNtfError
 
 INTERVAL = 0.2
@@ -39,7 +36,7 @@ def watch(render: Callable[[Callable[[Path], None]], None], say: Callable[[str],
     change, of the files of the last round that ended well, too.
     """
     files: Stamps = {}
-    with _stop_key() as stopped:
+    with interruption.noticed() as stopped:
         while not stopped.is_set():
             fresh: Stamps = {}
             begun = time.perf_counter()
@@ -80,22 +77,6 @@ def _stamp(path: Path) -> tuple | None:
     except OSError:
         return None
     return stat.st_mtime_ns, stat.st_size, stat.st_ino
-
-
-@contextmanager
-def _stop_key():
-    """Ctrl-C raises KeyboardInterrupt as always, and sets the event that this gives."""
-    stopped = threading.Event()
-
-    def stop(_number, _frame):
-        stopped.set()
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGINT, stop)
-    try:
-        yield stopped
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 class Tev:

@@ -10,7 +10,6 @@ from helpers.programs import run_on_one_core, run_program
 
 from mi_ntf import cli, doctor
 from mi_ntf.core.errors import MiNtfError
-from mi_ntf.evaluate.tradeoff.study import seconds
 from mi_ntf.jobs import Workers
 
 
@@ -40,7 +39,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list:
              print_table=lambda values: print("table", values["psnr"]))
     stand_in("mi_ntf.core.field_file", describe=note(table))
     stand_in("mi_ntf.evaluate.tradeoff", study=types.SimpleNamespace(
-        seconds=seconds, tradeoff=note(table), print_table=lambda values: print("table", values["psnr"])))
+        tradeoff=note(table), print_table=lambda values: print("table", values["psnr"])))
     return seen
 
 
@@ -112,11 +111,8 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list:
         ("compare a.exr b.exr -o c.png", (Path("a.exr"), Path("b.exr"), Path("c.png")), {}),
         ("explain s.xml -D spp=4 -D light=env", (Path("s.xml"), {"spp": "4", "light": "env"}, False), {}),
         ("explain s.xml --measure", (Path("s.xml"), {}, True), {}),
-        ("tradeoff s.xml -D a=4 --budget 2m", (Path("s.xml"), Path("tradeoff"), {"a": "4"}, 120.0, None, False),
-         {"workers": Workers()}),
-        ("tradeoff s.xml -o d --reference m.xml --engine dask --scheduler tcp://a:8786 --threads 2",
-         (Path("s.xml"), Path("d"), {}, 300.0, Path("m.xml"), False),
-         {"workers": Workers("dask", None, 2, "tcp://a:8786")}),
+        ("tradeoff s.xml -D a=4 --budget 2m", (Path("s.xml"), Path("tradeoff"), {"a": "4"}, 120.0, None, False), {}),
+        ("tradeoff s.xml -o d --reference m.xml", (Path("s.xml"), Path("d"), {}, 300.0, Path("m.xml"), False), {}),
         ("info f.safetensors", (Path("f.safetensors"),), {}),
     ],
 )

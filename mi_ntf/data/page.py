@@ -15,6 +15,7 @@ Every text is escaped. Arrays are (H, W, 3) RGB, linear light as floats or sRGB 
 
 import base64
 import io
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from pathlib import Path
@@ -36,7 +37,8 @@ _STYLE = """
 @media (prefers-color-scheme: dark) { :root { --page: #17181a; --ink: #dedede; --warn: #45330f; } }
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em;
        background: var(--page); color: var(--ink); }
-h1 { font-size: 1.6em; } h2 { font-size: 1.2em; margin-top: 2em; border-bottom: 1px solid #8886; }
+h1 { font-size: 1.6em; overflow-wrap: anywhere; }
+h2 { font-size: 1.2em; margin-top: 2em; border-bottom: 1px solid #8886; }
 p.warning { background: var(--warn); border-left: 4px solid #e39b1a; padding: .4em .8em; }
 table { border-collapse: collapse; margin: 1em 0; }
 td, th { padding: .15em .8em .15em 0; text-align: left; border-bottom: 1px solid #8883; vertical-align: top;
@@ -44,8 +46,17 @@ td, th { padding: .15em .8em .15em 0; text-align: left; border-bottom: 1px solid
 .row { display: flex; flex-wrap: wrap; gap: 10px; }
 figure { margin: 0 0 .5em; } figcaption { font-size: .85em; opacity: .8; overflow-wrap: anywhere; }
 img { display: block; max-width: 100%; height: auto; } img.small { image-rendering: pixelated; }
-summary { cursor: pointer; }
+summary { cursor: pointer; } .wide { overflow-x: auto; }
+pre { overflow-x: auto; background: #8882; padding: .5em; margin: .2em 0; } button { font: inherit; font-size: .85em; }
 """
+_COPY = """<script>
+for (const button of document.querySelectorAll("button.copy")) button.addEventListener("click", () => {
+  const text = button.parentElement.nextElementSibling, all = document.createRange();
+  all.selectNodeContents(text);
+  getSelection().removeAllRanges(); getSelection().addRange(all);
+  button.textContent = document.execCommand("copy") ? "Copied" : "Press Ctrl+C";
+});
+</script>"""
 
 
 class Page:
@@ -75,14 +86,14 @@ class Page:
         lines += ["".join(f"<th>{escape(str(cell))}</th>" for cell in header)]
         lines += ["".join(f"<td>{escape(str(cell))}</td>" for cell in row) for row in rows]
         table = "<table>" + "".join(f"<tr>{line}</tr>\n" for line in lines) + "</table>"
-        self._parts.append(f"<details><summary>{escape(folded)}</summary>{table}</details>" if folded else table)
+        self.scrolling(f"<details><summary>{escape(folded)}</summary>{table}</details>" if folded else table, "table")
 
     def pictures(self, pictures: Iterable[tuple[str, np.ndarray]], width: int = 240) -> None:
         """A row of pictures (caption, (H, W, 3)), each shown `width` CSS pixels wide."""
         self._parts.append('<div class="row">')
         for caption, array in pictures:
             small = ' class="small"' if array.shape[1] < width else ""
-            self._image(encode(array), caption, f'{small} width="{width}"')
+            self._image(encode(array), caption, f'{small} width="{width}"', f' style="max-width: {max(width, 150)}px"')
         self._parts.append("</div>")
 
     def figure(self, figure, caption: str = "", vector: bool = False) -> None:
@@ -116,23 +127,49 @@ class Page:
             axes.legend(frameon=False, labelcolor=GREY)
         self.figure(figure)
 
+    def drawing(self, figure, label: str, width: int) -> None:
+        """Add a `matplotlib.figure.Figure` as part of the page, whose text can be read aloud and copied: as wide as the
+        page, but `width` CSS pixels at least. `label` says what it shows."""
+        import matplotlib
+
+        buffer = io.StringIO()
+        with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "mi_ntf", "font.family": "sans-serif"}):
+            figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
+        text = re.sub(r"<metadata>.*?</metadata>", "", buffer.getvalue(), flags=re.S)
+        head, _, body = text[text.index("<svg"):].partition(">")
+        head = re.sub(r'\s(xmlns(:\w+)?|width|height)="[^"]*"', "", head)
+        head += f' role="img" aria-label="{escape(label)}" style="min-width: {width}px; width: 100%; height: auto"'
+        self.scrolling(f"{head}>{body}".replace("xlink:href", "href"), label)
+
+    def scrolling(self, html: str, label: str) -> None:
+        """Add HTML that may be wider than a phone: it scrolls by itself, by keyboard as well. `label` is for those who
+        hear the page."""
+        self._parts.append(f'<div class="wide" tabindex="0" role="region" aria-label="{escape(label)}">{html}</div>')
+
+    @staticmethod
+    def code(text: str, caption: str) -> str:
+        """Return the HTML of a text to copy under a caption, with a button that copies it."""
+        return (f'<p>{escape(caption)} <button type="button" class="copy">Copy</button></p>'
+                f"<pre>{escape(text.strip())}</pre>")
+
     def markup(self, html: str) -> None:
         """HTML as it is, not escaped: the caller's own, that loads nothing."""
         self._parts.append(html)
 
     def html(self) -> str:
         """The page so far."""
+        script = [_COPY] if any('class="copy"' in part for part in self._parts) else []
         return ('<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">\n'
                 f'<meta name="viewport" content="width=device-width">\n<title>{escape(self._title)}</title>\n'
-                f"<style>{_STYLE}</style></head>\n<body>\n" + "\n".join(self._parts) + "\n</body></html>\n")
+                f"<style>{_STYLE}</style></head>\n<body>\n" + "\n".join([*self._parts, *script]) + "\n</body></html>\n")
 
     def write(self, path: Path) -> None:
         """Write the page to `path`, whole or not at all. Raises MiNtfError."""
         files.write(path, self.html())
 
-    def _image(self, uri: str, caption: str, attributes: str) -> None:
+    def _image(self, uri: str, caption: str, attributes: str, frame: str = "") -> None:
         caption = escape(caption)
-        self._parts.append(f'<figure><img src="{uri}" alt="{caption}"{attributes}>'
+        self._parts.append(f'<figure{frame}><img src="{uri}" alt="{caption}"{attributes}>'
                            f"<figcaption>{caption}</figcaption></figure>")
 
 

@@ -79,13 +79,13 @@ def study(command: list[str], scene: Path, out: Path, budget: str, size: int, sp
 
     It begins anew: seconds that an earlier study measured in `out` are not those of this run.
 
-    Returns what ``tradeoff.json`` holds. Raises MiNtfError where the study fails, or every point of it.
+    Returns what ``tradeoff.json`` holds. Raises MiNtfError where the study fails, or every way of it.
     """
-    from .tradeoff import reading, state
+    from .kept import NAME
 
-    if state.forget(out):
+    if (out / NAME).is_file():
         print(f"{out}: what an earlier study measured there is dropped, the demo measures anew", file=sys.stderr)
-    for name in REPORT:
+    for name in (NAME, *REPORT):
         (out / name).unlink(missing_ok=True)
     defines = [w for d in ("light=env", f"res={size}", f"spp={spp}") for w in ("-D", d)]
     words = [*command, "tradeoff", str(scene), *defines, "--budget", budget, "-o", str(out)]
@@ -97,15 +97,15 @@ def study(command: list[str], scene: Path, out: Path, budget: str, size: int, sp
     if done.returncode or not path.is_file():
         raise MiNtfError(f"{' '.join(words)}\nfailed with exit code {done.returncode}; what it said stands above")
     found = json.loads(path.read_text(encoding="utf-8"))
-    rows = found["points"]
-    if rows and not reading.measured(rows):
-        raise MiNtfError(f"every point of the study failed, the first one since {rows[0]['reason']}; see {out}")
+    rows = found["ways"]
+    if rows and not any(row["points"] for row in rows):
+        raise MiNtfError(f"every way of the study failed, the first one since {rows[0]['reason']}; see {out}")
     return found
 
 
 def seconds_of(budget: str) -> float:
     """The seconds of a budget such as 90s or 5m. Raises MiNtfError."""
-    from .tradeoff.study import seconds
+    from .budget import seconds
 
     return seconds(budget)
 
@@ -143,7 +143,7 @@ def demo(out: Path = Path("out/demo"), scene: str = "statue", size: int = 256, s
         found = study([sys.executable, "-m", "mi_ntf"], folder / "scene.xml", out / "tradeoff", budget, size,
                       environment_spp)
     except MiNtfError as error:
-        raise MiNtfError(f"the study failed; table and picture of the renders are in {out}, without its curve\n{error}"
+        raise MiNtfError(f"the study failed; table and picture of the renders are in {out}, without its curves\n{error}"
                          ) from None
     picture(path, shots, references, measured, found)
     console.print(f"picture, now with the study: {path}\nstudy: {out / 'tradeoff' / 'index.html'}", soft_wrap=True)

@@ -12,13 +12,14 @@ from mi_ntf.core import files
 from mi_ntf.core.errors import MiNtfError
 
 from .compare import compare_arrays
+from .curves import draw
 from .metrics import relative_rmse, srgb
 
 LIGHTS = {"point": "point light", "env": "environment map"}
 ERROR_SCALE = 0.5
 """Upper end of the error maps, in units of the reference's RMS."""
 CURVE_HEIGHT = 4.8
-"""Inches of the study's curve, where a picture is 3.1 wide."""
+"""Inches of the study's curves, where a picture is 3.1 wide."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ def table(measured: list[dict], note: str) -> str:
 def picture(path: Path, shots: list[Shot], references: dict[str, np.ndarray], measured: list[dict],
             study: dict | None = None) -> None:
     """Draw, per light, the reference and the shots side by side and beneath them the error maps |a − b|/RMS(b); below
-    all of it the curve of `study`, what ``tradeoff.json`` holds."""
+    all of it the curves of `study`, what ``tradeoff.json`` holds."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
@@ -83,25 +84,26 @@ def picture(path: Path, shots: list[Shot], references: dict[str, np.ndarray], me
         scale = ScalarMappable(Normalize(0, ERROR_SCALE), "inferno")
         upper.colorbar(scale, cax=bottom[0].inset_axes([0.7, 0.1, 0.06, 0.8]), label="error / RMS of the reference")
     if study:
-        pareto(found[1], study)
+        curves(found[1], study)
     with files.replacing(path) as temporary:
         figure.savefig(temporary, format="png", dpi=110)
 
 
-def pareto(part, study: dict) -> None:
-    """Draw the curve of `study` onto an empty `part` of a matplotlib figure, under a title that says what it is of."""
-    from .tradeoff import figures, reading
+def curves(part, study: dict) -> None:
+    """Draw the curves of `study` onto an empty `part` of a matplotlib figure, under a title that says what they are of.
+    """
+    from .tradeoff.report import unsteady
 
     axes = part.subplots()
-    rows = reading.measured(study["points"])
-    if rows:
-        figures.panel(axes, study, environment=True)
+    count, (width, height) = sum(bool(row["points"]) for row in study["ways"]), study["size"]
+    if count:
+        draw(axes, study)
     else:
         axes.set_axis_off()
-        axes.text(0.5, 0.5, "no point was measured: a larger --budget measures some", ha="center", fontsize=11)
-    warning = reading.busy(rows, os.cpu_count() or 1).partition(":")[0]
-    axes.set_title(f"{LIGHTS['env']}: what accuracy costs, {len(rows)} ways measured within "
-                   f"{study['budget_seconds']:g} s{warning and '. ' + warning}", fontsize=11)
+        axes.text(0.5, 0.5, "no way was measured: a larger --budget measures some", ha="center", fontsize=11)
+    noisy = ". The machine was noisy" if unsteady(study) else ""
+    axes.set_title(f"{LIGHTS['env']}: what accuracy costs, {count} ways to render {width}×{height} pixels, held "
+                   f"against the converged field{noisy}", fontsize=11)
 
 
 def report(out: Path, shots: list[Shot], references: dict[str, np.ndarray], note: str) -> tuple[str, list[dict]]:

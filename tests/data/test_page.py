@@ -107,3 +107,24 @@ def test_written_whole_or_not_at_all(tmp_path, monkeypatch):
         with pytest.raises(MiNtfError, match=r"page.html \(No space left"):
             Page("other").write(path)
     assert path.read_text(encoding="utf-8") == before and list(tmp_path.iterdir()) == [path]
+
+
+def test_what_is_wide_scrolls_by_itself_and_by_keyboard():
+    page = Page("p")
+    page.table(["a"], [["b"]])
+    figure = new_figure(4, 2)
+    figure.add_subplot().plot([0, 1], [0, 1])
+    page.drawing(figure, "a line, rising", 700)
+    html = page.html()
+    assert html.count('<div class="wide" tabindex="0" role="region" aria-label="') == 2
+    assert '<svg' in html and 'style="min-width: 700px' in html and 'aria-label="a line, rising"' in html
+    assert "http" not in html and "<script" not in html  # nothing of another place, and no script without a button
+
+
+def test_texts_to_copy_have_a_button_and_one_script():
+    page = Page("p")
+    for text in ("<a/>\n", "mi-ntf"):
+        page.markup(Page.code(text, "Paste & go:"))
+    html = page.html()
+    assert "<pre>&lt;a/&gt;</pre>" in html and "Paste &amp; go:" in html
+    assert html.count('<button type="button" class="copy">') == 2 and html.count("<script>") == 1

@@ -13,8 +13,7 @@ from skimage import io
 
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.evaluate import demo, demo_report
-from mi_ntf.evaluate.tradeoff import reading
-from mi_ntf.evaluate.tradeoff.points import Point
+from mi_ntf.evaluate.curves import COLOURS
 
 FAKE = """
 import os, sys, numpy as np, OpenEXR
@@ -108,52 +107,50 @@ def test_report_refuses_a_reference_of_another_size(tmp_path):
         demo.report(tmp_path, shots, references, "")
 
 
-def _found(*points):
-    """A study's result of `points`: method, samples a pixel, drawn lights, seconds, error."""
-    rows = [{"label": method, "build": 0.5, "render": seconds - 0.5, "noise": error, "bias": 0.0, "uncertainty": 1e-8,
-             "error": error, "reason": "", "load": 1.0, "point": Point(method, spp, 6, light_samples=lights).as_dict()}
-            for method, spp, lights, seconds, error in points]
-    reading.mark_front(rows)
-    return {"points": rows, "base": Point("auto", 4, 6).as_dict(), "size": [64, 64], "budget_seconds": 120.0}
+def _found(**curves):
+    """A study's result: the methods and their points (seconds, error)."""
+    rows = [{"method": method, "title": method.replace("_", " "), "finer": False, "reason": "",
+             "points": [{"seconds": x, "error": y, "error_uncertainty": y / 20, "front": method != "volpath"}
+                        for x, y in points]} for method, points in curves.items()]
+    return {"ways": rows, "size": [64, 64], "machine": {"spread": 0.2, "probe_seconds": [1, 2]}}
 
 
-def test_the_picture_gains_the_curve(tmp_path):
-    """Below what it showed before; words for the points of the front, marks for all."""
+def test_the_picture_gains_the_curves(tmp_path):
+    """Below what it showed before: one curve a method, in the method's colour, and its name beside."""
+    from matplotlib.colors import to_hex
     from matplotlib.figure import Figure
-    from matplotlib.text import Text
 
     shots, references = _shots()
     _, measured = demo.report(tmp_path, shots, references, "")
     before = io.imread(tmp_path / "comparison.png")
-    study = _found(("transmittance_atlas", 4, 0, 2.0, 0.1), ("raymarch", 1, 16, 4.0, 0.3), ("volpath", 1, 0, 1.0, 0.9),
-                   ("ray_network", 16, 1, 2.1, 0.099))
+    study = _found(transmittance_atlas=[(2.0, 0.1), (4.0, 0.05)], raymarch=[(4.0, 0.3)], none=[(0.1, 0.3), (1.0, 0.2)],
+                   volpath=[(1.0, 0.9), (9.0, 0.4)])
     demo.picture(tmp_path / "comparison.png", shots, references, measured, study)
     after = io.imread(tmp_path / "comparison.png")
     added = after.shape[0] - before.shape[0]
     assert added == pytest.approx(110 * demo_report.CURVE_HEIGHT, abs=2) and after.shape[1] == before.shape[1]
     assert after[-added:, :, :3].std() > 20 and np.abs(after[:-added] - before.astype(float)).mean() < 12
     part = Figure(figsize=(12.4, 4.8), layout="constrained")
-    demo_report.pareto(part, study)
+    demo_report.curves(part, study)
     axes = part.axes[0]
-    assert axes.get_title() == "environment map: what accuracy costs, 4 ways measured within 120 s"
-    words = ["volpath, 1 spp", "atlas, 512 lights, 4 spp", "ray network, 1 drawn light, 16 spp"]
-    assert [text.get_text() for text in axes.texts] == words
+    assert axes.get_title() == ("environment map: what accuracy costs, 4 ways to render 64×64 pixels, held against the "
+                                "converged field. The machine was noisy")
+    lines = {line.get_label(): line for line in axes.lines}
+    assert set(lines) == {"Pareto front", "transmittance atlas", "raymarch", "none (a bound)", "volpath"}
+    for name in ("transmittance_atlas", "raymarch", "volpath"):
+        assert to_hex(lines[name.replace("_", " ")].get_color()) == COLOURS[name]
+    assert lines["none (a bound)"].get_linestyle() == "--" and lines["raymarch"].get_linestyle() == "-"
     part.draw_without_rendering()
-    boxes = [Text.get_window_extent(text) for text in axes.texts]  # without the lines that lead to the points
-    points = axes.transData.transform([(1.0, 0.9), (2.0, 0.1), (2.1, 0.099)])
-    for box, (x, y) in zip(boxes, points, strict=True):  # to the left, below, within the axes
-        assert box.x1 < x and (box.y0 + box.y1) / 2 < y
-        assert axes.bbox.x0 <= box.x0 and axes.bbox.y0 <= box.y0
-    assert not boxes[1].overlaps(boxes[2])
-    assert {"volpath", "raymarch", "transmittance_atlas", "ray_network"} < set(axes.get_legend_handles_labels()[1])
+    box, legend = axes.get_window_extent(), axes.get_legend().get_window_extent()
+    assert legend.x0 >= box.x1 and legend.x1 <= part.bbox.x1 and legend.y0 >= part.bbox.y0  # beside, within the figure
 
 
-def test_a_study_without_a_point_says_so_in_the_picture():
+def test_a_study_without_a_way_says_so_in_the_picture():
     from matplotlib.figure import Figure
 
     part = Figure()
-    demo_report.pareto(part, _found())
-    assert part.axes[0].texts[0].get_text() == "no point was measured: a larger --budget measures some"
+    demo_report.curves(part, _found())
+    assert part.axes[0].texts[0].get_text() == "no way was measured: a larger --budget measures some"
 
 
 def test_a_failing_study_leaves_table_and_picture(tmp_path, monkeypatch, capsys):
@@ -169,7 +166,7 @@ def test_a_failing_study_leaves_table_and_picture(tmp_path, monkeypatch, capsys)
     assert demo.main() == 1
     printed = capsys.readouterr()
     assert "demo: the study failed; table and picture of the renders are in" in printed.err
-    assert printed.err.endswith("without its curve\nno light\n")
+    assert printed.err.endswith("without its curves\nno light\n")
     assert "| point light | `raymarch` | 1.0 |" in printed.out
     assert sorted(p.name for p in tmp_path.iterdir()) == ["comparison.png", "metrics.json", "table.md"]
 
@@ -249,7 +246,9 @@ def test_the_demo_on_few_pixels(tmp_path):
     assert "reference:" in done.stderr and str(out / "tradeoff" / "index.html") in done.stdout
     result = json.loads((out / "tradeoff" / "tradeoff.json").read_text())
     assert result["parameters"] == {"light": "env", "res": "32", "spp": "4"} and result["budget_seconds"] == 5
-    assert result["scene_size"] == [32, 32] and "mesh" in result["references"]
+    assert result["scene_size"] == [32, 32] and "reference_env.exr" in result["mesh"]
+    shown = {row["method"] for row in result["ways"] if row["points"]}
+    assert {*demo.VISIBILITIES, "transmittance_atlas", "volpath", "mesh"} <= shown
 
 
 @pytest.mark.slow
@@ -259,7 +258,8 @@ def test_make_demo():
     assert done.returncode == 0, done.stdout + done.stderr
     check_demo(ROOT / "out" / "demo", 0.9, 0.25, 0.07)
     result = json.loads((ROOT / "out" / "demo" / "tradeoff" / "tradeoff.json").read_text())
-    assert result["finished"] and len(reading.measured(result["points"])) >= 6
+    curves = {row["method"] for row in result["ways"] if len(row["points"]) > 1}
+    assert result["finished"] and len(curves) >= 6 and {*demo.VISIBILITIES, "transmittance_atlas"} <= curves
 
 
 @pytest.mark.parametrize("size", [8, 100, 512])

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from mi_ntf.core.errors import MiNtfError
-from mi_ntf.evaluate import demo
-from mi_ntf.evaluate.tradeoff import state
+from mi_ntf.evaluate import demo, kept
 
 STUDY = """
 import json, os, sys
@@ -34,13 +33,12 @@ def _study(tmp_path, monkeypatch, result):
 
 
 def test_a_study_takes_up_nothing_that_an_earlier_one_left(tmp_path, monkeypatch, capsys):
-    (tmp_path / state.IMAGES).mkdir()
-    for name in (state.NAME, f"{state.IMAGES}/reference.npy", *demo.REPORT, "notes.txt"):
+    for name in (kept.NAME, *demo.REPORT, "notes.txt"):
         (tmp_path / name).write_text("of yesterday")
-    found = _study(tmp_path, monkeypatch, {"points": []})
-    assert found == {"points": [], "left": ["notes.txt"]}
+    found = _study(tmp_path, monkeypatch, {"ways": []})
+    assert found == {"ways": [], "left": ["notes.txt"]}
     assert f"{tmp_path}: what an earlier study measured there is dropped" in capsys.readouterr().err
-    assert _study(tmp_path, monkeypatch, {"points": []})["left"] == ["notes.txt"]
+    assert _study(tmp_path, monkeypatch, {"ways": []})["left"] == ["notes.txt"]
     assert capsys.readouterr().err == ""  # nothing was dropped
 
 
@@ -48,5 +46,6 @@ def test_a_study_that_fails_or_measures_failures_alone_is_an_error(tmp_path, mon
     (tmp_path / "tradeoff.json").write_text("{}")
     with pytest.raises(MiNtfError, match=r"(?s)tradeoff scene\.xml.*failed with exit code 1; what it said stands"):
         _study(tmp_path, monkeypatch, None)
-    with pytest.raises(MiNtfError, match="every point of the study failed, the first one since no light"):
-        _study(tmp_path, monkeypatch, {"points": [{"reason": "no light"}, {"reason": "no time"}]})
+    with pytest.raises(MiNtfError, match="every way of the study failed, the first one since no light"):
+        _study(tmp_path, monkeypatch, {"ways": [{"reason": "no light", "points": []},
+                                                {"reason": "no time", "points": []}]})

@@ -1,95 +1,76 @@
-"""`mi-ntf tradeoff` as a whole, on a tiny scene: its report, what is on the disk, resumption, failures."""
+"""`mi-ntf tradeoff` as a whole, on small scenes: its report, what is on the disk, resumption, Ctrl-C, failures."""
 
 import csv
 import json
+import os
 import re
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
 from html.parser import HTMLParser
 
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers import fields, scenes
+from evaluate import small_study
 from helpers.variants import VARIANT
 
 from mi_ntf import cli
-from mi_ntf.core import field_file
 from mi_ntf.core.errors import MiNtfError
-from mi_ntf.evaluate.tradeoff import reading, references, report, search, state, study
-from mi_ntf.evaluate.tradeoff.points import Point
-from mi_ntf.evaluate.tradeoff.subject import Picture, Subject
-from mi_ntf.jobs import Workers
+from mi_ntf.evaluate import kept
+from mi_ntf.evaluate.tradeoff import measure, report, study, ways
+from mi_ntf.infer.visibility import REGISTRY
 
-SCENE = """<scene version="3.9.0">
-    <default name="res" value="32"/>
-    <default name="light" value="point"/>
-    <integrator type="nrf"><integer name="samples" value="48"/><integer name="map_resolution" value="32"/>
-        <boolean name="hide_emitters" value="true"/></integrator>
-    <sensor type="perspective">
-        <float name="fov" value="28"/>
-        <transform name="to_world"><lookat origin="1.6, 1.3, 5.3" target="0.4, -0.2, 0.3" up="0, 1, 0"/></transform>
-        <sampler type="independent"><integer name="sample_count" value="4"/></sampler>
-        <film type="hdrfilm"><integer name="width" value="$res"/><integer name="height" value="$res"/>
-            <rfilter type="box"/></film>
-    </sensor>
-    <emitter type="$light"><point name="position" x="3.4" y="3" z="2.5"/><rgb name="intensity" value="60, 50, 40"/>
-    </emitter>
-    <shape type="sphere">
-        <point name="center" x="0.4" y="-0.2" z="0.3"/><float name="radius" value="1.5"/>
-        <bsdf type="null"/>
-        <medium type="nrf" name="interior"><string name="filename" value="ball.safetensors"/>
-            <integer name="resolution" value="48"/></medium>
-    </shape>
-</scene>
-"""
+ALL = [*REGISTRY, ways.STOCK]
+"""Methods that the scene ``many.xml`` is rendered by."""
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A scene file with its field; the user's cache beside it."""
-    folder = tmp_path_factory.mktemp("tradeoff")
-    (folder / "scene.xml").write_text(SCENE)
-    header, tensors = fields.blobs(scenes.CENTERS, scenes.RADII, similarity=scenes.SIMILARITY, log_density=3.0)
-    field_file.save(folder / "ball.safetensors", header, tensors, np.float32)
-    return folder
+    return small_study.write(tmp_path_factory.mktemp("tradeoff"))
 
 
 @pytest.fixture(autouse=True)
-def few(monkeypatch, folder):
-    """Two methods and small references; prices as built in."""
+def variant(monkeypatch, folder):
     mi.set_variant(VARIANT)
     monkeypatch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
-    registry = {name: study.REGISTRY[name] for name in ("raymarch", "none")}
-    monkeypatch.setattr(study, "REGISTRY", registry)
-    monkeypatch.setattr(references, "LARGEST_PASS", 1 << 14)
-    monkeypatch.setattr(references, "CROP", 8)
-    for name, share in (("REFERENCE", 0.02), ("CHECK", 0.02)):
-        monkeypatch.setattr(study, name, share)
-    propose = search.Search.next
-
-    def next_of_six(self, left):  # however busy the machine is
-        return propose(self, left) if len(self.results) < 6 else None
-
-    monkeypatch.setattr(search.Search, "next", next_of_six)
 
 
 @pytest.fixture(scope="module")
 def done(folder):
-    """One study; tests of what it leaves share it."""
+    """The study of two fields on a floor under three lights; tests of what it leaves share it."""
+    mi.set_variant(VARIANT)
+    study.tradeoff(folder / "many.xml", folder / "out", {}, 4.0, quiet=True)
     return folder / "out"
 
 
+@pytest.fixture
+def counted(monkeypatch):
+    """Renders so far: the integrators' methods."""
+    calls, once = [], measure.once
+
+    def count(scene, integrator, *rest):
+        calls.append(getattr(integrator, "visibility", "stock"))
+        return once(scene, integrator, *rest)
+
+    monkeypatch.setattr(measure, "once", count)
+    return calls
+
+
 class Outline(HTMLParser):
-    """Tags that are open, those that load something, and ids."""
+    """Tags that are open, those that load something, and texts."""
 
     def __init__(self):
         super().__init__()
-        self.open, self.loads, self.ids, self.texts = [], [], set(), []
+        self.open, self.loads, self.texts = [], [], []
 
     def handle_starttag(self, tag, attrs):
         if tag not in ("meta", "img", "br", "link"):
             self.open.append(tag)
         self.loads += [value for name, value in attrs if name in ("src", "href", "xlink:href", "action", "data")]
-        self.ids |= {value for name, value in attrs if name == "id"}
 
     def handle_startendtag(self, tag, attrs):
         self.handle_starttag(tag, attrs)
@@ -100,7 +81,8 @@ class Outline(HTMLParser):
         assert self.open.pop() == tag
 
     def handle_data(self, data):
-        self.texts.append(data)
+        if self.open and self.open[-1] not in ("style", "script"):
+            self.texts.append(data)
 
 
 def outline(text: str) -> Outline:
@@ -111,200 +93,279 @@ def outline(text: str) -> Outline:
     return found
 
 
-def test_the_command_from_end_to_end(folder, done, capsys):
-    assert cli.main(["tradeoff", str(folder / "scene.xml"), "-o", str(done), "--budget", "3m"]) == 0
-    printed = capsys.readouterr()
-    assert "on the front" in printed.out and "reference:" in printed.err
-    result = json.loads((done / "tradeoff.json").read_text())
-    rows = reading.measured(result["points"])
-    assert {"raymarch", "none"} <= {row["point"]["method"] for row in rows} and result["finished"]
-    reference, check = result["references"]["reference"], result["references"]["check"]
-    assert 0 < reference["noise"] < 0.1 and reference["spp"] >= 16 and "raymarch" in reference["about"]
-    assert abs(check["difference"]) < 5 * check["sigma"] and "stock volpath" in check["verdict"]
-    for row in rows:
-        assert row["render"] > 0 and row["first"] >= row["compile"] and row["peak"] > 1e5 and row["repeats"] >= 1
-        assert row["error"] == pytest.approx(np.hypot(row["noise"], row["bias"]))
-    unlit = next(r for r in rows if r["point"]["method"] == "none" and r["point"]["spp"] == 4)
-    marched = next(r for r in rows if r["point"]["method"] == "raymarch" and r["point"]["spp"] == 4)
-    assert unlit["bias"] > 0.05 > marched["bias"]  # the balls' shadows
+def result_of(out):
+    return json.loads((out / "tradeoff.json").read_text())
+
+
+def test_every_method_has_a_curve_on_two_fields_a_floor_and_three_lights(done):
+    result = result_of(done)
+    rows = {row["method"]: row for row in result["ways"] if not row["finer"]}
+    assert sorted(rows) == sorted(ALL) and result["finished"]
+    for row in rows.values():
+        assert row["points"] and not row["reason"], row
+        seconds, samples = ([p[name] for p in row["points"]] for name in ("seconds", "samples"))
+        assert seconds == sorted(seconds) and samples == sorted(set(samples)) and seconds[0] > 0
+    assert sum(len(row["points"]) > 1 for row in rows.values()) >= 6
+    end = rows["none"]["points"][-1]
+    assert end["bias"] - 3 * end["bias_uncertainty"] > 0.05  # the shadows on the floor
+    assert not any(p.get("front") for p in rows["none"]["points"])
+    assert any(p["front"] for row in rows.values() for p in row["points"] if row["method"] != "none")
+
+
+def test_the_table_for_programs_has_a_line_for_each_point(done):
+    rows = result_of(done)["ways"]
     with open(done / "tradeoff.csv", newline="") as file:
         table = list(csv.DictReader(file))
-    assert [float(t["error"]) for t in table if not t["reason"]] == [r["error"] for r in rows]
-    assert table[0]["total"] and table[0]["spp"] == str(result["points"][0]["point"]["spp"])
+    points = [(row["title"], point["error"]) for row in rows for point in row["points"]]
+    assert [(line["way"], float(line["error"])) for line in table] == points
+    assert table[0]["noise"] == "" and table[1]["samples"] == "2"
 
 
-def test_the_page_holds_all_it_shows(done):
+def test_the_page_is_whole_and_offline_and_in_plain_words(folder, done):
     text = (done / "index.html").read_text()
     found = outline(text)
     assert all(value.startswith(("data:image/", "#")) for value in found.loads), found.loads
     assert not re.search(r"https?://|@import|url\((?!#)", re.sub(r"data:image/[^\"]*", "", text))
-    result = json.loads((done / "tradeoff.json").read_text())
-    points = json.loads(re.search(r'id="points">(.*?)</script>', text, re.S)[1])
-    rows = reading.measured(result["points"])
-    assert set(points) == {str(row["number"]) for row in rows}
-    assert {f"p{row['number']}" for row in rows} <= found.ids  # the marks of the curve
-    assert all(p["image"].startswith("data:image/png") and len(p["lines"]) >= 4 for p in points.values())
     words = " ".join(found.texts)
-    assert all(part in words for part in (*result["reading"], result["machine"]["what"], "samples a pixel"))
-    assert len(text) < 5e6
+    assert "`" not in words and not any("volpath" in t and "shadows" in t for t in found.texts)
+    assert f"<h1>What accuracy costs: {folder.name}/many.xml</h1>" in text and f"<h1>{folder}" not in text
+    for row in result_of(done)["ways"]:
+        assert row["title"] in words and f"How to render by {row['title']}" in words and row["xml"].strip() in words
+    assert words.count('<integrator type="nrf">') == len(REGISTRY) and "stock volpath, after" in words
+    assert text.count('tabindex="0"') >= 2 and 'min-width: 760px' in text  # figure and table scroll by themselves
+    assert text.count('class="copy"') >= len(ALL) and "execCommand" in text and len(text) < 5e6
 
 
-def test_a_study_that_was_killed_goes_on(folder, done, monkeypatch):
-    """The last line is cut off; of what was found before nothing is measured again."""
-    path = done / state.NAME
-    lines = path.read_text().splitlines(keepends=True)
-    points = [i for i, line in enumerate(lines) if '"kind": "point"' in line]
-    kept = [json.loads(lines[i])["name"] for i in points[:-1]]
-    path.write_text("".join(lines[: points[-1]]) + lines[points[-1]][:40])
-    measured = []
-    monkeypatch.setattr(study, "measure", lambda subject, point, *rest: measured.append(point) or 1 / 0)
-    monkeypatch.setattr(references, "converge", lambda *a: 1 / 0)
-    spent = sum(json.loads(line).get("spent", 0.0) for line in lines)
-    result = study.tradeoff(folder / "scene.xml", done, {}, spent + 200, quiet=True)
-    names = [row["name"] for row in result["points"]]
-    assert set(kept) < set(names) and len(names) == len(set(names))
-    assert not {state.name_of(p.as_dict()) for p in measured} & set(kept)
-    failed = [row for row in result["points"] if row["reason"]]
-    assert failed and all("ZeroDivisionError" in row["reason"] for row in failed)
-    assert "ZeroDivisionError" in (done / "index.html").read_text()
+def test_a_finished_study_is_not_rendered_again(folder, done, counted, capsys):
+    before = result_of(done)
+    after = study.tradeoff(folder / "many.xml", done, {}, 4.0)
+    assert after["ways"] == before["ways"] and counted == []
+    assert "goes on; " in capsys.readouterr().err
 
 
-def test_another_scene_begins_anew(folder, done, monkeypatch, capsys):
-    monkeypatch.setattr(references, "choose_picture", lambda *a: (_ for _ in ()).throw(KeyboardInterrupt))
-    with pytest.raises(KeyboardInterrupt):
-        study.tradeoff(folder / "scene.xml", done, {"res": "24"}, 5.0)
-    assert "begun anew, what lay in" in capsys.readouterr().err
-    assert len((done / state.NAME).read_text().splitlines()) == 1
+def test_an_interrupted_study_renders_what_is_missing(folder, done, counted, tmp_path):
+    """Of a file that was cut off within the fifth way."""
+    out = tmp_path / "out"
+    shutil.copytree(done, out)
+    lines = (out / kept.NAME).read_text().splitlines(keepends=True)
+    at = [i for i, line in enumerate(lines) if line.startswith('{"name": "way ')]
+    names = [json.loads(lines[i])["values"]["method"] for i in at]
+    (out / kept.NAME).write_text("".join(lines[: at[4]]) + lines[at[4]][:50])
+    result = study.tradeoff(folder / "many.xml", out, {}, 4.0, quiet=True)
+    assert [row["method"] for row in result["ways"]] == names and result["finished"]
+    again = {*counted} - {"raymarch", "stock"}  # raymarch is the small render that shows how steady the machine is
+    assert again == {*names[4:]} - {"raymarch", ways.STOCK}
+    errors = [[[p["error"] for p in row["points"]] for row in found["ways"][:4]] for found in (result, result_of(done))]
+    assert errors[0] == errors[1]
 
 
-def test_a_point_that_fails_is_a_row_and_an_interruption_leaves_a_report(folder, tmp_path, monkeypatch):
-    """`raymarch` is interrupted, `none` cannot be rendered before."""
-    def measure(subject, point, *rest):
-        if point.method == "none":
-            raise MiNtfError("no such light")
-        raise KeyboardInterrupt
+def test_another_scene_or_budget_begins_anew(folder, done, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "out"
+    shutil.copytree(done, out)
+    monkeypatch.setattr(study.Study, "run", lambda self: None)
+    monkeypatch.setattr(study.Study, "result", lambda self: {})
+    study.tradeoff(folder / "many.xml", out, {}, 4.0)
+    assert "begins anew" not in capsys.readouterr().err
+    study.tradeoff(folder / "many.xml", out, {}, 5.0)
+    assert "begins anew, since what lies in" in (said := capsys.readouterr().err) and "of another budget" in said
+    study.tradeoff(folder / "many.xml", out, {"res": "20"}, 5.0)
+    assert "of another scene" in capsys.readouterr().err
+    assert list(kept.State(out, {"budget": 1}).lines) == ["key"]
 
-    monkeypatch.setattr(study, "measure", measure)
-    image = np.ones((32, 32, 3), np.float32)
-    monkeypatch.setattr(references, "converge", lambda *a: references.Reference(image, 0.0, 4, 4, 1.0, "ones"))
-    monkeypatch.setattr(references, "choose_picture", lambda *a: (Picture(), "whole"))
-    monkeypatch.setattr(references, "hold_against_stock", lambda *a: {"verdict": "not held", "reason": "no time"})
-    with pytest.raises(KeyboardInterrupt):
-        study.tradeoff(folder / "scene.xml", tmp_path, {}, 50.0, quiet=True)
-    result = json.loads((tmp_path / "tradeoff.json").read_text())
-    assert [(r["label"], r["reason"]) for r in result["points"]] == [("none, 4 spp", "no such light")]
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_what_begins_anew_renders_its_own_reference(folder, done, tmp_path, lost):
+    """Pictures of the earlier study lie there, perhaps without the file that says what they are of."""
+    out = tmp_path / "out"
+    shutil.copytree(done, out)
+    if lost:
+        (out / kept.NAME).unlink()
+    result = study.tradeoff(folder / "one.xml", out, {"res": "16"}, 1.0, quiet=True)
+    assert result["finished"] and result["size"] == (16, 16)
+    with np.load(out / kept.PICTURES / "reference.npz") as file:
+        assert file["image"].shape == (16, 16, 3)
+
+
+def interrupting(monkeypatch, method: str):
+    """Ctrl-C in the first render by a method, as Mitsuba hands it on."""
+    once, calls = measure.once, []
+
+    def interrupted(*arguments):
+        calls.append(getattr(arguments[1], "visibility", ways.STOCK))
+        if [method] == calls[-1:] and calls.count(method) == 1:
+            try:
+                os.kill(os.getpid(), signal.SIGINT)
+                time.sleep(9)
+            except KeyboardInterrupt as error:
+                raise RuntimeError("drjit.custom(<mitsuba.python.util._RenderOp>): error (see above)") from error
+        return once(*arguments)
+
+    monkeypatch.setattr(measure, "once", interrupted)
+
+
+def test_an_interruption_leaves_the_report_and_130(folder, tmp_path, monkeypatch, capsys):
+    interrupting(monkeypatch, "transmittance_map")
+    before = signal.getsignal(signal.SIGINT)
+    words = ["tradeoff", str(folder / "one.xml"), "-o", str(tmp_path), "--budget", "3s", "-D", "res=16"]
+    assert cli.main(words) == 130
+    said = capsys.readouterr().err
+    ended = re.search(r"mi-ntf: interrupted; (\d+) ways are finished; the same command goes on", said)
+    assert ended and signal.getsignal(signal.SIGINT) is before
+    result = result_of(tmp_path)
+    assert len(result["ways"]) == int(ended[1]) > 0 and not result["finished"]
+    assert not any(row["reason"] for row in result["ways"])
+    assert "KeyboardInterrupt" not in (tmp_path / kept.NAME).read_text()
     page = outline((tmp_path / "index.html").read_text())
-    assert "failed: no such light" in page.texts and any("interrupted" in text for text in page.texts)
+    assert any("The study was interrupted" in text for text in page.texts)
+    monkeypatch.undo()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
+    assert cli.main(words) == 0
+    after = result_of(tmp_path)
+    errors = [[[p["error"] for p in row["points"]] for row in found["ways"]] for found in (result, after)]
+    assert errors[1][: len(errors[0])] == errors[0] and after["finished"]
+    assert f"goes on; {ended[1]} ways are finished" in capsys.readouterr().err
 
 
-def test_what_ends_the_process_twice_is_not_begun_again(tmp_path):
-    found = state.State(tmp_path, {"a": 1})
+def test_an_interruption_before_the_reference_leaves_no_report(folder, tmp_path, monkeypatch, capsys):
+    interrupting(monkeypatch, "raymarch")
+    assert cli.main(["tradeoff", str(folder / "one.xml"), "-o", str(tmp_path), "--budget", "2s"]) == 130
+    assert "mi-ntf: interrupted; 0 ways are finished" in capsys.readouterr().err
+    assert not (tmp_path / "index.html").exists()
+
+
+def test_a_signal_to_the_program_ends_it(folder, tmp_path):
+    """Real Mitsuba, which hands the interruption on in its own way."""
+    words = ["tradeoff", str(folder / "many.xml"), "-o", str(tmp_path), "--budget", "60s"]
+    with subprocess.Popen([sys.executable, "-m", "mi_ntf", *words], stderr=subprocess.PIPE, text=True) as program:
+        said = []
+        for line in program.stderr:
+            said.append(line)
+            if " s  raymarch: error" in line:
+                time.sleep(1)
+                program.send_signal(signal.SIGINT)
+        assert program.wait(60) == 130
+    assert "the same command goes on" in said[-1], said
+    rows = result_of(tmp_path)["ways"]
+    assert rows[0]["method"] == "raymarch" and not any(row["reason"] for row in rows)
+
+
+def test_a_way_that_fails_is_a_row_that_says_why(folder, tmp_path, monkeypatch):
+    once = measure.once
+
+    def failing(scene, integrator, *rest):
+        if getattr(integrator, "visibility", "") == "transmittance_map":
+            raise MiNtfError("no room for maps")
+        return once(scene, integrator, *rest)
+
+    monkeypatch.setattr(measure, "once", failing)
+    study.tradeoff(folder / "one.xml", tmp_path, {"res": "16"}, 1.0, quiet=True)
+    rows = {row["way"]: row for row in result_of(tmp_path)["ways"]}
+    assert rows["transmittance_map"]["reason"] == "no room for maps" and rows["raymarch"]["points"]
+    assert "failed: no room for maps" in outline((tmp_path / "index.html").read_text()).texts
+    report.print_table(result_of(tmp_path))
+
+
+def test_what_is_built_is_built_anew_for_each_way(folder, tmp_path, monkeypatch):
+    """Neither maps in memory nor those on the disk are taken over, though the user's cache is on."""
+    from mi_ntf.render.maps import building
+
+    built, build = [], building.build
+    monkeypatch.setenv("MI_NTF_CACHE", "on")
+    monkeypatch.setattr(building, "build", lambda name, *rest: built.append(name) or build(name, *rest))
+    made = []
+    cached = building.map_cache.cached
+    monkeypatch.setattr(building.map_cache, "cached",
+                        lambda name, make, *rest: cached(name, lambda *v: made.append(name) or make(*v), *rest))
     for _ in range(2):
-        found.add("begun", name="x")
-    assert state.State(tmp_path, {"a": 1}).attempts("x") == 2
-    found.add("interrupted", name="x")
-    assert state.State(tmp_path, {"a": 1}).attempts("x") == 1
-    assert state.State(tmp_path, {"a": 2}).fresh == "a"
+        shutil.rmtree(tmp_path / "out", ignore_errors=True)
+        study.tradeoff(folder / "one.xml", tmp_path / "out", {"res": "16"}, 1.0, quiet=True)
+    maps = {name for name in made}
+    assert all(made.count(name) >= 2 for name in maps) and len(maps) >= 2
+    assert not list((folder / "cache").rglob("maps/*"))
 
 
-def test_a_scenes_properties_are_changed_whatever_its_xml_says(folder):
-    subject = Subject(folder / "scene.xml", {"res": "40"})
-    assert subject.size == (40, 40) and subject.base == Point("auto", 4, 2, 48, 0, 512, 32)
-    scene = subject.load(Point("raymarch", 1, representation="network"), Picture(2, (3, 4, 8, 6)))
-    assert scene.shapes()[0].interior_medium().representation == "network"
-    film = scene.sensors()[0].film()
-    assert (tuple(film.size()), tuple(film.crop_size()), tuple(film.crop_offset())) == ((20, 20), (8, 6), (3, 4))
-    nrf = subject.integrator(Point("transmittance_map", 1, 3, 96, map_resolution=64), 9.0)
-    assert (nrf.visibility, nrf.samples, nrf.map_resolution, nrf.max_depth) == ("transmittance_map", 96, 64, 3)
-    assert nrf.hide_emitters and nrf.timeout == 9
+def fake_study(folder, tmp_path, monkeypatch, budget):
+    """Shares of the ways of a study, each of which uses its own, by their names; and what was left out."""
+    shares = {}
+
+    def use(self, way, shrink, share):
+        shares[way.name] = share
+        self._start -= share
+
+    monkeypatch.setattr(study.Study, "_prepare", lambda self: (1, lambda *a: (None, 1.0)))
+    monkeypatch.setattr(study.Study, "_probe", lambda self, render: None)
+    monkeypatch.setattr(study.Study, "_try", use)
+    monkeypatch.setattr(study.Study, "result", lambda self: self.state.lines["end"])
+    return shares, study.tradeoff(folder / "one.xml", tmp_path, {}, budget, quiet=True)["left_out"]
 
 
-def test_the_mesh_is_found_and_must_fit(folder, tmp_path):
-    subject = Subject(folder / "scene.xml", {})
-    assert references.find_mesh(subject) is None
-    path = tmp_path / "mesh.exr"
-    mi.Bitmap(np.kron(np.eye(32), np.ones((2, 2)))[..., None].astype(np.float32) * np.ones(3, np.float32)).write(
-        str(path))
-    found = references.mesh(subject, path, Picture(), (32, 32, 3), 1.0)
-    np.testing.assert_allclose(found.image, np.eye(32)[..., None] * np.ones(3))
-    with pytest.raises(MiNtfError, match="has 64×64 pixels, the study's pictures 48×48"):
-        references.mesh(subject, path, Picture(), (48, 48, 3), 1.0)
+def test_the_budget_is_shared_evenly(folder, tmp_path, monkeypatch):
+    shares, left_out = fake_study(folder, tmp_path / "a", monkeypatch, 40.0)
+    serves = len(REGISTRY) - 1 + 1  # the field has no visibility MLP; and volpath
+    assert len(shares) == serves and left_out
+    np.testing.assert_allclose(list(shares.values()), 40 / serves, rtol=0.02)
+    shares, left_out = fake_study(folder, tmp_path / "b", monkeypatch, 1000.0)
+    assert not left_out and len(shares) > serves and min(shares.values()) >= measure.TIMES[-1]
+    np.testing.assert_allclose(list(shares.values()), 1000 / len(shares), rtol=0.02)
+    assert next(iter(shares)) == "raymarch" and list(shares)[serves:] == [n for n in shares if "-" in n]
+
+
+def row(seconds, errors, uncertainty=0.0, method="raymarch", **more):
+    points = [{"seconds": s, "samples": 2**i, "error": e, "error_uncertainty": uncertainty, "noise": None, "bias": None,
+               "front": True} for i, (s, e) in enumerate(zip(seconds, errors, strict=True))]
+    return {"way": method, "method": method, "title": method, "finer": False, "points": points, "reason": "",
+            "note": "", "xml": "<integrator/>", "command": "", "shift": [0.01, 0.001], "peak": 1, **more}
+
+
+def test_seconds_to_an_error_are_read_with_their_range():
+    cells = report.cells(row([1.0, 4.0, 16.0], [0.2, 0.1, 0.05], 0.005))
+    assert cells[:5] == ["raymarch", "4 s (3.6 to 4.4)", "16 s (13 to not reached)", "not reached", "not reached"]
+    assert report.cells(row([0.5, 2.0], [0.08, 0.04]))[1] == "at most 0.5 s"
+    assert cells[5:9] == ["5.0% ± 0.5%", "16", "4", "not known"]
+    assert report.cells(row([1.0], [0.2], method="none"))[0] == "none (a bound)"
+    assert report.cells(row([], [], reason="no light")) == ["raymarch", "failed: no light"]
+
+
+@pytest.mark.parametrize(("spread", "warned"), [(0.3, True), (0.05, False), (None, False)])
+def test_an_unsteady_machine_is_said(spread, warned):
+    result = {"machine": {"spread": spread, "probe_seconds": [0.2, 0.4]}}
+    assert ("the same small render took 0.2 to 0.4 s" in report.unsteady(result)) == warned
+
+
+@pytest.mark.parametrize(("shift", "said"), [
+    ((0.003, 0.002), ", no difference."), ((0.03, 0.002), ", a difference."), ((-0.005, 0.002), "perhaps a"),
+    ((0.03, 0.05), "too noisy to show differences below 10%")])
+def test_what_stock_volpath_says_of_the_reference(shift, said):
+    assert said in report.check({"ways": [row([1.0], [0.3], method="volpath", shift=shift)]})
+    assert report.check({"ways": []}) == "Stock volpath has not checked the reference."
+
+
+def test_a_reference_that_is_missing_is_refused(folder, tmp_path):
     with pytest.raises(MiNtfError, match=r"nowhere\.exr does not exist"):
-        study.tradeoff(folder / "scene.xml", tmp_path, {}, 5.0, tmp_path / "nowhere.exr")
+        study.tradeoff(folder / "one.xml", tmp_path, {}, 5.0, tmp_path / "nowhere.exr")
 
 
-def test_the_crop_is_where_the_light_is():
-    image = np.zeros((40, 30, 3))
-    image[20:25, 10:14] = 1
-    x, y, width, height = references.crop_of(image, 8)
-    assert (width, height) == (8, 8) and x <= 10 and x + 8 >= 14 and y <= 20 and y + 8 >= 25
+def test_a_captured_mesh_adds_the_exported_one_and_a_second_error(folder, tmp_path):
+    """Any scene of other shapes stands for the captured mesh."""
+    result = study.tradeoff(folder / "one.xml", tmp_path, {"res": "16"}, 1.0, folder / "one.xml", quiet=True)
+    rows = {r["method"]: r for r in result["ways"]}
+    assert rows["mesh"]["points"] and "mi-ntf export " in rows["mesh"]["command"]
+    assert "are not counted" in rows["mesh"]["note"] and '<shape type="ply">' in rows["mesh"]["xml"]
+    assert all("mesh_error" in p for r in rows.values() for p in r["points"])
+    assert "to the mesh" in (tmp_path / "index.html").read_text()
 
 
-@pytest.mark.parametrize(("p", "sigma", "said"), [
-    (0.5, 0.01, "no difference is found"), (0.03, 0.01, "a difference is likely"), (1e-4, 0.01, "is off by about"),
-    (1e-4, 0.05, "too noisy to tell differences below 10%")])
-def test_what_the_comparison_with_volpath_says(p, sigma, said):
-    found = {"difference": 0.02, "sigma": sigma, "z": 2.0, "p": p, "crop": [0, 0, 16, 16], "stock_spp": 64}
-    assert said in references.verdict(found) and "+2.00%" in references.verdict(found)
+def test_a_budget_that_is_none_is_bad_usage(folder):
+    assert cli.main(["tradeoff", str(folder / "one.xml"), "--budget=soon"]) == 2
 
 
-@pytest.mark.parametrize(("text", "found"), [("90s", 90), ("5m", 300), ("1h", 3600), ("1.5m", 90)])
-def test_budgets(text, found):
-    assert study.seconds(text) == found
-
-
-@pytest.mark.parametrize("text", ["5", "m", "-3m", "0s", "5 minutes"])
-def test_budgets_that_are_none_are_refused(text, folder, capsys):
-    with pytest.raises(MiNtfError, match="expected a time of a second or more such as 90s, 5m or 1h"):
-        study.seconds(text)
-    assert cli.main(["tradeoff", str(folder / "scene.xml"), f"--budget={text}"]) == 2
-
-
-def row(number, seconds, noise, bias, method="raymarch", **more):
-    return {"number": number, "label": f"{method} {number}", "build": 0.0, "render": seconds, "noise": noise,
-            "bias": bias, "uncertainty": 1e-8, "error": float(np.hypot(noise, bias)), "reason": "",
-            "point": Point(method, 1).as_dict(), "load": 0.5, **more}
-
-
-def test_the_curve_is_read():
-    rows = [row(0, 8.0, 0.008, 0.0), row(0, 1.0, 0.15, 0.0), row(0, 2.0, 0.01, 0.016), row(0, 3.0, 0.3, 0.0),
-            row(0, 100.0, 0.3, 0.0, "volpath"), {**row(0, 0, 0, 0), "reason": "why not"}]
-    reading.mark_front(rows)
-    assert [r["number"] for r in rows if r["front"]] == [1, 2, 4] and rows[-1]["reason"]
-    text = reading.reading(rows)
-    assert "below 10% no. 2" in text[0] and "below 2% no. 2" in text[0] and "below 1% no. 4" in text[0]
-    assert "bends at no. 2" in text[1]
-    assert "volpath errs by 30% after 100 s" in text[2] and "100 times sooner" in text[2]
-    assert "no. 2 err by bias" in text[3]
-    assert "up to 9 jobs on 2 cores" in reading.busy([row(1, 1, 1, 1, load=9.0)], 2) and not reading.busy(rows, 2)
-
-
-def test_thumbnails_are_small_and_show_the_difference():
-    reference = np.full((300, 200, 3), 0.5)
-    thumbs = report._Thumbnails(reference)
-    assert thumbs.picture(reference).shape == (100, 66, 3)
-    np.testing.assert_allclose(thumbs.picture(reference), report.BRIGHT)
-    assert thumbs.difference(reference).max() < 10 < 200 < thumbs.difference(2 * reference).max()
-
-
-def test_workers_render_the_passes_of_the_reference(folder, tmp_path):
-    subject, picture = Subject(folder / "scene.xml", {"res": "16"}), Picture()
-    here = references.converge(subject, picture, 0.0, lambda text: None)
-    shared = references.converge(subject, picture, 0.0, lambda text: None, Workers("local", 2), tmp_path)
-    assert (shared.passes, shared.spp) == (here.passes, here.spp) == (4, 4)
-    assert abs(shared.image.mean() / here.image.mean() - 1) < 0.05 and shared.noise < 0.3
-    task = references.Pass(subject.path.absolute(), (("res", "16"),), VARIANT, picture, 2, references.FIRST_SEED + 7)
-    own = references.Renderer(subject, references.way(subject), picture)
-    np.testing.assert_array_equal(references.one_pass(task), own(2, references.FIRST_SEED + 7)[0])
-
-
-def test_points_are_measured_here_whoever_renders_the_reference(folder, tmp_path, monkeypatch):
-    chosen = []
-    image = np.ones((32, 32, 3), np.float32)
-    monkeypatch.setattr(references, "converge",
-                        lambda *a: chosen.append(a[4]) or references.Reference(image, 0.0, 4, 4, 1.0, "ones"))
-    monkeypatch.setattr(study.Study, "_search", lambda self: search.Search(self.subject.base, [], self.subject.limits,
-                                                                         lambda point: (0.0, 0.0), 1.0))
-    monkeypatch.setattr(references, "hold_against_stock", lambda *a: {"verdict": "none"})
-    study.tradeoff(folder / "scene.xml", tmp_path, {"res": "32"}, 5.0, quiet=True, workers=Workers("local", 2))
-    assert chosen == [Workers("local", 2)]
+def test_the_bound_is_no_choice(folder, tmp_path):
+    """It is left out of the front, though nothing is faster or more accurate."""
+    begun = study.Study(ways.Subject(folder / "one.xml", {}), tmp_path, 9.0, None, lambda *a: None, threading.Event())
+    begun.state.add("picture", {"shrink": 1})
+    begun.state.add("reference", {})
+    for method, seconds in (("none", 0.1), ("raymarch", 1.0), ("volpath", 2.0)):
+        begun.state.add(f"way {method}", row([seconds], [seconds / 9], method=method))
+        del begun.state.lines[f"way {method}"]["points"][0]["front"]
+    marks = {row["method"]: row["points"][0].get("front") for row in begun.result()["ways"]}
+    assert marks == {"none": None, "raymarch": True, "volpath": False}

@@ -1,2 +1,2 @@
-"""``mi-ntf tradeoff``: what accuracy costs, on one scene: seconds, memory and error of the visibility methods and their
-dials, as a page to look at. Begin with :mod:`mi_ntf.evaluate.tradeoff.study`."""
+"""``mi-ntf tradeoff``: the error of a scene's picture over the seconds that it takes, by every way to render the scene.
+Begin with :mod:`mi_ntf.evaluate.tradeoff.study`."""

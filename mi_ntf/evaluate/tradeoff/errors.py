@@ -1,14 +1,17 @@
-"""Error, split into what is noise and what is bias. Images are float arrays (h, w, 3), linear RGB.
+"""Error of a mean of pictures, split into noise and bias. Pictures are float arrays (h, w, 3), linear RGB.
 
-Of K pictures a_k by different seeds and a reference R in two independent halves, relative to P = mean R²:
+Let a_k be pictures of s_k samples a pixel by independent seeds, m their mean weighted by s_k, R a reference of variance
+V, and P = mean R² − V its power. Relative to P:
 
-    noise²  = mean Var_k(a_k) / P                 what more samples take away
-    bias²   = mean over pairs k ≠ l of (a_k − R)(a_l − R), less the variance of R / P      what stays
-    error²  = noise² + bias²                      of one picture
+    error² = mean (m − R)² − V                                    of the mean
+    bias²  = mean of (a_k − R)(a_l − R) over pairs k ≠ l − V      what stays, however many samples
+    noise² = error² − bias²                                       what more samples take away
 
-Products of different seeds hold no noise on average, nor does what is taken off leave any of the reference's.
+The pairs are weighted by s_k s_l. Each estimate is right on average, and its standard error is that of a mean over
+pixels, which are taken as independent.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import sqrt
 
@@ -18,92 +21,108 @@ from ...core.errors import MiNtfError
 
 
 @dataclass(frozen=True)
-class Error:
-    """Relative errors (1: as large as the picture). `noise`: of one picture; `bias`: estimated, 0 where the squared
-    estimate is negative; `uncertainty`: standard error of bias², so that a bias below √`uncertainty` cannot be told
-    from none."""
+class Estimate:
+    """Estimate of a squared relative error, which may be negative by chance, and its standard error."""
 
-    noise: float
-    bias: float
-    uncertainty: float
+    square: float
+    deviation: float
 
     @property
-    def total(self) -> float:
-        """Of one picture."""
-        return sqrt(self.noise**2 + self.bias**2)
+    def value(self) -> float:
+        """Relative error; 0 where the estimate of its square is negative."""
+        return sqrt(max(self.square, 0.0))
 
     @property
-    def known(self) -> bool:
-        """Whether the bias stands out: two standard errors above 0."""
-        return self.bias**2 > 2 * self.uncertainty
+    def uncertainty(self) -> float:
+        """Distance from the value to the relative error whose square is one standard error larger."""
+        return sqrt(max(self.square, 0.0) + self.deviation) - self.value
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Picture (h, w, 3) that others are held against; its mean squared noise, 0 where that is not known; and words."""
+
+    image: np.ndarray
+    variance: float = 0.0
+    about: str = ""
 
     @property
-    def most(self) -> float:
-        """The bias that two standard errors allow."""
-        return sqrt(self.bias**2 + 2 * self.uncertainty)
+    def power(self) -> float:
+        """Mean square of the picture without its noise. Raises MiNtfError for a black picture."""
+        power = float(np.mean(np.square(self.image, dtype=np.float64))) - self.variance
+        if power <= 0:
+            raise MiNtfError("the reference is black, so that no relative error exists; does light reach the object?")
+        return power
+
+    @property
+    def noise(self) -> float:
+        """Relative noise."""
+        return sqrt(self.variance / self.power)
 
 
-def split(pictures, reference: np.ndarray, variance: float = 0.0) -> Error:
-    """The :class:`Error` of `pictures` (two or more, of different seeds). `variance`: mean squared noise of
-    `reference`, 0 for one without. Raises MiNtfError for a black reference and for a single picture."""
-    a = np.stack([np.asarray(p, np.float64) for p in pictures])
-    r = np.asarray(reference, np.float64)
-    if len(a) < 2:
-        raise MiNtfError("one picture cannot tell noise from bias; render two seeds")
-    power = float(np.mean(r * r)) - variance
-    if power <= 0:
-        raise MiNtfError("the reference is black everywhere, no relative error exists; was it rendered with a light?")
-    noise = float(np.mean(a.var(0, ddof=1)))
-    d = a - r
-    pairs = (d.sum(0) ** 2 - (d * d).sum(0)) / (len(a) * (len(a) - 1))
-    bias = (float(pairs.mean()) - variance) / power
-    return Error(sqrt(noise / power), sqrt(max(bias, 0.0)), _uncertainty(pairs) / power)
+class Mean:
+    """Running mean of independent pictures, and its error against a reference."""
+
+    def __init__(self, truth: Truth):
+        self._truth, self.pictures, self.samples, self._weights = truth, 0, 0, 0.0
+        self._sum, self._squares = np.zeros(truth.image.shape), np.zeros(truth.image.shape)
+
+    def add(self, picture: np.ndarray, samples: int) -> None:
+        """Add a picture of so many samples a pixel."""
+        difference = samples * (np.asarray(picture, np.float64) - self._truth.image)
+        self._sum += difference
+        self._squares += difference**2
+        self._weights += float(samples) ** 2
+        self.pictures, self.samples = self.pictures + 1, self.samples + samples
+
+    @property
+    def image(self) -> np.ndarray:
+        """Mean of the pictures (h, w, 3)."""
+        return (self._truth.image + self._sum / self.samples).astype(np.float32)
+
+    def error(self) -> Estimate:
+        """Return the error of the mean."""
+        return self._estimate((self._sum / self.samples) ** 2, self._truth.variance)
+
+    def split(self) -> tuple[Estimate, Estimate]:
+        """Return noise and bias of the mean. Raises MiNtfError for a single picture, which cannot tell them apart."""
+        if self.pictures < 2:
+            raise MiNtfError("one picture cannot tell noise from bias; render two seeds")
+        pairs = (self._sum**2 - self._squares) / (self.samples**2 - self._weights)
+        noise = self._estimate((self._sum / self.samples) ** 2 - pairs, 0.0)
+        return noise, self._estimate(pairs, self._truth.variance)
+
+    def shift(self) -> tuple[float, float]:
+        """Return the difference of the means over all pixels, relative to the reference, and its standard error."""
+        pixels, size = (self._sum / self.samples).mean(-1), float(self._truth.image.mean())
+        return float(pixels.mean()) / size, float(pixels.std()) / sqrt(pixels.size) / size
+
+    def _estimate(self, values: np.ndarray, variance: float) -> Estimate:
+        pixels, power = values.mean(-1), self._truth.power
+        return Estimate((float(pixels.mean()) - variance) / power, float(pixels.std()) / sqrt(pixels.size) / power)
 
 
-def _uncertainty(values: np.ndarray) -> float:
-    """Standard error of the mean of `values` (h, w, colours), taken for independent from pixel to pixel; where the
-    bias itself differs between them a little too large."""
-    each = values.mean(-1)
-    return float(each.std() / sqrt(each.size))
+def crossing(seconds: Sequence[float], values: Sequence[float], limit: float) -> float | None:
+    """Return the seconds after which the error `values` falls to `limit`, or None where no point is below it.
 
-
-def pooled(errors) -> Error:
-    """One of several :class:`Error` of the same settings: the bias by the inverse of its squared uncertainties, the
-    noise of the last."""
-    weights = [1 / max(e.uncertainty, 1e-12) ** 2 for e in errors]
-    bias = sqrt(sum(w * e.bias**2 for w, e in zip(weights, errors, strict=True)) / sum(weights))
-    return Error(errors[-1].noise, bias, sum(weights) ** -0.5)
-
-
-def z_test(first, second) -> dict[str, float]:
-    """Whether the means of two sets of independent pictures (n, h, w, 3) agree.
-
-    ``difference``: relative, of the means over all pixels, `first` over `second` less 1; ``sigma``: its standard error;
-    ``z``, their ratio; ``p``, two-sided, by Welch's t-test, since few pictures know their own spread badly;
-    ``pictures``: how many of the first. Raises MiNtfError for fewer than four pictures of either.
+    Between two points the curve is straight on log axes. An error below half of the limit counts as half of it, since
+    the logarithm of one that is measured as 0 says nothing.
     """
-    a, b = (np.array([np.mean(p, dtype=np.float64) for p in group]) for group in (first, second))
-    if min(len(a), len(b)) < 4:
-        raise MiNtfError(f"{len(a)} and {len(b)} pictures; a variance needs at least 4 of each")
-    size = float(b.mean())
-    if size <= 0:
-        raise MiNtfError("the crop is black; no relative difference exists")
-    va, vb = a.var(ddof=1) / len(a), b.var(ddof=1) / len(b)
-    sigma = max(sqrt(va + vb), 1e-12 * size)
-    gap = float(a.mean()) - size
-    freedom = (va + vb) ** 2 / max(va**2 / (len(a) - 1) + vb**2 / (len(b) - 1), 1e-300)
-    return {"difference": gap / size, "sigma": sigma / size, "z": gap / sigma,
-            "p": two_sided(gap / sigma, float(np.clip(freedom, 1, len(a) + len(b) - 2))), "pictures": len(a)}
+    for i, value in enumerate(values):
+        if value <= limit:
+            if i == 0:
+                return seconds[0]
+            above, below = np.log(values[i - 1]), np.log(max(value, limit / 2))
+            way = (above - np.log(limit)) / (above - below)
+            return float(seconds[i - 1] * (seconds[i] / seconds[i - 1]) ** way)
+    return None
 
 
-def two_sided(t: float, freedom: float) -> float:
-    """Chance of a larger |t| by Student's distribution of `freedom` degrees: t = √ν tan θ makes its density a power of
-    cos θ."""
-    begin = np.arctan(abs(t) / sqrt(freedom))
-
-    def integral(low: float) -> float:
-        step = (np.pi / 2 - low) / 4096
-        angles = low + (np.arange(4096) + 0.5) * step
-        return float((np.cos(angles) ** (freedom - 1)).sum() * step)
-
-    return integral(begin) / integral(0.0)
+def front(points: Sequence[tuple[float, float]]) -> list[int]:
+    """Return the indices of the points (seconds, error) that no other point beats in both, by seconds."""
+    best, indices = np.inf, []
+    for i in sorted(range(len(points)), key=lambda i: points[i]):
+        if points[i][1] < best:
+            best = points[i][1]
+            indices.append(i)
+    return indices

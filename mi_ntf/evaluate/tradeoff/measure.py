@@ -1,109 +1,108 @@
-"""Measures one point: its pictures by two seeds or more, and what they took. Maps and atlases are made once, in the
-first picture, and kept for the others, so that what is built once is told from what every picture costs."""
+"""The curve of one way to render: passes with independent seeds, and the error of their mean after each."""
 
-import os
-import statistics
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any
 
-import drjit as dr
 import numpy as np
 
 from ...core.errors import MiNtfError
-from ...render.cost.measurement import BUILT, once
-from ...render.maps import map_cache
-from .points import STOCK, Point
-from .subject import Picture, Subject
+from ...render.cost.measurement import once
+from ...render.maps.map_cache import maps_in_memory
+from .errors import Estimate, Mean, Truth
 
-CHEAP = 1.0
-"""Seconds below which a picture is rendered `REPEATS` times warm, dearer ones once."""
-REPEATS = 3
-
-
-@dataclass(frozen=True)
-class Timing:
-    """Times and memory of one point.
-
-    Seconds: `build` of maps, atlas and the light between patches, without compilation; `compile` of
-    kernels in the first picture, or their fetching from Dr.Jit's cache on disk; `first`: the first picture as a whole;
-    `render`: the median of `repeats` warm pictures, what is built left out; `peak`: most bytes that Dr.Jit held;
-    `load`: jobs that the system ran on average when it was measured."""
-
-    build: float
-    compile: float
-    first: float
-    render: float
-    repeats: int
-    peak: int
-    load: float
-
-    @property
-    def total(self) -> float:
-        """Seconds of a picture whose kernels are compiled and whose maps are not made yet."""
-        return self.build + self.render
+TIMES = (1, 3, 10)
+"""Seconds after which pictures are compared: the waits of a change by hand, of a try, and of a preview."""
+LARGEST_PASS = 1 << 22
+"""Camera rays of one pass at most: path tracers hold all of them in memory, some 100 bytes each."""
 
 
-@contextmanager
-def maps_in_memory() -> Iterator[None]:
-    """Within, transmittance maps are kept in memory and in no file, and there are none yet."""
-    name = "MI_NTF_CACHE"
-    before = os.environ.get(name)
-    os.environ[name] = "memory"
-    map_cache.forget()
-    try:
-        yield
-    finally:
-        map_cache.forget()
-        os.environ.pop(name)
-        if before is not None:
-            os.environ[name] = before
+@dataclass
+class Renderer:
+    """Renderer of many pictures of a scene by one integrator, which keeps what it has built. `compile`: seconds of
+    compilation; `peak`: most bytes that Dr.Jit held."""
+
+    scene: Any
+    integrator: Any
+    compile: float = 0.0
+    peak: int = 0
+
+    def __call__(self, samples: int, seed: int) -> tuple[np.ndarray, float]:
+        """Return a picture (h, w, 3) of so many samples a pixel, and its seconds without compilation. Raises MiNtfError
+        where a pixel is not finite."""
+        image, took = once(self.scene, self.integrator, samples, seed)
+        pixels = np.array(image, np.float32)[..., :3]
+        if not np.isfinite(pixels).all():
+            raise MiNtfError("the picture has pixels that are not finite")
+        self.compile += took["compile_seconds"]
+        self.peak = max(self.peak, took["peak_bytes"])
+        return pixels, max(took["wall_seconds"] - took["compile_seconds"], 1e-4)
 
 
-def measure(subject: Subject, point: Point, picture: Picture, timeout: float = -1.0) -> tuple[list[np.ndarray], Timing]:
-    """The pictures (h, w, 3), of seeds 0, 1, …, and their :class:`Timing`. `timeout`: seconds after which a rendering
-    ends, between chunks of its pixels; below 0: never. Raises whatever rendering does, and MiNtfError where it did not
-    end in time."""
-    scene, integrator = subject.load(point, picture), subject.integrator(point, timeout)
-    dr.flush_malloc_cache()
+@dataclass
+class Curve:
+    """Points of a curve, JSON-ready; the picture (h, w, 3) at the last point within each of `TIMES`; and at the last of
+    all, the difference of its mean brightness from the reference's, with its standard error."""
+
+    points: list[dict[str, Any]] = field(default_factory=list)
+    pictures: dict[str, np.ndarray] = field(default_factory=dict)
+    shift: tuple[float, float] = 0.0, 0.0
+
+    def add(self, seconds: float, mean: Mean, mesh: Mean | None) -> None:
+        """Add the point of `mean`, which took so many seconds; `mesh`: the same held against the mesh."""
+        split = mean.split() if mean.pictures > 1 else (None, None)
+        values: dict[str, Estimate | None] = {"error": mean.error(), "noise": split[0], "bias": split[1]}
+        point: dict[str, Any] = {"seconds": seconds, "samples": mean.samples}
+        for name, estimate in (values | ({"mesh_error": mesh.error()} if mesh else {})).items():
+            point[name] = estimate and estimate.value
+            point[f"{name}_uncertainty"] = estimate and estimate.uncertainty
+        self.points.append(point)
+        self.shift = mean.shift()
+        self.pictures |= {str(mark): mean.image for mark in TIMES if seconds <= mark}
+
+
+def follow(render: Callable[[int, int], tuple[np.ndarray, float]], truth: Truth, mesh: Truth | None, budget: float,
+           tell: Callable[[float], None]) -> Curve:
+    """Render passes until `budget` seconds by the clock are used, or the noise is below the reference's own or a tenth
+    of the bias, where more samples would change the error no more.
+
+    `render` takes samples and a seed and returns a picture and seconds, as :class:`Renderer`; what it builds, it builds
+    anew in the first pass, which is rendered whatever it takes. `tell` is called with each error. Passes double the
+    samples of all before them, so that what each costs besides its samples does not dominate. Where building uses most
+    of the budget, but less than twice as much, a quarter of it is added for samples.
+    """
+    curve, mean, other = Curve(), Mean(truth), Mean(mesh) if mesh else None
+    begin, seconds, samples = time.perf_counter(), 0.0, 1
     with maps_in_memory():
-        image, first = _picture(scene, integrator, point, 0, timeout)
-        images, warm = [image], []
-        for seed in range(1, REPEATS + 1):
-            image, found = _picture(scene, integrator, point, seed, timeout)
-            images.append(image)
-            warm.append(found)
-            if found["wall_seconds"] > CHEAP:
+        while samples:
+            start = time.perf_counter()
+            picture, took = render(samples, 2 * mean.pictures)  # references have odd seeds
+            seconds += took
+            mean.add(picture, samples)
+            if other:
+                other.add(picture, samples)
+            curve.add(seconds, mean, other)
+            tell(curve.points[-1]["error"])
+            used, last = time.perf_counter() - begin, time.perf_counter() - start
+            if mean.pictures == 1 and budget / 2 < used < 2 * budget:  # for building, so that samples have some of it
+                budget = max(budget, used + budget / 4)
+            noise, bias = (e.value for e in mean.split()) if mean.pictures > 1 else (1.0, 0.0)
+            if used >= budget or noise < max(truth.noise, bias / 10):
                 break
-    render = statistics.median(_rest(found, point) for found in warm)
-    peak = max(found["peak_bytes"] for found in (first, *warm))
-    build = sum(_built(first, point).values())
-    return images, Timing(build, first["compile_seconds"], first["wall_seconds"], render, len(warm), peak,
-                          round(os.getloadavg()[0], 2))
+            fit = (budget - used) / last * samples if mean.pictures > 1 else 1.0
+            mark = next(((t - seconds) / took * samples for t in TIMES if t > seconds), 0.0)
+            samples = following(mean.samples, fit, mark, LARGEST_PASS // picture[..., 0].size)
+    return curve
 
 
-def _picture(scene, integrator, point: Point, seed: int, timeout: float) -> tuple[np.ndarray, dict]:
-    image, found = once(scene, integrator, point.spp, seed)
-    took = found["wall_seconds"] - found["compile_seconds"]
-    if 0 < timeout < took:
-        raise MiNtfError(f"its picture took {took:.0f} s, where {timeout:.0f} s were allowed")
-    return colours(image), found
+def following(samples: int, fit: float, mark: float, largest: int) -> int:
+    """Return the samples of the next pass: those so far, fewer where only these fit, none where less than half do.
 
-
-def colours(image: Any) -> np.ndarray:
-    """(h, w, 3) of a rendered picture. Raises MiNtfError where a value is not finite."""
-    pixels = np.array(image, np.float32)[..., :3]
-    if not np.isfinite(pixels).all():
-        raise MiNtfError("the picture has pixels that are not finite")
-    return pixels
-
-
-def _built(found: dict, point: Point) -> dict[str, float]:
-    """Seconds of the stages that do not grow with the picture."""
-    return {} if point.method == STOCK else {name: found["stages"].get(name, 0.0) for name in BUILT}
-
-
-def _rest(found: dict, point: Point) -> float:
-    """Seconds of a picture without compilation and what is built."""
-    return max(1e-4, found["wall_seconds"] - found["compile_seconds"] - sum(_built(found, point).values()))
+    `samples` were rendered, `fit` fit into the rest of the time, `mark` into the time until pictures are compared next,
+    `largest` into one pass.
+    """
+    wanted = min(samples, int(fit))
+    if samples <= 2 * int(mark) < 2 * wanted:
+        wanted = int(mark)
+    return max(1, min(wanted, largest)) if 2 * wanted >= samples else 0

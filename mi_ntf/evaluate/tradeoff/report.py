@@ -1,11 +1,9 @@
-"""The report of a study: one page that holds all it shows, a table for programs, and JSON."""
+"""The report of a study: a page to read offline with its figure of curves, a table for programs, and JSON."""
 
 import csv
 import io
 import json
-import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+import sys
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -13,255 +11,180 @@ from typing import Any
 import numpy as np
 
 from ...core import files
-from ...data.page import Page, encode
-from . import figures
-from .reading import busy, error, measured, total
-from .search import WORST
+from ...data.images import levels
+from ...data.page import Page, new_figure, plain
+from ..curves import draw
+from . import errors
+from .measure import TIMES
+from .references import ERRORS
+from .ways import BOUND, MESH, STOCK
 
-WIDTH = 128
-"""Pixels along the longer side of a thumbnail, at most."""
-BRIGHT = 0.9
-"""Level that the brightest 0.5 % of the reference are shown from on."""
-SHOWN = 11
-"""Pictures of the front, at most."""
-ERROR_SCALE = 0.5
-"""Upper end of difference images, in units of the reference's RMS."""
-COLUMNS = ("number", "front", "label", "build", "render", "total", "repeats", "first", "compile", "peak", "error",
-           "noise", "bias", "uncertainty", "mesh_error", "load", "why", "reason")
-"""Of the CSV file, before the dials."""
-
-_STYLE = """<style>
-#curve { position: relative; } svg { max-width: 100%; height: auto; color: inherit; } svg text { fill: #7d7d7d; }
-#card { position: fixed; display: none; background: var(--page); color: var(--ink); border: 1px solid #8888;
-        padding: 8px; border-radius: 6px; box-shadow: 0 4px 18px #0005; pointer-events: none; z-index: 9;
-        max-width: 300px; font-size: 13px; }
-#card img { display: inline-block; width: 140px; image-rendering: pixelated; margin-right: 6px; }
-table.points td, table.points th { white-space: nowrap; font-size: 13px; } tr.front { font-weight: 600; }
-table.points td:nth-child(2) { white-space: normal; min-width: 17em; }
-.wide { overflow-x: auto; } g[id^="p"] { cursor: pointer; }
-</style>"""
-_SCRIPT = """<div id="card"></div><script>
-const points = JSON.parse(document.getElementById("points").textContent), card = document.getElementById("card");
-function show(number, event) {
-  const p = points[number];
-  card.innerHTML = `<img alt="" src="${p.image}"><img alt="" src="${p.difference}">`;
-  for (const line of p.lines) { const d = document.createElement("div"); d.textContent = line; card.append(d); }
-  card.style.display = "block";
-  const box = card.getBoundingClientRect();
-  card.style.left = Math.max(4, Math.min(event.clientX + 16, innerWidth - box.width - 8)) + "px";
-  card.style.top = Math.max(4, Math.min(event.clientY + 16, innerHeight - box.height - 8)) + "px";
-}
-for (const number of Object.keys(points)) {
-  for (const mark of document.querySelectorAll(`#p${number}, tr[data-point="${number}"]`)) {
-    mark.addEventListener("mousemove", event => show(number, event));
-    mark.addEventListener("mouseleave", () => { card.style.display = "none"; });
-  }
-}
-</script>"""
+SPREAD = 0.1
+"""Standard deviation of equal renders, over their mean, above which pyperf calls a machine too noisy to trust."""
+COLUMNS = ("seconds", "samples", "error", "error_uncertainty", "noise", "noise_uncertainty", "bias", "bias_uncertainty",
+           "mesh_error", "mesh_error_uncertainty", "front")
+HEADER = ("way", *(f"to {limit:.0%}" for limit in ERRORS), "error at the end", "after s", "samples", "noise", "bias",
+          "to the mesh")
 
 
-def write(result: dict[str, Any], study, out: Path) -> None:
-    """``index.html``, ``tradeoff.csv`` and ``tradeoff.json`` in `out`. `study`: the
-    :class:`mi_ntf.evaluate.tradeoff.study.Study` that `result` is of."""
+def write(result: dict[str, Any], reference: np.ndarray, pictures: dict[str, dict[str, np.ndarray]], out: Path) -> None:
+    """Write ``index.html``, ``tradeoff.csv`` and ``tradeoff.json`` to `out`. `result`: the study's; `reference`:
+    (h, w, 3) linear; `pictures`: those of each way, by the seconds after which they are compared."""
     files.write(out / "tradeoff.json", json.dumps(result, indent=1) + "\n")
-    files.write(out / "tradeoff.csv", table(result))
-    reference = study.reference.image
-    pictures = {row["number"]: image for row in measured(result["points"])
-                if (image := study.state.image(row["image"])) is not None}
-    files.write(out / "index.html", page(result, reference, pictures))
-
-
-def table(result: dict[str, Any]) -> str:
-    """CSV: a line a point, seconds, bytes and relative errors."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*COLUMNS, *result["base"]])
-    for row in result["points"]:
-        values = {**row, "total": "" if row["reason"] else total(row), "front": int(row["front"])}
-        writer.writerow([*(values.get(name, "") for name in COLUMNS), *row["point"].values()])
-    for row in result["skipped"]:
-        writer.writerow([*(row.get(name, "") for name in COLUMNS), *row["point"].values()])
-    return text.getvalue()
+    writer.writerow(["way", "method", *COLUMNS, "reason"])
+    for row in result["ways"]:
+        for point in row["points"] or [{}]:
+            writer.writerow([row["title"], row["method"], *(point.get(name) for name in COLUMNS), row["reason"]])
+    files.write(out / "tradeoff.csv", text.getvalue())
+    page(result, reference, pictures).write(out / "index.html")
 
 
-def page(result: dict[str, Any], reference: np.ndarray, pictures: dict[int, np.ndarray]) -> str:
-    """HTML. `reference`, `pictures` by number: (h, w, 3) linear."""
-    rows, found = result["points"], Page(f"What accuracy costs: {result['scene']}")
-    found.markup(_STYLE)
+def page(result: dict[str, Any], reference: np.ndarray, pictures: dict[str, dict[str, np.ndarray]]) -> Page:
+    """Return the page."""
+    sheet = Page(f"What accuracy costs: {result['title']}")
     if not result["finished"]:
-        found.warning("The study was interrupted: the same command goes on.")
-    if warning := busy(rows, os.cpu_count() or 1):
-        found.warning(warning)
-    for sentence in result["reading"]:
-        found.text(sentence)
-    if measured(rows):
-        _curves(found, rows, reference, pictures)
-    found.section("All points")
-    found.text("By seconds; the front in bold. A picture takes build + render; its first one in a process takes the "
-               "compilation of kernels besides, or their fetching from Dr.Jit's cache. Bias in brackets is not told "
-               "from none.")
-    _table(found, rows, "mesh_error" in next(iter(measured(rows)), {}))
-    if result["skipped"]:
-        found.table(["not measured", "why"], [[s["label"], s["reason"]] for s in result["skipped"]])
-    _references(found, result)
-    return found.html()
+        sheet.warning("The study was interrupted, and this is what it has measured so far. The same command goes on.")
+    if noisy := unsteady(result):
+        sheet.warning(noisy)
+    if any(row["points"] for row in result["ways"]):
+        sheet.section("Error over time")
+        sheet.text("Each curve is one way to render the scene, with more samples from left to right. Lower is better. "
+                   "Seconds include what is built, such as maps, and leave out the compilation of kernels. Bands are "
+                   "one standard error wide. The thick grey line, the Pareto front, joins the least errors of each "
+                   "time. Without shadows is a bound: the error of not looking for visibility at all.")
+        figure = new_figure(10.5, 5.2)
+        axes = figure.add_subplot()
+        plain(axes)
+        draw(axes, result)
+        sheet.drawing(figure, "Error over seconds, one curve for each way to render", 760)
+    sheet.section("Seconds to an error")
+    sheet.text("In brackets: how early or late it may be, since errors are estimates, ± one standard error. Nothing is "
+               "extrapolated: where an error is not reached, the time of that way was over before. More samples take "
+               "noise away; bias stays.")
+    lines = ["".join(f"<th>{h}</th>" for h in HEADER)]
+    for row in result["ways"]:
+        lines.append("".join(f'<td style="white-space: nowrap">{escape(cell)}</td>' for cell in cells(row)))
+        if row["points"]:
+            lines.append(f'<td colspan="{len(HEADER)}">{_recipe(row)}</td>')
+    table = "".join(f"<tr>{line}</tr>\n" for line in lines)
+    sheet.scrolling(f'<table style="font-size: 13px">{table}</table>', "Seconds to an error")
+    _pictures(sheet, result, reference, pictures)
+    _about(sheet, result)
+    return sheet
 
 
-def _curves(found: Page, rows, reference, pictures) -> None:
-    found.section("Error over time")
-    found.text("Left and below is better. Thin lines join points that differ in samples a pixel alone. Point at a mark "
-               "for its picture and its difference from the reference.")
-    found.markup(f'<div id="curve">{figures.curve(rows)}</div>')
-    thumbs = _Thumbnails(reference)
-    points = {row["number"]: {"image": encode(thumbs.picture(pictures[row["number"]])),
-                              "difference": encode(thumbs.difference(pictures[row["number"]])), "lines": _lines(row)}
-              for row in measured(rows) if row["number"] in pictures}
-    content = json.dumps(points).replace("</", "<\\/")
-    found.section("The front in pictures")
-    found.text(f"Below each its difference from the reference: white is {ERROR_SCALE:.0%} of the reference's RMS or "
-               "more.")
-    shown: list[tuple] = [("reference", encode(thumbs.picture(reference)), None)]
-    ends = [row for row in rows if row["front"] and row["number"] in points]
-    ends = [row for row in ends if row["error"] < WORST] or ends
-    kept = np.unique(np.linspace(0, len(ends) - 1, min(SHOWN, len(ends))).round().astype(int))
-    shown += [(f"{row['number']}: {row['label']}: {total(row):.3g} s, {row['error']:.1%}",
-               points[row["number"]]["image"], points[row["number"]]["difference"]) for row in (ends[k] for k in kept)]
-    found.markup('<div class="row">' + "".join(map(_figure, *zip(*shown, strict=True))) + "</div>")
-    found.section("Bias at equal noise")
-    found.text("What no number of samples takes away. Open triangles: not told from none, the bound of two standard "
-               "errors.")
-    found.markup(f"<div>{figures.bias_curve(rows)}</div>")
-    found.markup(f'<script type="application/json" id="points">{content}</script>{_SCRIPT}')
+def unsteady(result: dict[str, Any]) -> str:
+    """Return a warning if equal renders took unequal times on the machine, else ""."""
+    spread, probes = result["machine"]["spread"], result["machine"]["probe_seconds"]
+    if not spread or spread <= SPREAD:
+        return ""
+    return (f"The machine was noisy: the same small render took {min(probes):.2g} to {max(probes):.2g} s, a standard "
+            f"deviation of {spread:.0%}. All seconds are uncertain by as much. Repeat the study while nothing else "
+            "runs.")
 
 
-def _figure(caption: str, image: str, difference: str | None) -> str:
-    below = f'<img class="small" width="{WIDTH}" src="{difference}" alt="difference">' if difference else ""
-    return (f'<figure style="width:{WIDTH + 24}px"><img class="small" width="{WIDTH}" src="{image}" alt="">{below}'
-            f"<figcaption>{escape(caption)}</figcaption></figure>")
+def cells(row: dict[str, Any]) -> list[str]:
+    """Return the cells of a way below `HEADER`: where it failed, its name and the reason."""
+    if not row["points"]:
+        return [row["title"], f"failed: {row['reason']}"]
+    seconds, end = [p["seconds"] for p in row["points"]], row["points"][-1]
+
+    def reached(limit: float) -> str:
+        middle, early, late = (errors.crossing(seconds, [p["error"] + step * p["error_uncertainty"]
+                                                         for p in row["points"]], limit) for step in (0, -1, 1))
+        if middle is None:
+            return "not reached"
+        times = [f"{early:.2g}", "not reached" if late is None else f"{late:.2g}"]
+        least = "at most " if middle == seconds[0] else ""
+        return f"{least}{middle:.2g} s" + (f" ({times[0]} to {times[1]})" if times[0] != times[1] else "")
+
+    def estimate(name: str) -> str:
+        value = end.get(name)
+        return "not known" if value is None else f"{value:.1%} ± {end[f'{name}_uncertainty']:.1%}"
+
+    name = row["title"] + (" (a bound)" if row["method"] == BOUND else "")
+    return [name, *map(reached, ERRORS), estimate("error"), f"{end['seconds']:.3g}", f"{end['samples']}",
+            *map(estimate, ("noise", "bias", "mesh_error"))]
 
 
-def _lines(row: dict[str, Any]) -> list[str]:
-    """What the card of a point says."""
-    lines = [f"{row['number']}: {row['label']}",
-             f"{total(row):.3g} s: build {row['build']:.2g}, render {row['render']:.3g}; "
-             f"compilation {row['compile']:.2g} s",
-             f"error {row['error']:.1%}: noise {row['noise']:.1%}, bias {_bias(row)}",
-             f"{row['peak'] / 2**20:.0f} MiB"]
-    return lines + ([f"error to the mesh {row['mesh_error']:.1%}"] if "mesh_error" in row else [])
+def _recipe(row: dict[str, Any]) -> str:
+    """Return HTML that says how a way is rendered by hand."""
+    what = " and the shapes around the fields" if row["method"] == MESH else ""
+    text = Page.code(row["xml"], f"In the scene file, in place of its integrator{what}:")
+    text += Page.code(row["command"], "On the command line:") if row["command"] else ""
+    note = f"<p>{escape(row['note'])}</p>" if row["note"] else ""
+    return f"<details><summary>How to render by {escape(row['title'])}</summary>{note}{text}</details>"
 
 
-def _bias(row: dict[str, Any]) -> str:
-    text = f"{row['bias']:.1%}"
-    return text if error(row).known else f"({text})"
+def _pictures(sheet: Page, result, reference, pictures) -> None:
+    """Add what the ways show after equal times, those that went on for half of a time at least, and the difference."""
+    from matplotlib import colormaps
+
+    scale = 0.9 / max(float(np.percentile(reference.max(-1), 99.5)), 1e-12)
+    rms = max(float(np.sqrt(np.mean(np.square(reference, dtype=np.float64)))), 1e-12)
+    sheet.section("Equal time")
+    sheet.text("What each way shows after the same time, and below it the difference from the reference: white is half "
+               "of the reference's root mean square, or more. Ways that had built nothing by then, or ended well "
+               "before, are left out.")
+    sheet.pictures([("reference", levels(reference * scale))], 144)
+    for mark in TIMES:
+        pairs = []
+        for row in result["ways"]:
+            image = pictures[row["way"]].get(str(mark))
+            if image is None or 2 * row["points"][-1]["seconds"] < mark:
+                continue
+            point = [p for p in row["points"] if p["seconds"] <= mark][-1]
+            heat = colormaps["inferno"](np.clip(2 * np.abs(image - reference).mean(-1) / rms, 0, 1))[..., :3]
+            pairs.append((f"{row['title']}: error {point['error']:.1%} after {point['seconds']:.2g} s",
+                          np.vstack([levels(image * scale), (255 * heat).astype(np.uint8)])))
+        if pairs:
+            sheet.markup(f"<h3>After {mark} s</h3>")
+            sheet.pictures(pairs, 144)
 
 
-def _table(found: Page, rows: list[dict[str, Any]], mesh: bool) -> None:
-    header = ["", "point", "build s", "render s", "of", "compile s", "MiB", "error", "noise", "bias",
-              *(["to mesh"] if mesh else [])]
-    lines = ["<tr>" + "".join(f"<th>{h}</th>" for h in header) + "</tr>"]
-    for row in rows:
-        cells = [row["number"], row["label"]]
-        if row["reason"]:
-            text = f'<td colspan="{len(header) - 2}" style="white-space:normal">failed: {escape(row["reason"])}</td>'
-        else:
-            figures_ = [f"{row['build']:.2f}", f"{row['render']:.3g}", row["repeats"], f"{row['compile']:.2g}",
-                        f"{row['peak'] / 2**20:.0f}", f"{row['error']:.1%}", f"{row['noise']:.1%}", _bias(row)]
-            figures_ += [f"{row['mesh_error']:.1%}"] if mesh else []
-            text = "".join(f"<td>{escape(str(value))}</td>" for value in figures_)
-        mark = ' class="front"' if row["front"] else ""
-        lines.append(f'<tr{mark} data-point="{row["number"]}">'
-                     + "".join(f"<td>{escape(str(c))}</td>" for c in cells) + text + "</tr>")
-    found.markup('<div class="wide"><table class="points">' + "\n".join(lines) + "</table></div>")
+def _about(sheet: Page, result: dict[str, Any]) -> None:
+    """Add what errors are held against, the machine, and what was left out."""
+    sheet.section("References and machine")
+    reference, machine = result["reference"], result["machine"]
+    sheet.text("Errors are root mean square differences, relative to the root mean square of the reference: the same "
+               f"field by {reference['about']}. Its noise, {reference['noise']:.2%}, is taken off.")
+    sheet.text(check(result))
+    if result["mesh"]:
+        sheet.text(f"Errors to the mesh, the object that was captured, hold all that is lost: {result['mesh']}.")
+    (width, height), (whole, _) = result["size"], result["scene_size"]
+    if width != whole:
+        sheet.text(f"Pictures are {width}×{height} pixels, so that the reference fits into the budget. At the scene's "
+                   f"own size a sample takes about {whole ** 2 // width ** 2} times as long, building does not.")
+    spread = "" if machine["spread"] is None else (
+        f" The same small render, {len(machine['probe_seconds'])} times, varied by {machine['spread']:.0%}.")
+    sheet.text(f"{machine['what']}, Mitsuba {machine['mitsuba']}. The study took {result['spent_seconds']:.0f} s of "
+               f"{result['budget_seconds']:.0f} s.{spread}")
+    if result["left_out"]:
+        sheet.table(["way"], [[name] for name in result["left_out"]], f"{len(result['left_out'])} finer ways were left "
+                    f"out, since the budget has less than {TIMES[-1]} s for each")
 
 
-def _references(found: Page, result: dict[str, Any]) -> None:
-    """What errors are held against, how far that can be trusted, and what computed."""
-    found.section("References and machine")
-    known = result["references"]
-    if reference := known.get("reference"):
-        found.text(f"Errors are relative RMSE to the converged field: {reference['about']}. Its own noise is "
-                   f"{reference['noise']:.2%}, which is taken off the errors.")
-    if check := known.get("check"):
-        found.text(check["verdict"])
-    if mesh := known.get("mesh"):
-        found.text(f"“To mesh” is the error to the path-traced mesh, all that is lost: {mesh['about']}.")
-    machine = result["machine"]
-    found.text(result["picture"])
-    found.text(f"{machine['what']}; Mitsuba {machine['mitsuba']}, mi_ntf {machine['version']}. The study took "
-               f"{result['spent_seconds']:.0f} s of {result['budget_seconds']:.0f} s. “of”: how many warm renderings "
-               "the median is of.")
-
-
-class _Thumbnails:
-    """Small pictures, all shown alike."""
-
-    def __init__(self, reference: np.ndarray):
-        self._reference = _small(reference)
-        self._scale = BRIGHT / max(float(np.percentile(reference.max(-1), 99.5)), 1e-12)
-        self._rms = max(float(np.sqrt(np.mean(np.square(reference, dtype=np.float64)))), 1e-12)
-
-    def picture(self, image: np.ndarray) -> np.ndarray:
-        """Linear RGB, as bright as the page shows it."""
-        return np.clip(_small(image) * self._scale, 0, 1)
-
-    def difference(self, image: np.ndarray) -> np.ndarray:
-        """sRGB levels of |image − reference|."""
-        from matplotlib import colormaps
-
-        wrong = np.abs(_small(image) - self._reference).mean(-1) / self._rms
-        return (255 * colormaps["inferno"](np.clip(wrong / ERROR_SCALE, 0, 1))[..., :3]).astype(np.uint8)
-
-
-def _small(image: np.ndarray) -> np.ndarray:
-    """At most `WIDTH` pixels along the longer side, means of squares."""
-    block = -(-max(image.shape[:2]) // WIDTH)
-    h, w = (n // block * block for n in image.shape[:2])
-    return image[:h, :w].reshape(h // block, block, w // block, block, 3).mean((1, 3))
-
-
-@contextmanager
-def progress(budget: float, quiet: bool = False) -> Iterator:
-    """Shows how far a study is, on stderr; gives the function that hears seconds, a text, and
-    whether that is done, which is a line that stays."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn
-
-    console = Console(stderr=True, quiet=quiet)
-    columns = (TextColumn("{task.completed:.0f} of {task.total:.0f} s"), BarColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, console=console) as bar:
-        task = bar.add_task("", total=budget)
-
-        def tell(seconds: float, text: str, done: bool) -> None:
-            bar.update(task, completed=min(seconds, budget), description=escape_markup(text))
-            if done:
-                console.print(f"{seconds:5.0f} s  {text}", highlight=False, markup=False, soft_wrap=True)
-
-        yield tell
-
-
-def escape_markup(text: str) -> str:
-    """`text` for rich, which takes brackets for markup."""
-    from rich.markup import escape as escape_rich
-
-    return escape_rich(text)
+def check(result: dict[str, Any]) -> str:
+    """Return a sentence on the reference against stock ``volpath``, which shares no code for light with it."""
+    stock = next((row for row in result["ways"] if row["method"] == STOCK and row["points"]), None)
+    if stock is None:
+        return "Stock volpath has not checked the reference."
+    gap, sigma = stock["shift"]
+    text = (f"The check of the reference: the mean brightness of stock volpath, after {stock['points'][-1]['samples']} "
+            f"samples a pixel, differs from it by {gap:+.2%} ± {sigma:.2%}")
+    if sigma > 0.02:
+        return f"{text}, too noisy to show differences below {2 * sigma:.0%}."
+    return f"{text}, {'no' if abs(gap) < 2 * sigma else 'perhaps a' if abs(gap) < 3 * sigma else 'a'} difference."
 
 
 def print_table(result: dict[str, Any]) -> None:
-    """The result for a reader."""
+    """Print the seconds to each error."""
     from rich.console import Console
     from rich.table import Table
 
-    console = Console()
-    console = console if console.is_terminal else Console(width=130)
-    table = Table("", "point", "build s", "render s", "error", "noise", "bias")
-    for row in result["points"]:
-        if row["reason"]:
-            table.add_row(str(row["number"]), f"{row['label']}: failed, {row['reason']}")
-            continue
-        name = row["label"] + (" *" if row["front"] else "")
-        table.add_row(str(row["number"]), name, f"{row['build']:.2f}", f"{row['render']:.3g}", f"{row['error']:.1%}",
-                      f"{row['noise']:.1%}", _bias(row))
-    console.print(table)
-    console.print("*: on the front. Bias in brackets is not told from none.", highlight=False)
-    for sentence in result["reading"]:
-        console.print(sentence, highlight=False, markup=False)
+    table = Table(*HEADER[:7])
+    for row in result["ways"]:
+        table.add_row(*cells(row)[:7])
+    Console(width=None if sys.stdout.isatty() else 150).print(table, unsteady(result))

@@ -1,275 +1,216 @@
 """``mi-ntf tradeoff``: the study of one scene, from its references to its report."""
 
-import re
+import statistics
+import sys
+import threading
 import time
-from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
-import numpy as np
 
 from ... import __version__
-from ...core import files
+from ...core import files, interruption
 from ...core.errors import MiNtfError, sentence
-from ...infer.visibility import REGISTRY
-from ...jobs import Workers
-from ...render.cost import model
-from . import errors, reading, references, report
-from .measure import measure
-from .points import STOCK, Point, from_dict, label
-from .references import Reference
-from .search import Proposal, Result, Search
-from .state import ATTEMPTS, State, name_of
-from .subject import Picture, Subject
+from ...render.cost.model import machine
+from .. import mesh_reference
+from ..budget import Tell, progress
+from ..exported_mesh import ExportedMesh
+from ..kept import State
+from ..recipes import integrator_xml, render_command
+from . import errors, references, report
+from .errors import Truth
+from .measure import TIMES, Renderer, follow
+from .ways import BOUND, MESH, Subject, Way, plan
 
 print_table = report.print_table
 
-REFERENCE, CHECK, MESH = 0.35, 0.12, 0.05
-"""Shares of the budget: the converged reference, its comparison with stock `volpath`, a mesh scene to be rendered."""
-UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
-LEAST_BUDGET = 1.0
-PATIENCE, LEAST_PATIENCE = 4.0, 0.15
-"""A rendering is stopped that takes so many times what was predicted, and more than this share of the budget."""
-
-Tell = Callable[[float, str, bool], None]
-"""Hears the seconds spent so far, what is done now, and whether it is done."""
-
-
-def seconds(text: str) -> float:
-    """The seconds of `text`: 90s, 5m, 1h. Raises MiNtfError."""
-    match = re.fullmatch(r"(\d+(?:\.\d*)?)\s*([smh])", text.strip())
-    found = float(match[1]) * UNITS[match[2]] if match else 0.0
-    if found < LEAST_BUDGET:
-        raise MiNtfError(f"--budget is '{text}', expected a time of a second or more such as 90s, 5m or 1h")
-    return found
+REFERENCE = 0.2
+"""Share of the budget for the reference. All errors are held against it, so that it has twice the time that one of ten
+ways gets."""
 
 
 class Study:
-    """One run of the study. `tell` hears what is done; `workers` render the passes of the reference. Points are
-    measured here, one after the other: beside others their seconds would be no measure."""
+    """One run of a study, which takes over what an earlier run of the same study has finished.
+
+    `out`, `budget` and `reference` are those of :func:`tradeoff`; `tell` hears of the progress; `pressed` is set by
+    Ctrl-C (:mod:`mi_ntf.core.interruption`).
+    """
 
     def __init__(self, subject: Subject, out: Path, budget: float, reference: Path | None, tell: Tell,
-                 workers: Workers = Workers()):  # noqa: B008
-        self._workers = workers
-        self.subject, self.budget, self._tell = subject, budget, tell
-        self.state = State(out, _key(subject, reference))
-        self._mesh_path = reference or references.find_mesh(subject)
-        self._must_have_mesh = reference is not None
-        self._mark, self._before = time.perf_counter(), sum(f.get("spent", 0.0) for f in self.state.findings)
+                 pressed: threading.Event):
+        self.subject, self.budget, self._tell, self._pressed = subject, budget, tell, pressed
+        self._mesh_path, self._must_have_mesh = reference or mesh_reference.shipped(subject.path, subject.parameters), (
+            reference is not None)
+        stamp = reference and [str(reference), reference.stat().st_mtime_ns]
+        self.state = State(out, {"scene": subject.key(), "version": __version__, "machine": machine(),
+                                 "budget": budget, "reference": stamp})
+        self._start = time.perf_counter() - max(line.get("clock", 0.0) for line in self.state.lines.values())
+        self.truth: Truth | None = None
+        self.mesh: Truth | None = None
         if self.state.fresh:
-            self.tell(f"begun anew, what lay in {out} is of another {self.state.fresh}", True)
-        elif self.points:
-            self.tell(f"goes on, {len(self.points)} points are there", True)
-        self.reference: Reference | None = None
-        self.mesh: Reference | None = None
+            self.tell(f"begins anew, since what lies in {out} is of another {self.state.fresh}", True)
+        elif rows := self.lines("way"):
+            self.tell(f"goes on; {len(rows)} ways are finished", True)
 
     @property
     def spent(self) -> float:
-        """Seconds of the budget that are gone, those of earlier runs included."""
-        return self._before + time.perf_counter() - self._mark
+        """Seconds of the budget that are used, those of earlier runs included."""
+        return time.perf_counter() - self._start
 
-    @property
-    def points(self) -> list[dict[str, Any]]:
-        """Rows that were measured or failed."""
-        return self.state.of("point")
+    def lines(self, kind: str) -> list[dict[str, Any]]:
+        """Return what is known of each ``way`` or each ``probe``, the render that shows how steady the machine is."""
+        return [line for name, line in self.state.lines.items() if name.startswith(f"{kind} ")]
 
     def tell(self, text: str, done: bool = False) -> None:
         """Say what is done now, or was done."""
         self._tell(self.spent, text, done)
 
     def run(self) -> None:
-        """Everything, as far as it is not there."""
-        self._prepare()
-        search = self._search()
-        while (proposal := search.next(self.budget - self.spent)) is not None:
-            self.tell(f"{label(proposal.point, self.subject.base)}: about {proposal.seconds:.2g} s")
-            self._try(proposal)
-            self._inform(search)
-        self._add("end", skipped=[_skipped(p, self.subject) for p in search.left_out()])
+        """Do all that is not done yet."""
+        shrink, marching = self._prepare()
+        if "end" in self.state.lines:
+            return
+        marching(1, 1)  # compiles and builds, where an earlier run has rendered the reference
+        self._probe(marching)
+        ways = [way for way in plan(self.subject, self.mesh is not None) if f"way {way.name}" not in self.state.lines]
+        left_out = []
+        for i, way in enumerate(ways):
+            always = sum(not w.changes for w in ways[i:])
+            left = max(self.budget - self.spent, 0.0)
+            more = max(0, min(int(left / TIMES[-1]) - always, len(ways) - i - always))
+            if way.changes and not more:
+                left_out.append(way.title)
+                continue
+            # Whatever the ways before have used, each has some time.
+            self._try(way, shrink, max(left / (always + more), self.budget / 40))
+            self._probe(marching)
+        self._add("end", {"left_out": left_out})
 
-    def _add(self, kind: str, **values: Any) -> dict[str, Any]:
-        """A finding, with the seconds since the one before it."""
-        now, gone = time.perf_counter(), self.spent
-        self._before, self._mark = gone, now
-        before = sum(f.get("spent", 0.0) for f in self.state.findings)
-        return self.state.add(kind, **values, spent=gone - before)
+    def _add(self, name: str, values: dict[str, Any]) -> None:
+        """Keep a line, unless Ctrl-C has spoilt it: Mitsuba may have turned that into an error of another kind."""
+        if self._pressed.is_set():
+            raise KeyboardInterrupt
+        self.state.add(name, {**values, "clock": self.spent})
 
-    def _prepare(self) -> None:
-        """The size of the picture and the references."""
-        share = REFERENCE * self.budget
-        if not (found := self.state.one("picture")):
+    def _prepare(self) -> tuple[int, Renderer]:
+        """Find the size of the picture, and the references. Return the former and what renders the reference."""
+        subject, lines, share = self.subject, self.state.lines, REFERENCE * self.budget
+        if "picture" not in lines:
             self.tell("how large a picture the budget allows")
-            picture, about = references.choose_picture(self.subject, 0.8 * share)
-            found = self._add("picture", shrink=picture.shrink, about=about)
-            self.tell(about, True)
-        self.picture = Picture(found["shrink"])
-        self.reference = self._kept("reference", lambda: references.converge(
-            self.subject, self.picture, max(share - self.spent, 0.0), self.tell, self._workers, self.state.folder))
-        if not self.state.one("check"):
-            self.tell("the reference against stock volpath")
-            check = self._add("check", **references.hold_against_stock(
-                self.subject, self.picture, self.reference.image, CHECK * self.budget, self.tell))
-            self.tell(check["verdict"], True)
+            self._add("picture", {"shrink": references.choose_shrink(subject, share / 2)})
+        shrink = lines["picture"]["shrink"]
+        width, height = subject.pixels(shrink)
+        render = references.renderer(subject, references.marched(subject), shrink)
+        if "reference" not in lines or not self.state.pictures("reference"):
+            made, rate = references.converge(render, width * height, max(share - self.spent, 0.0), self.tell)
+            self.state.keep("reference", {"image": made.image})
+            self._add("reference", {"variance": made.variance, "noise": made.noise, "about": made.about,
+                                    "probe": max(1, int(0.25 / rate))})
+            self.tell(f"reference: {made.about}, noise {made.noise:.2%}", True)
+        known = lines["reference"]
+        self.truth = Truth(self.state.pictures("reference")["image"], known["variance"], known["about"])
         if self._mesh_path:
             try:
-                self.mesh = self._kept("mesh", self._find_mesh)
+                self.mesh = references.captured(subject, self._mesh_path, shrink, share / 5)
             except MiNtfError as error:
                 if self._must_have_mesh:
                     raise
-                self.tell(f"no mesh reference: {error}", True)
+                self.tell(f"no mesh to compare with: {error}", True)
+        return shrink, render
 
-    def _find_mesh(self) -> Reference:
-        assert self._mesh_path is not None and self.reference is not None
-        return references.mesh(self.subject, self._mesh_path, self.picture, self.reference.image.shape,
-                               MESH * self.budget)
+    def _probe(self, render: Renderer) -> None:
+        """Time a small render, always the same."""
+        _, took = render(self.state.lines["reference"]["probe"], 1)
+        self._add(f"probe {len(self.lines('probe'))}", {"seconds": took})
 
-    def _kept(self, kind: str, make: Callable[[], Reference]) -> Reference:
-        """A reference from the disk, or made and kept there."""
-        found = self.state.one(kind)
-        image = self.state.image(found["image"]) if found else None
-        if found and image is not None:
-            names = ("variance", "spp", "passes", "seconds", "about")
-            return Reference(image, *(found[name] for name in names))
-        made = make()
-        values = {k: v for k, v in asdict(made).items() if k != "image"}
-        self._add(kind, **values, noise=made.noise, image=self.state.keep(kind, made.image))
-        self.tell(f"{kind}: {made.about}" + (f", noise {made.noise:.2%}" if made.variance else ""), True)
-        return made
-
-    def _search(self) -> Search:
-        subject = self.subject
-        scenes = {name: subject.load(Point("raymarch", 1, representation=name), self.picture)
-                  for name in ("grid", "network")}
-        check = self.state.one("check") or {}
-        pixels = np.prod([n // self.picture.shrink for n in subject.size])
-
-        def predict(point: Point) -> tuple[float, float]:
-            if point.method == STOCK:
-                return 0.0, check["seconds_per_ray"] * float(pixels) * point.spp
-            found = subject.predicted(point, scenes[point.representation])
-            return found["build"], found["render"]
-
-        methods = [name for name in REGISTRY if subject.serves[name]]
-        methods += [STOCK] if "seconds_per_ray" in check else []
-        search = Search(subject.base, methods, subject.limits, predict, self.budget)
-        self._inform(search)
-        return search
-
-    def _inform(self, search: Search) -> None:
-        """Tell the search what is known; the bias of a point is that of all points of its settings."""
-        rows = [(from_dict(row["point"]), row) for row in self.points]
-        for point, row in rows:
-            if row["reason"]:
-                search.add(point, Result(failed=True))
-                continue
-            alike = [reading.error(r) for p, r in rows if p.settings == point.settings and not r["reason"]]
-            search.add(point, Result(row["build"], row["render"], row["noise"], errors.pooled(alike).bias))
-
-    def _try(self, proposal: Proposal) -> None:
-        """Measure a point, or note why it failed."""
-        point, name = proposal.point, name_of(proposal.point.as_dict())
-        row: dict[str, Any] = {"name": name, "point": point.as_dict(), "why": proposal.why, "reason": "",
-                               "label": label(point, self.subject.base)}
-        if self.state.attempts(name) >= ATTEMPTS:
-            self._add("point", **row | {"reason": f"the process ended {ATTEMPTS} times while it was measured"})
-            return
-        self.state.add("begun", name=name)
+    def _try(self, way: Way, shrink: int, share: float) -> None:
+        """Measure a way, or note why it failed."""
+        assert self.truth is not None
+        row: dict[str, Any] = {"way": way.name, "method": way.method, "title": way.title, "finer": bool(way.changes),
+                               "points": [], "reason": "", "note": "", "command": ""}
+        self.tell(way.title)
         try:
-            row |= self._measured(point, name, self._patience(proposal))
-        except KeyboardInterrupt:
-            self.state.add("interrupted", name=name)
-            raise
+            scene, properties = None, way.properties(self.subject)
+            row["xml"] = integrator_xml(way.plugin, properties)
+            if way.method == MESH:
+                made = ExportedMesh(self.subject.scene(shrink), self.subject.media, self.state.folder)
+                scene, row["command"], row["xml"] = made.scene, made.commands, row["xml"] + made.shapes
+                row["note"] = (f"Making the mesh took {made.seconds:.0f} s, which are not counted, as those of the "
+                               "field's voxels are not for the other ways. ")
+            render = references.renderer(self.subject, way, shrink, scene)
+            curve = follow(render, self.truth, self.mesh, share, lambda e: self.tell(f"{way.title}: error {e:.1%}"))
+            end = curve.points[-1]
+            if len(curve.points) == 1:
+                row["note"] += (f"A single pass takes longer than this way's share of the budget, {share:.0f} s, so "
+                                "that its noise and bias are not known.")
+            if way.plugin == "nrf":
+                row["command"] = render_command(self.subject.path, self.subject.parameters, properties, end["samples"])
+            self.state.keep(way.name, curve.pictures)
+            row |= {"points": curve.points, "shift": curve.shift, "compile": render.compile, "peak": render.peak}
+            text = f"error {end['error']:.1%} after {end['seconds']:.1f} s"
         except Exception as error:
-            row["reason"] = sentence(error)
-        found = self._add("point", **row)
-        self.tell(_told(found), True)
+            row["reason"] = text = sentence(error)
+        self._add(f"way {way.name}", row)
+        self.tell(f"{way.title}: {text}", True)
 
-    def _patience(self, proposal: Proposal) -> float:
-        """Seconds that one picture may take."""
-        share = max(PATIENCE * proposal.seconds, LEAST_PATIENCE * self.budget)
-        return max(5.0, min(share, self.budget - self.spent))
-
-    def _measured(self, point: Point, name: str, timeout: float) -> dict[str, Any]:
-        """The figures of a point's row."""
-        assert self.reference is not None
-        images, timing = measure(self.subject, point, self.picture, timeout)
-        found = errors.split(images, self.reference.image, self.reference.variance)
-        row: dict[str, Any] = {**asdict(timing), "noise": found.noise, "bias": found.bias,
-                               "uncertainty": found.uncertainty, "error": found.total,
-                               "image": self.state.keep(name, images[0])}
-        if self.mesh:
-            row["mesh_error"] = errors.split(images, self.mesh.image, self.mesh.variance).total
-        return row
+    def result(self) -> dict[str, Any]:
+        """Return what ``tradeoff.json`` holds."""
+        lines, subject, rows = self.state.lines, self.subject, self.lines("way")
+        points = [p for row in rows if row["method"] != BOUND for p in row["points"]]
+        ends = errors.front([(p["seconds"], p["error"]) for p in points])
+        for i, point in enumerate(points):
+            point["front"] = i in ends
+        probes, path = [probe["seconds"] for probe in self.lines("probe")], subject.path.resolve()
+        spread = statistics.stdev(probes) / statistics.mean(probes) if len(probes) > 1 else None
+        return {
+            "scene": str(subject.path), "title": f"{path.parent.name}/{path.name}", "parameters": subject.parameters,
+            "size": subject.pixels(lines["picture"]["shrink"]), "scene_size": subject.size,
+            "budget_seconds": self.budget, "spent_seconds": self.spent, "finished": "end" in lines,
+            "machine": {"what": machine(), "mitsuba": mi.__version__, "probe_seconds": probes, "spread": spread},
+            "reference": lines["reference"], "mesh": self.mesh and self.mesh.about, "ways": rows,
+            "left_out": lines.get("end", {}).get("left_out", []),
+        }
 
 
 def tradeoff(scene: Path, out: Path = Path("tradeoff"), parameters: dict[str, str] | None = None,
-             budget: float = 300.0, reference: Path | None = None, quiet: bool = False,
-             workers: Workers = Workers()) -> dict[str, Any]:  # noqa: B008
-    """Study `scene` (with `parameters` for its $names) for `budget` seconds and write ``index.html``, ``tradeoff.csv``
-    and ``tradeoff.json`` to `out`, where an interrupted study of the same scene goes on.
+             budget: float = 300.0, reference: Path | None = None, quiet: bool = False) -> dict[str, Any]:
+    """Study what accuracy costs on a scene, and write ``index.html``, ``tradeoff.csv`` and ``tradeoff.json``.
 
-    reference  the path-traced mesh: an EXR picture or the XML file of its scene; None: what shipped scenes have
-    quiet      no progress on stderr
-    workers    who renders the passes of the reference; points are measured here
+    Parameters
+    ----------
+    scene, parameters
+        XML file with an ``nrf`` integrator, and values of its $names.
+    out
+        Folder for the report, where an interrupted study goes on.
+    budget
+        Seconds.
+    reference
+        The captured mesh, an EXR picture or the XML file of its scene; None: what shipped scenes have.
+    quiet
+        True: no progress on stderr.
 
-    Returns what ``tradeoff.json`` holds. Raises MiNtfError for what cannot be rendered, and KeyboardInterrupt as it
-    comes, after the report of what is there.
+    Returns what ``tradeoff.json`` holds. Raises MiNtfError where the scene cannot be rendered, and KeyboardInterrupt as
+    it comes, after the report of what is there.
     """
-    workers.check()
-    subject = Subject(scene, parameters or {})
     if reference is not None and not reference.is_file():
         raise MiNtfError(f"reference {reference} does not exist; give an EXR picture or the XML file of a mesh scene")
-    files.make_folder(out)
-    with report.progress(budget, quiet) as tell:
-        study = Study(subject, out, budget, reference, tell, workers)
+    study: Study | None = None
+    with interruption.noticed() as pressed:
         try:
-            study.run()
+            subject = Subject(scene, parameters or {})
+            files.make_folder(out)
+            with progress(budget, quiet) as tell:
+                study = Study(subject, out, budget, reference, tell, pressed)
+                study.run()
+        except BaseException:
+            if not pressed.is_set():
+                raise
+            done = f"{len(study.lines('way'))} ways are finished; " if study else ""
+            print(f"mi-ntf: interrupted; {done}the same command goes on", file=sys.stderr)
+            raise KeyboardInterrupt from None
         finally:
-            result = None
-            if study.reference is not None:
-                result = _result(study, scene)
-                report.write(result, study, out)
-    assert result is not None  # else the study has raised
-    return result
-
-
-def _key(subject: Subject, reference: Path | None) -> dict[str, Any]:
-    """What findings hold for."""
-    stamp = [str(reference), reference.stat().st_mtime_ns] if reference else None
-    return {"scene": subject.key(), "version": __version__, "machine": model.machine(), "reference": stamp}
-
-
-def _result(study: Study, scene: Path) -> dict[str, Any]:
-    """All that is known, JSON-ready: rows, references, machine, and sentences that read them."""
-    state, subject = study.state, study.subject
-    last = state.findings[-1]
-    end = last if last["kind"] == "end" else None
-    width, height = (n // study.picture.shrink for n in subject.size)
-    rows = [dict(row) for row in study.points]
-    reading.mark_front(rows)
-    plain = ("kind", "image", "spent")
-    return {
-        "scene": str(scene), "parameters": subject.parameters, "size": [width, height],
-        "scene_size": list(subject.size), "picture": (state.one("picture") or {}).get("about", ""),
-        "base": subject.base.as_dict(), "scene_visibility": subject.visibility, "budget_seconds": study.budget,
-        "spent_seconds": study.spent, "finished": end is not None,
-        "machine": {"what": model.machine(), "mitsuba": mi.__version__, "version": __version__},
-        "references": {kind: {k: v for k, v in found.items() if k not in plain}
-                       for kind in ("reference", "check", "mesh") if (found := state.one(kind))},
-        "points": rows, "skipped": end["skipped"] if end else [], "reading": reading.reading(rows),
-    }
-
-
-def _skipped(proposal: Proposal, subject: Subject) -> dict[str, Any]:
-    return {"label": label(proposal.point, subject.base), "point": proposal.point.as_dict(),
-            "reason": f"skipped: measuring it would take about {proposal.cost:.0f} s, which were not left"}
-
-
-def _told(row: dict[str, Any]) -> str:
-    """A point in one line."""
-    if row["reason"]:
-        return f"{row['label']}: {row['reason']}"
-    return (f"{row['label']}: {row['build'] + row['render']:.2f} s, error {row['error']:.1%} "
-            f"(noise {row['noise']:.1%}, bias {row['bias']:.1%})")
+            if study and study.truth is not None:
+                pictures = {row["way"]: study.state.pictures(row["way"]) for row in study.lines("way")}
+                report.write(study.result(), study.truth.image, pictures, out)
+    return study.result()

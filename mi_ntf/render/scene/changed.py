@@ -20,6 +20,16 @@ def load(path: Path, parameters: dict[str, str], change: Callable[[Any], None], 
         return instantiated(path, state, strict)
 
 
+def shrink_film(props, shrink: int) -> None:
+    """Make a film RGBA, with one pixel for `shrink` along each side of it and of its crop; `props`: its properties."""
+    for name, default in (("width", 768), ("height", 576)):
+        props[name] = max(1, int(props.get(name, default)) // shrink)
+    for name in ("crop_offset_x", "crop_offset_y", "crop_width", "crop_height"):
+        if name in props:
+            props[name] = int(props[name]) // shrink
+    props["pixel_format"] = "rgba"
+
+
 def parsed(path: Path, parameters: dict[str, str], strict: bool = True):
     """What an XML file says, `parameters` for its $names: ``nodes``, each with a ``type`` and ``props``."""
     with beside(path):

@@ -65,6 +65,14 @@ class Frame:
         """Numbers that tell frames apart."""
         return self._matrix.tobytes(), self.origin.tobytes(), self.length
 
+    def of_capture(self, similarity: Similarity) -> np.ndarray:
+        """Return the (4, 4) matrix that takes coordinates of the capture, whose sphere is `similarity`, to the scene's.
+        """
+        matrix = np.eye(4)
+        matrix[:3, :3] = self._matrix * (self.length / similarity.radius)
+        matrix[:3, 3] = self.origin - matrix[:3, :3] @ np.asarray(similarity.center)
+        return matrix
+
     def world_to_field_numpy(self, p: np.ndarray, direction: bool = False) -> np.ndarray:
         """(n, 3) scene points (or directions) → field, in float64 on the host."""
         return p @ self._matrix if direction else (p - self.origin) @ self._matrix / self.length
