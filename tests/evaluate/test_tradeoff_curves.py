@@ -18,7 +18,7 @@ from mi_ntf.evaluate.tradeoff import measure, references, ways
 from mi_ntf.evaluate.tradeoff.errors import Truth
 from mi_ntf.evaluate.tradeoff.ways import Subject, Way
 from mi_ntf.infer.visibility import REGISTRY
-from mi_ntf.render.cost.measurement import once
+from mi_ntf.render.timing import once
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from ...core.errors import MiNtfError
-from ...render.cost.measurement import once
-from ...render.maps.map_cache import maps_in_memory
+from ...render.maps import map_cache
+from ...render.timing import once
 from .errors import Estimate, Mean, Truth
 
 TIMES = (1, 3, 10)
@@ -74,7 +74,7 @@ def follow(render: Callable[[int, int], tuple[np.ndarray, float]], truth: Truth,
     """
     curve, mean, other = Curve(), Mean(truth), Mean(mesh) if mesh else None
     begin, seconds, samples = time.perf_counter(), 0.0, 1
-    with maps_in_memory():
+    with map_cache.in_memory():
         while samples:
             start = time.perf_counter()
             picture, took = render(samples, 2 * mean.pictures)  # references have odd seeds

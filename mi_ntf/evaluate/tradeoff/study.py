@@ -12,7 +12,7 @@ import mitsuba as mi
 from ... import __version__
 from ...core import files, interruption
 from ...core.errors import MiNtfError, sentence
-from ...render.cost.model import machine
+from ...render.machine import machine
 from .. import mesh_reference
 from ..budget import Tell, progress
 from ..exported_mesh import ExportedMesh

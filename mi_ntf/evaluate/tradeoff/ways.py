@@ -15,7 +15,7 @@ from ...render.scene import changed
 from ...render.scene.media import find_media
 
 PROPERTIES = ("samples", "light_samples", "environment_lights", "map_resolution", "map_source", "map_components",
-              "map_memory", "max_depth", "bounces", "hide_emitters")
+              "map_memory", "max_depth", "bounces", "unbiased", "hide_emitters")
 """Properties of the scene's integrator that all ways take over: not its method, nor limits, files of maps and further
 outputs."""
 STOCK, MESH, BOUND = "volpath", "mesh", "none"
@@ -31,7 +31,8 @@ _TITLES = {STOCK: "stock volpath", MESH: "exported mesh, stock path", BOUND: "no
            "visibility_mlp": "visibility MLP"}
 _WORDS = {"samples": "{} steps", "light_samples": "{} lights drawn at each point",
           "environment_lights": "{} environment lights", "map_resolution": "{0}×{0} texels",
-          "map_components": "{} logistics a texel", "bounces": "further light by {}"}
+          "map_components": "{} logistics a texel", "bounces": "further light by {}",
+          "unbiased": "corrected by marches at random"}
 
 
 class Subject:
@@ -142,6 +143,8 @@ def finer(subject: Subject, methods: list[str]) -> list[Way]:
     dials: list[tuple[str, str, Any]] = []
     if subject.lights > DRAWN and not values["light_samples"]:
         dials += [(name, "light_samples", DRAWN) for name in summed]
+    if not values["unbiased"]:
+        dials += [(name, "unbiased", True) for name in methods if REGISTRY[name].automatic and REGISTRY[name].numbers]
     dials += [(name, "map_resolution", 2 * (values["map_resolution"] or subject.texels(name))) for name in methods
               if "map_resolution" in REGISTRY[name].dials]
     if values["map_components"] == 1 and values["map_source"] == "field":

@@ -4,7 +4,6 @@ A map's key is everything that its texels depend on: the field's content, grid a
 resolution, source and number of logistics (:mod:`mi_ntf.render.user_cache`).
 """
 
-import os
 import threading
 from collections import OrderedDict
 from collections.abc import Iterator
@@ -116,22 +115,6 @@ def forget() -> None:
     with _lock:
         _maps.clear()
         _forget_gone()
-
-
-@contextmanager
-def maps_in_memory() -> Iterator[None]:
-    """Within, transmittance maps are kept in memory and in no file, and there are none yet."""
-    name = "MI_NTF_CACHE"
-    before = os.environ.get(name)
-    os.environ[name] = "memory"
-    forget()
-    try:
-        yield
-    finally:
-        forget()
-        os.environ.pop(name)
-        if before is not None:
-            os.environ[name] = before
 
 
 def keep_used() -> None:

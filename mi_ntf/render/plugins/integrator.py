@@ -47,9 +47,9 @@ def integrator_class() -> type:
                                     ``radiosity``, without noise and biased, between opaque fields alone, whose
                                     skins count as diffuse; ``auto``: ``radiosity`` where nothing else takes part
                                     (default: auto)
-        unbiased            boolean march to a sixteenth of the pairs of point and light, drawn at random, which corrects
-                                    what maps and atlases err by: the mean over seeds is that of ``raymarch``; their
-                                    error becomes noise (default: false)
+        unbiased            boolean march to a sixteenth of the pairs of point and light, drawn at random, to correct
+                                    what maps and atlases err by: the mean over seeds is that of ``raymarch``, and
+                                    their error becomes noise (default: false)
         aovs                string  further outputs, a comma-separated list of ``depth``, ``normal``, ``albedo``,
                                     ``roughness``, ``opacity``, ``visibility``, ``visibility_lights``: see
                                     :mod:`mi_ntf.render.transport.aovs` (default: none)
