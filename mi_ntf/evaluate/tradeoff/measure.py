@@ -1,6 +1,5 @@
 """The curve of one way to render: passes with independent seeds, and the error of their mean after each."""
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -64,8 +63,8 @@ class Curve:
 
 def follow(render: Callable[[int, int], tuple[np.ndarray, float]], truth: Truth, mesh: Truth | None, budget: float,
            tell: Callable[[float], None]) -> Curve:
-    """Render passes until `budget` seconds by the clock are used, or the noise is below the reference's own or a tenth
-    of the bias, where more samples would change the error no more.
+    """Render passes until `budget` seconds are used, compilation apart, or the noise is below the reference's own or a
+    tenth of the bias, where more samples would change the error no more.
 
     `render` takes samples and a seed and returns a picture and seconds, as :class:`Renderer`; what it builds, it builds
     anew in the first pass, which is rendered whatever it takes. `tell` is called with each error. Passes double the
@@ -73,10 +72,9 @@ def follow(render: Callable[[int, int], tuple[np.ndarray, float]], truth: Truth,
     of the budget, but less than twice as much, a quarter of it is added for samples.
     """
     curve, mean, other = Curve(), Mean(truth), Mean(mesh) if mesh else None
-    begin, seconds, samples = time.perf_counter(), 0.0, 1
+    seconds, samples = 0.0, 1
     with map_cache.in_memory():
         while samples:
-            start = time.perf_counter()
             picture, took = render(samples, 2 * mean.pictures)  # references have odd seeds
             seconds += took
             mean.add(picture, samples)
@@ -84,13 +82,12 @@ def follow(render: Callable[[int, int], tuple[np.ndarray, float]], truth: Truth,
                 other.add(picture, samples)
             curve.add(seconds, mean, other)
             tell(curve.points[-1]["error"])
-            used, last = time.perf_counter() - begin, time.perf_counter() - start
-            if mean.pictures == 1 and budget / 2 < used < 2 * budget:  # for building, so that samples have some of it
-                budget = max(budget, used + budget / 4)
+            if mean.pictures == 1 and budget / 2 < seconds < 2 * budget:  # for building: samples have some of it, too
+                budget = max(budget, seconds + budget / 4)
             noise, bias = (e.value for e in mean.split()) if mean.pictures > 1 else (1.0, 0.0)
-            if used >= budget or noise < max(truth.noise, bias / 10):
+            if seconds >= budget or noise < max(truth.noise, bias / 10):
                 break
-            fit = (budget - used) / last * samples if mean.pictures > 1 else 1.0
+            fit = (budget - seconds) / took * samples if mean.pictures > 1 else 1.0
             mark = next(((t - seconds) / took * samples for t in TIMES if t > seconds), 0.0)
             samples = following(mean.samples, fit, mark, LARGEST_PASS // picture[..., 0].size)
     return curve
