@@ -78,6 +78,7 @@ class Chooser:
         self._spp, self._patches, self._gone, self._before, self._whole = spp, patches, gone, before, whole
         self._rays = math.prod(int(n) for n in sensor.film().crop_size()) * spp
         self._trials: list[Trial] = []
+        self._all_glints: list[Look] = []  # of all lights, once it is wanted
         self._spent = self._vain = 0.0
 
     def choose(self) -> Choice:
@@ -185,10 +186,11 @@ class Chooser:
             return Error(0.0, 0.0)
         pilot = Pilot(self._sensor, fewer.media, GLINTS * BLOCKS)
         wanted = fewer.settings.but(visibility="none", max_depth=2)
-        counts = fewer.settings.environment_lights, self._settings.environment_lights
-        look, truth = (pilot.look(partial(self._composed, wanted.but(environment_lights=n))) for n in counts)
-        self._spent += look.wall + truth.wall
-        return pilot.error(look, truth, self._samples())
+        counts = (fewer.settings.environment_lights, *([] if self._all_glints else [self._settings.environment_lights]))
+        look, *truth = (pilot.look(partial(self._composed, wanted.but(environment_lights=n))) for n in counts)
+        self._all_glints += truth
+        self._spent += look.wall + sum(t.wall for t in truth)
+        return pilot.error(look, self._all_glints[0], self._samples())
 
     def _affordable(self, best: Trial, building: float) -> bool:
         """Return True if another look is a small part of the time of all frames, and so is what it builds in vain."""

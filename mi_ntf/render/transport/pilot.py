@@ -84,10 +84,11 @@ class Pilot:
     def look(self, compose: Callable[[], Composition]) -> Look:
         """Render the pilot by the composition that `compose` makes."""
         begin = time.perf_counter()
-        (composition, radiance, seen), seconds = timing.measure(lambda: self._trace(compose()))
+        composition, made = timing.measure(compose)
+        (radiance, seen), seconds = timing.measure(lambda: self._trace(composition))
         # Rays that meet nothing take next to no time.
         rays = self._pixels * float(self.weight @ seen) / max(SAMPLES * int(seen.sum()), 1)
-        return Look(composition, radiance, seen, seconds.building, seconds.kernels * rays,
+        return Look(composition, radiance, seen, made.building + seconds.building, seconds.kernels * rays,
                     time.perf_counter() - begin)
 
     def _trace(self, composition: Composition):
@@ -99,7 +100,7 @@ class Pilot:
             total += light * self._importance
             seen |= opacity > 0
             dr.eval(total, seen)
-        return (composition, np.array(total, np.float64).T.reshape(-1, SAMPLES, 3),
+        return (np.array(total, np.float64).T.reshape(-1, SAMPLES, 3),
                 np.array(seen).reshape(-1, SAMPLES).any(1))
 
     def error(self, look: Look, truth: Look, samples: float) -> Error:
