@@ -25,7 +25,7 @@ def clock(monkeypatch, each):
 
     def look(self, compose):
         seen = plain(self, compose)
-        return pilot.Look(seen.composition, seen.radiance, seen.seen, 0.0, each(seen.composition.settings), 1e-6)
+        return pilot.Look(seen.composition, seen.radiance, 0.0, each(seen.composition.settings), 1e-6, 0.0)
 
     monkeypatch.setattr(pilot.Pilot, "look", look)
 

@@ -49,8 +49,7 @@ def some_looks(rng, one, bias: float, noise: float):
     shape = (len(one.weight), 1, 1)
     off = bias * rng.normal(size=shape) + noise * rng.normal(size=(len(one.weight), pilot.SAMPLES, 1))
     power = np.sqrt((truth**2).mean())
-    seen = np.ones(len(one.weight), bool)
-    return (pilot.Look(None, a, seen, 0.0, 1.0, 0.0) for a in (truth + power * off, truth))
+    return (pilot.Look(None, a, 0.0, 1.0, 0.0, 0.0) for a in (truth + power * off, truth))
 
 
 @pytest.fixture
@@ -72,7 +71,7 @@ def test_errors_are_those_of_pictures(rng, one, bias, noise, samples):
 
 
 def test_a_black_truth_has_no_error(one):
-    dark = pilot.Look(None, np.zeros((len(one.weight), pilot.SAMPLES, 3)), np.zeros(len(one.weight), bool), 0, 0, 0)
+    dark = pilot.Look(None, np.zeros((len(one.weight), pilot.SAMPLES, 3)), 0, 0, 0, 0)
     assert one.error(dark, dark, 4) == (0.0, 0.0) and one.noise(dark) == 0.0 and one.samples_for(0.1, dark) == 1.0
 
 

@@ -117,7 +117,7 @@ class Chooser:
 
     def _look(self, settings: Settings, composition: Composition | None = None) -> Look:
         look = self._pilot.look(lambda: composition or self._composed(settings))
-        self._spent += look.wall - look.built
+        self._spent += look.took - look.compiling
         return look
 
     def _judged(self, first: Composition) -> tuple[Look, Error]:
@@ -189,7 +189,7 @@ class Chooser:
         counts = (fewer.settings.environment_lights, *([] if self._all_glints else [self._settings.environment_lights]))
         look, *truth = (pilot.look(partial(self._composed, wanted.but(environment_lights=n))) for n in counts)
         self._all_glints += truth
-        self._spent += look.wall + sum(t.wall for t in truth)
+        self._spent += sum(each.took - each.compiling for each in (look, *truth))
         return pilot.error(look, self._all_glints[0], self._samples())
 
     def _affordable(self, best: Trial, building: float) -> bool:
@@ -210,7 +210,7 @@ class Chooser:
         least = self._end(look)
         self._trials.append(Trial("raymarch", self._limits.seconds, *least, True, "the least error in this time"))
         for name, settings, rays in candidates.methods(march):
-            if self._spent / len(self._trials) + self._building(rays) > IN_VAIN * self._left():
+            if look.took + self._building(rays) > IN_VAIN * self._left():
                 self._trials.append(Trial(name, why="not tried: it would take too much of the time"))
                 continue
             other = self._look(settings)

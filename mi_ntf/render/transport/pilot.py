@@ -31,18 +31,17 @@ class Look:
     """The pilot rendered in one way.
 
     radiance  (pixels, samples, 3)
-    seen      (pixels,): true if anything is seen there
     built     seconds of building that do not grow with the picture
     each      seconds of one sample of every pixel of the picture
-    wall      seconds that the pilot itself took, compilation included
+    took      seconds of the look itself, building left out; `compiling`: of these, compilation
     """
 
     composition: Composition
     radiance: np.ndarray
-    seen: np.ndarray
     built: float
     each: float
-    wall: float
+    took: float
+    compiling: float
 
 
 class Error(NamedTuple):
@@ -88,8 +87,9 @@ class Pilot:
         (radiance, seen), seconds = timing.measure(lambda: self._trace(composition))
         # Rays that meet nothing take next to no time.
         rays = self._pixels * float(self.weight @ seen) / max(SAMPLES * int(seen.sum()), 1)
-        return Look(composition, radiance, seen, made.building + seconds.building, seconds.kernels * rays,
-                    time.perf_counter() - begin)
+        built = made.building + seconds.building
+        return Look(composition, radiance, built, seconds.kernels * rays, time.perf_counter() - begin - built,
+                    made.compiling + seconds.compiling)
 
     def _trace(self, composition: Composition):
         total, seen = mi.Color3f(0), mi.Bool(False)
