@@ -59,7 +59,7 @@ def explain(scene: Path, parameters: dict[str, str], measure: bool = False) -> d
         "lights": {"emitters": list(described.emitters), "count": count, "drawn": effects.drawn(settings, light)},
         "environments": [_environment(each) for each in light.discrete if each.cells],
         "visibility": described.visibility,
-        "method": candidates.name(settings),
+        "method": candidates.name(settings, Settings.of(integrator)),
         "effects": _effects(loaded, described, settings, count, light.suns().sum()),
         "predicted": choice.predicted,
         "trials": [vars(t) for t in choice.trials],

@@ -15,8 +15,8 @@ from ..scene.settings import Settings
 from .composition import Composition
 
 
-def methods(march: Composition) -> Iterator[tuple[str, Settings, int]]:
-    """Yield ``(name, settings, rays)`` of what may take the place of the `march`.
+def methods(march: Composition) -> Iterator[tuple[Settings, int]]:
+    """Yield ``(settings, rays)`` of what may take the place of the `march`.
 
     `rays` fill what the method holds. Maps that do not fit into `map_memory` at once are left out, since every pass
     would build them anew, and so are maps of no light.
@@ -26,15 +26,23 @@ def methods(march: Composition) -> Iterator[tuple[str, Settings, int]]:
             for logistics in ((1, 2) if "map_components" in method.dials else (march.settings.map_components,))]
     for settings in sorted(ways, key=lambda s: _rays(march, s)):
         if per_field(settings) or _fits(march, settings):
-            yield name(settings), settings, _rays(march, settings)
+            yield settings, _rays(march, settings)
 
 
-def name(settings: Settings) -> str:
-    """Return a method and its dials in words."""
-    if not REGISTRY[settings.visibility].drawn:
-        return settings.visibility
-    logistics = ", two logistics" if settings.map_components == 2 else ""
-    return f"{settings.visibility} of {settings.map_resolution}²{logistics}"
+def name(settings: Settings, whole: Settings) -> str:
+    """Return in words a method, its dials, and what it leaves out of the picture that `whole` asks for."""
+    drawn = bool(REGISTRY[settings.visibility].drawn)
+    less = {
+        f" of {settings.map_resolution}²": drawn,
+        ", two logistics": drawn and settings.map_components == 2,
+        ", without further bounces": settings.max_depth != whole.max_depth,
+        f", without {len(settings.without)} of the fields": bool(settings.without),
+        f", {settings.environment_lights} lights of the environment":
+            settings.environment_lights < whole.environment_lights,
+        f", {settings.brightest} brightest lights": bool(settings.brightest),
+        ", without specular lobes": whole.specular and not settings.specular,
+    }
+    return settings.visibility + "".join(words for words, there in less.items() if there)
 
 
 def per_field(settings: Settings) -> bool:
@@ -82,11 +90,6 @@ def _no_lobes(now: Composition) -> Settings | None:
     return now.settings.but(specular=False) if now.effects.specular else None
 
 
-OMISSIONS: dict[str, Callable[[Composition], Settings | None]] = {
-    "without further bounces": _no_bounces,
-    "without the smallest field": _no_smallest_field,
-    "with half of the environment's lights": _half_of_an_environment,
-    "without the dimmer half of the lights": _dimmer_half,
-    "without specular lobes": _no_lobes,
-}
-"""Name → function of a composition, which returns settings that leave something out; None if there is nothing."""
+OMISSIONS: tuple[Callable[[Composition], Settings | None], ...] = (
+    _no_bounces, _no_smallest_field, _half_of_an_environment, _dimmer_half, _no_lobes)
+"""Functions of a composition that return settings which leave something out; None if there is nothing."""

@@ -148,23 +148,29 @@ class Chooser:
         """Return the fastest choice whose error has an upper bound below `max_error`."""
         look, error = self._judged(first)
         why = "named" if named else "the march, whose error is 0 by definition"
-        best = Trial(candidates.name(first.settings), self._seconds(look), *error, True, why)
+        best = Trial(self._name(first.settings), self._seconds(look), *error, True, why)
         self._trials.append(best)
-        for name, settings, rays in () if named else candidates.methods(first):
+        for settings, rays in () if named else candidates.methods(first):
             building = self._building(rays)
             if building / self._shared(settings) > best.seconds or not self._affordable(best, building):
-                self._trials.append(Trial(name, why="not tried: it would take too much of the time it might save"))
+                self._pass(settings)
                 continue
-            best, look = self._tried(name, settings, best, look)
-        for what, of in {} if self._whole else candidates.OMISSIONS.items():
-            while (less := of(look.composition)) is not None and self._affordable(best, 0.0):
+            best, look = self._tried(settings, best, look)
+        for leave_out in () if self._whole else candidates.OMISSIONS:
+            while (less := leave_out(look.composition)) is not None and self._affordable(best, 0.0):
                 before = best
-                best, look = self._tried(f"{candidates.name(less)} {what}", less, best, look)
+                best, look = self._tried(less, best, look)
                 if best is before:
                     break
         return Choice(look.composition, self._trials, self._predicted(best.seconds, (best.error, best.bound)))
 
-    def _tried(self, name: str, settings: Settings, best: Trial, look: Look) -> tuple[Trial, Look]:
+    def _name(self, settings: Settings) -> str:
+        return candidates.name(settings, self._settings)
+
+    def _pass(self, settings: Settings) -> None:
+        self._trials.append(Trial(self._name(settings), why="not tried: it would take too much of the time"))
+
+    def _tried(self, settings: Settings, best: Trial, look: Look) -> tuple[Trial, Look]:
         """Look at a candidate; return it and its look if it is better than `best`, else `best` and its look."""
         other = self._look(settings)
         error, seconds = self._pilot.error(other, self._truth, self._samples()), self._seconds(other)
@@ -173,7 +179,7 @@ class Chooser:
         good = error.bound <= self._limits.error
         taken = good and seconds < best.seconds
         why = "the fastest within max_error" if taken else "no faster" if good else "its error may exceed max_error"
-        trial = Trial(name, seconds, *error, taken, why)
+        trial = Trial(self._name(settings), seconds, *error, taken, why)
         self._trials.append(trial)
         if taken:
             return trial, other
@@ -209,15 +215,15 @@ class Chooser:
         look, _ = self._judged(march)
         least = self._end(look)
         self._trials.append(Trial("raymarch", self._limits.seconds, *least, True, "the least error in this time"))
-        for name, settings, rays in candidates.methods(march):
+        for settings, rays in candidates.methods(march):
             if look.took + self._building(rays) > IN_VAIN * self._left():
-                self._trials.append(Trial(name, why="not tried: it would take too much of the time"))
+                self._pass(settings)
                 continue
             other = self._look(settings)
             end = self._end(other)
             taken = end.bound < least.bound
             why = "the least error in this time" if taken else "a larger error in this time"
-            self._trials.append(Trial(name, self._limits.seconds, *end, taken, why))
+            self._trials.append(Trial(self._name(settings), self._limits.seconds, *end, taken, why))
             look, least = (other, end) if taken else (look, least)
         if look.each > self._left():
             mi.Log(  # type: ignore[operator]  # an object in the stub
