@@ -25,7 +25,7 @@ KINDS = {
 }  # fmt: skip
 NUMBERS = {"timeout", "map_memory", "scale", "sampling_weight", "noise_threshold", "max_error", "time_budget"}
 WORDS = {"visibility", "bounces", "map_source", "representation", "aovs", "filename", "map_file"}
-FLAGS = {"hide_emitters", "sample_emitters"}
+FLAGS = {"hide_emitters", "sample_emitters", "unbiased"}
 RANGES = {
     "samples": (8, 8192), "light_samples": (0, 65536), "environment_lights": (1, 65536), "map_resolution": (0, 4096),
     "map_components": (1, 2), "map_memory": (0.0, 2.0**24), "max_depth": (-1, 1 << 20), "resolution": (16, 1024),

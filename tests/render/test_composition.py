@@ -228,8 +228,8 @@ def test_a_sun_among_many_lights_is_marched_to(monkeypatch):
 
     truth = picture("raymarch")
     assert dial.relative(picture("transmittance_atlas"), truth) < 0.004
-    light = scene_lights.Lights(loaded, find_media(loaded), dimmest=0.1)
-    assert light.suns().sum() == 1 and len(light.suns()) == len(light.rows.power) < 400  # of 470
+    light = scene_lights.Lights(loaded, find_media(loaded), brightest=300)
+    assert light.suns().sum() == 1 and len(light.suns()) == len(light.rows.power) == 300  # of 470
     assert light.rows.power[light.suns()].sum() > 0.5 * light.rows.power.sum()
     monkeypatch.setattr(scene_lights.Lights, "suns", lambda self: np.zeros(1, bool))
     assert dial.relative(picture("transmittance_atlas"), truth) > 0.015
