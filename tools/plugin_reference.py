@@ -69,7 +69,7 @@ def inline(text: str) -> str:
 
 
 def is_border(line: str) -> bool:
-    """Whether `line` is the first one of a simple table."""
+    """Return True if `line` is the first one of a simple table."""
     return re.fullmatch(r"=+( +=+)+", line) is not None
 
 

@@ -1,5 +1,5 @@
-"""One short HTML page that holds all it shows: no network, and no scripts but those given to :meth:`Page.markup`. For
-reports to look at.
+"""HTML pages for reports. A page holds all that it shows: it needs no network, and no scripts but those given to
+:meth:`Page.markup`.
 
     page = Page("skull")
     page.section("Photographs")

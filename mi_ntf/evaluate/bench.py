@@ -83,7 +83,7 @@ def _atlas(resolution: int | None):
 
 
 def machine() -> dict:
-    """What the figures were measured on."""
+    """Return the machine, its load and the versions that the figures were measured with."""
     return {"processor": processor(), "cores": os.cpu_count(), "load": round(os.getloadavg()[0], 2),
             "variant": mi.variant(), "mitsuba": mi.__version__}
 

@@ -1,4 +1,4 @@
-"""What the demo shows: its table and its picture."""
+"""Table and picture of the demo."""
 
 import json
 import os
@@ -24,7 +24,7 @@ CURVE_HEIGHT = 4.8
 
 @dataclass(frozen=True)
 class Shot:
-    """One render. `image`: linear RGBA (h, w, 4); `seconds`: wall time of the whole process, start included."""
+    """A render. `image`: linear RGBA (h, w, 4); `seconds`: wall time of the whole process, start included."""
 
     light: str
     visibility: str

@@ -1,4 +1,4 @@
-"""What the limits of the integrator ``nrf`` keep to, on the shipped scenes.
+"""Measurements of the limits of the integrator ``nrf`` on the shipped scenes: do pictures keep to them, and how fast?
 
     python -m mi_ntf.evaluate.dial error  [--scenes statue globe …] [--lights point sky …] [--size 128] [--spp 4]
     python -m mi_ntf.evaluate.dial noise  …
@@ -153,7 +153,7 @@ def error_case(name: str, light: str, size: int, spp: int) -> list[dict[str, Any
 
 
 def total(seconds: list[float], number: int) -> float:
-    """Of so many pictures."""
+    """Return the seconds of so many pictures."""
     first, second, further = seconds
     return first if number == 1 else first + second + (number - 2) * further
 
@@ -195,7 +195,7 @@ def time_case(name: str, light: str, size: int, spp: int) -> list[dict[str, Any]
 
 
 def effects_case(name: str, light: str, size: int, spp: int) -> list[dict[str, Any]]:
-    """One row."""
+    """Return a row: the error of all that was left out, and the seconds with and without it."""
     loaded = scene(name, light, size, spp)
     truth, march, _ = frames(loaded, {"visibility": "raymarch", "max_depth": DEPTH})
     images, seconds, nrf = frames(loaded, {"max_error": LIMIT, "max_depth": DEPTH})
@@ -207,7 +207,7 @@ def effects_case(name: str, light: str, size: int, spp: int) -> list[dict[str, A
 
 
 def stock_case(name: str, light: str, size: int, spp: int) -> list[dict[str, Any]]:
-    """One row, for the fastest method; `spp` of it is not read."""
+    """Return a row for the fastest method; `spp` is not read."""
     loaded = scene(name, light, size, 1)
     skies = light in ("env", "sky")
     march = integrator(visibility="raymarch", light_samples=8 if skies else 0)

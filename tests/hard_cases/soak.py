@@ -10,7 +10,6 @@ import argparse
 import ctypes
 import gc
 import sys
-import tempfile
 import time
 import traceback
 from pathlib import Path
@@ -22,7 +21,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from helpers import random_scenes, ztest
-from helpers.variants import VARIANT
 
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.render.scene import loaded
@@ -169,12 +167,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--minutes", type=float, default=30.0)
     arguments = parser.parse_args()
-    import mi_ntf.render
-
-    mi.set_variant(VARIANT)
-    mi_ntf.render.register()
-    with tempfile.TemporaryDirectory() as folder:
-        files = random_scenes.write_fields(Path(folder))
+    with random_scenes.prepared() as files:
         run, count = (pairs, arguments.pairs) if arguments.pairs else (soak, arguments.scenes)
         failures = run(count, arguments.seed, files, 60 * arguments.minutes, lambda text: print(text, flush=True))
     print(f"{len(failures)} failures", *failures, sep="\n")

@@ -1,13 +1,18 @@
 """Random scenes: fields × films × sensors × lights × methods × dials, small enough for a second each. One seed, one
 scene; nothing here knows what it should look like."""
 
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 
+import mi_ntf.render
 from helpers import emitters, fields
+from helpers.variants import VARIANT
 from mi_ntf.core import field_file
 from mi_ntf.core.architecture import Similarity
 
@@ -65,6 +70,15 @@ def write_fields(folder: Path) -> dict[str, Path]:
     for name, (header, tensors) in made.items():
         field_file.save(paths[name], header, tensors, np.float32)
     return paths | {name: SHIPPED / name / "field.safetensors" for name in ("knot", "cloud")}
+
+
+@contextmanager
+def prepared() -> Iterator[dict[str, Path]]:
+    """Set the variant, register the plugins, and give the field files in a folder that goes afterwards."""
+    mi.set_variant(VARIANT)
+    mi_ntf.render.register()
+    with tempfile.TemporaryDirectory() as folder:
+        yield write_fields(Path(folder))
 
 
 class _Draw:

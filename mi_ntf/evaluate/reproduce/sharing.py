@@ -34,7 +34,7 @@ class Request:
     variant: str = ""
 
     def plan(self) -> Plan:
-        """All jobs. Raises MiNtfError for bad names and files that are missing."""
+        """Return the plan of all jobs. Raises MiNtfError for bad names and files that are missing."""
         names = compared.chosen("table", self.tables, TABLES), compared.chosen("method", self.methods, METHODS)
         found = compared.scenes(self.scenes)
         if self.variant or mi.variant() is None:

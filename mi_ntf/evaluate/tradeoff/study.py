@@ -31,7 +31,7 @@ ways gets."""
 
 
 class Study:
-    """One run of a study, which takes over what an earlier run of the same study has finished.
+    """Run of a study, which takes over what an earlier run of the same study has finished.
 
     `out`, `budget` and `reference` are those of :func:`tradeoff`; `tell` hears of the progress; `pressed` is set by
     Ctrl-C (:mod:`mi_ntf.core.interruption`).

@@ -91,7 +91,7 @@ class Subject:
 
 @dataclass(frozen=True)
 class Way:
-    """One way to render the scene.
+    """Way to render the scene: a method, and dials that differ from the scene's own.
 
     method    name of a visibility method, `STOCK` or `MESH`
     changes   properties of the integrator that differ from the scene's own: finer or coarser dials

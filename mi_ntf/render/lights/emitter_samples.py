@@ -12,8 +12,8 @@ from ..scene.frame import Frame
 SAMPLES = 2
 """Resampled lights a point for each emitter with an extent, where all discrete lights are summed."""
 CANDIDATES = 4
-"""Draws that a resampled light is kept from. Of 1, 2, 4 and 8, four have the least variance times seconds under an
-environment, for `raymarch` and `transmittance_atlas` alike (`globe`, `knot`, `skull`)."""
+"""Draws that a resampled light is kept from. More draws lower the variance less and less, and each of them costs. The
+number was measured (docs/speed.md)."""
 LEAST = 0.01
 """Of its irradiance that a candidate which is lit counts for at least: what is kept stands for what is not, and of one
 that hardly shows so many times its light would be no number."""
@@ -32,7 +32,7 @@ place, its chance, unless it is alone: methods are asked about one light as they
 
 
 def sharp(ds, chance=1.0):
-    """Whether a direction sample of Mitsuba's, of an emitter that had this chance, is of such a light."""
+    """Return True where a direction sample of Mitsuba's is of such a light; `chance`: of its emitter to be drawn."""
     density = ds.pdf * chance
     return dr.select(ds.delta, (density > CERTAIN) & (density < 0.999), density > SHARP)
 
@@ -90,7 +90,8 @@ class EmitterSamples:
         dr.eval(self._point, self._shift)
 
     def sample(self, index, x, active):
-        """As LightTable.sample, and 1 for what is :func:`sharp`, else 0; irradiance: the estimate's."""
+        """Return what ``LightTable.sample`` does, the irradiance being the estimate's, and 1 where the light is
+        :func:`sharp`, else 0."""
         it = dr.zeros(mi.Interaction3f, dr.width(x[0]))
         it.p = self.frame.point_to_world(x)
         kept, weight = mi.UInt32(0), dr.gather(mi.Float, self._share, index, active)
@@ -155,7 +156,7 @@ class EmitterSamples:
 
 
 def _outside(emitter, frame: Frame) -> bool:
-    """Whether an emitter is known to lie outside of the unit sphere of `frame`."""
+    """Return True if an emitter is known to lie outside of the unit sphere of `frame`."""
     if emitter.is_environment():
         return True
     shape = emitter.get_shape()
@@ -167,7 +168,7 @@ def _outside(emitter, frame: Frame) -> bool:
 
 
 def _narrow(emitter, frame: Frame) -> bool:
-    """Whether an emitter lights all points of the unit sphere of `frame` evenly, each from about one side."""
+    """Return True if an emitter lights all points of the unit sphere of `frame` evenly, each from about one side."""
     if mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta):
         return True
     shape = emitter.get_shape()

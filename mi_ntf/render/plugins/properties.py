@@ -23,8 +23,10 @@ _SIMPLE = {"Bool": "the boolean", "Integer": "the integer", "Float": "the number
 
 
 def is_medium(props) -> bool:
-    """Whether `props` are those of the medium ``nrf`` rather than the integrator's: Mitsuba has one constructor for a
-    name and tells it no kind. A medium always has a field file, perhaps misspelt."""
+    """Return True if `props` are those of the medium ``nrf`` rather than the integrator's.
+
+    Mitsuba has one constructor for a name and tells it no kind. A medium always has a field file, perhaps misspelt.
+    """
     if props.id() in ("interior", "exterior"):  # from Python; in XML this name is not handed on
         return True
     return "filename" in (_nearest(name, (*INTEGRATOR, *MEDIUM)) for name in props.keys())
@@ -47,7 +49,7 @@ class Reader:
         return self._value(name, default, ("String",), "text")
 
     def choice(self, name: str, default: str, legal: tuple[str, ...]) -> str:
-        """One of the words `legal`."""
+        """Return the text of a property, which must be one of the words `legal`."""
         expected = f"one of {', '.join(legal)}"
         value = self._value(name, default, ("String",), expected)
         return value if value in legal else self._refuse(name, expected)

@@ -31,7 +31,7 @@ def shrink_film(props, shrink: int) -> None:
 
 
 def parsed(path: Path, parameters: dict[str, str], strict: bool = True):
-    """What an XML file says, `parameters` for its $names: ``nodes``, each with a ``type`` and ``props``."""
+    """Return the parsed XML file, `parameters` for its $names: ``nodes``, each with a ``type`` and ``props``."""
     with beside(path):
         return mi.parser.parse_file(_config(strict), str(path), **parameters)
 

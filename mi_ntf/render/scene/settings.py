@@ -1,4 +1,4 @@
-"""What the properties of an ``nrf`` integrator say, apart from the plugin: others can be tried in their place."""
+"""Properties of an ``nrf`` integrator, apart from the plugin, so that others can be tried in their place."""
 
 from dataclasses import dataclass, fields, replace
 
@@ -36,17 +36,17 @@ class Settings:
 
     @classmethod
     def of(cls, integrator) -> "Settings":
-        """Those of an integrator, or of other settings."""
+        """Return the settings of an integrator, or of other settings."""
         return cls(**{f.name: getattr(integrator, f.name) for f in fields(cls) if hasattr(integrator, f.name)})
 
     def but(self, **changed) -> "Settings":
-        """These with others in place of some."""
+        """Return these settings with some of them changed."""
         return replace(self, **changed)
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What ends a render, the first that is reached; 0: none of the kind.
+    """Limits of a render, which ends when the first of them is reached; 0: no limit of the kind.
 
     noise    Monte Carlo noise (:func:`mi_ntf.render.transport.passes.noise`)
     error    bias against ``raymarch``, relative RMSE of the picture
@@ -59,5 +59,5 @@ class Limits:
 
     @property
     def of_samples(self) -> bool:
-        """Whether the number of samples is found while rendering."""
+        """True if the number of samples is found while rendering."""
         return self.noise > 0 or self.seconds > 0

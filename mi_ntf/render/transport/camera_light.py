@@ -178,7 +178,7 @@ class _CameraLight:
         walk.run(whole.take(dr.compress(dr.max(whole.weight) > 0)))
 
     def _random(self, number, purpose: int):
-        """Random streams of the rays of these numbers, other ones for each purpose."""
+        """Return random streams for the rays of these numbers, different ones for each purpose."""
         other: Any = dr.opaque(mi.UInt32, purpose)
         stream = mi.sample_tea_32(self.stream, other)[1]
         # One seed with other sequences would make neighbours alike.

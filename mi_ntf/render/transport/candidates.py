@@ -1,7 +1,7 @@
 """Ways to render a picture for less, in the order in which a pilot tries them.
 
-First other visibility methods in place of the march. Then, with the method that was taken, effects that the picture
-hardly shows are left out, one after the other, and each as often as the error allows.
+The pilot tries other visibility methods in place of the march. With the method that it takes, it then leaves out
+effects that the picture hardly shows, one after the other, and each as often as the error allows.
 """
 
 from collections.abc import Callable, Iterator

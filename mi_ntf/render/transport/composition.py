@@ -112,7 +112,8 @@ class Composition:
         return [(a, b) for i, (a, b) in enumerate(itertools.pairwise(ends)) if b > a or i == 0]
 
     def _own(self) -> list:
-        """Which runs this part of the lights renders: all of them, unless the settings say otherwise."""
+        """Return the numbers of the runs that this part of the lights renders, all unless the settings say otherwise.
+        """
         part, parts = self.settings.share
         if parts == 1 or self.runs == [None]:
             return [] if part else list(range(len(self.runs)))

@@ -1,4 +1,4 @@
-"""How many samples a pixel gets where a limit of noise or time says it: passes, and what they tell."""
+"""Passes of a render whose number of samples a limit of noise or time decides."""
 
 import math
 import time
@@ -66,7 +66,7 @@ class Passes:
         return self._clock() - self._begin
 
     def overtime(self, timeout: float) -> bool:
-        """Whether more than `timeout` seconds have passed; below 0: never."""
+        """Return True if more than `timeout` seconds have passed; never for one below 0."""
         return 0 < timeout < self.gone()
 
     def next(self) -> int:
