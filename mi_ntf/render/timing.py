@@ -38,19 +38,24 @@ _measured: Seconds | None = None
 def measure(work: Callable[[], Any]) -> tuple[Any, Seconds]:
     """Return the result of ``work()``, which has to be evaluated by it, and its seconds.
 
-    Uses Dr.Jit's kernel history, which is empty afterwards.
+    Uses Dr.Jit's kernel history, which is empty afterwards. Work that measures a part of itself has the seconds of that
+    part as well.
     """
     global _measured
-    outer, _measured = _measured, Seconds()
-    try:
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-            dr.sync_thread()
-            dr.kernel_history_clear()
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        (_measured or Seconds()).add_kernels()  # those before the work
+        outer, _measured = _measured, Seconds()
+        own = _measured
+        try:
             result = work()
-            _measured.add_kernels()
-        return result, _measured
-    finally:
-        _measured = outer
+            own.add_kernels()
+        finally:
+            _measured = outer
+    if outer:
+        outer.building += own.building
+        outer.kernels += own.kernels
+        outer.compiling += own.compiling
+    return result, own
 
 
 @contextmanager

@@ -9,7 +9,8 @@ minute to compile. One line a scene, and a table at the end. Exit code 1 if fewe
 a limit.
 
 With ``--seconds``, scenes with surfaces are rendered as one picture of ``SIDE`` squared pixels, under `max_error` 2 %
-and by each fixed method: the ratio of the seconds to those of the fastest that keeps to the limit, compilation left out.
+and by each fixed method. The ratio is that of the seconds, compilation left out, to those of the fastest method that
+keeps to the limit.
 """
 
 import argparse

@@ -143,6 +143,14 @@ def test_seconds_of_work():
         dr.eval(x)
         return x
 
+    def nested():
+        dr.eval(dr.cos(dr.arange(mi.Float, 1 << 20)))
+        part = timing.measure(work)[1]
+        return part, dr.eval(dr.tan(dr.arange(mi.Float, 1 << 20)))
+
+    (part, _), whole = timing.measure(nested)
+    assert whole.kernels > part.kernels > 0 and whole.building == part.building > 0  # a part counts for the whole
+    assert whole.compiling > part.compiling >= 0
     before = dr.flag(dr.JitFlag.KernelHistory)
     result, seconds = timing.measure(work)
     assert dr.width(result) == 1 << 20 and dr.flag(dr.JitFlag.KernelHistory) == before
