@@ -248,23 +248,6 @@ class Explain:
 
 
 @dataclass
-class Bench:
-    """Measure every speed figure of the project on this machine, in one run of some 15 minutes."""
-
-    output: Annotated[Path | None, arg(aliases=("-o",), metavar="FOLDER")] = None
-    """Folder for bench.json and bench.png."""
-    quick: bool = False
-    """Tiny sizes: seconds, but figures without meaning."""
-    json: bool = False
-    """Print JSON in place of a table."""
-
-    def run(self) -> None:
-        from mi_ntf.evaluate.bench import bench, print_table
-
-        _report(bench(self.quick, self.output, lambda text: print(text, file=sys.stderr)), self.json, print_table)
-
-
-@dataclass
 class Tradeoff:
     """Show what accuracy costs on a scene: the error of every method over seconds, as a page of curves."""
 
@@ -294,37 +277,6 @@ class Tradeoff:
             raise UsageError(str(error)) from None
         _report(study.tradeoff(self.scene, self.output, parameters, budget, self.reference, self.json),
                 self.json, study.print_table)
-
-
-@dataclass
-class Reproduce:
-    """The paper's tables and figures on our scenes, every number beside the paper's. Run again, it goes on."""
-
-    output: Annotated[Path, arg(aliases=("-o",), metavar="DIR")] = Path("reproduce")
-    """Folder of the run: finished jobs, references, networks, report.html, tables.tex."""
-    quick: bool = False
-    """Small pictures, few lights, short trainings: an afternoon on two cores."""
-    scenes: tuple[str, ...] = ()
-    """Names of scenes/, or folders with mesh.xml and field.safetensors; statue, globe and knot unless given."""
-    environments: Annotated[Path | None, arg(metavar="FOLDER")] = None
-    """Latitude-longitude maps (.hdr, .exr) in place of 18 made from the shipped one."""
-    tables: tuple[str, ...] = ()
-    """Of table1, table2, runtime, maps, complexity, curves, ablation; all unless given."""
-    methods: tuple[str, ...] = ()
-    """Of NRF, TM, AG, "No AG", NeRV, "TM of AG", "TM field", March; all unless given. The first two and the last two
-    train nothing."""
-    workers: Shared = field(default_factory=Workers)
-    json: bool = False
-    """Print JSON in place of a summary."""
-
-    def run(self) -> int:
-        _fitting(self.workers)
-        from mi_ntf.evaluate.reproduce import print_table, reproduce
-
-        found = reproduce(self.output, self.quick, self.scenes, self.environments, self.tables, self.methods,
-                          workers=self.workers)
-        _report(found, self.json, print_table)
-        return 1 if found["failed"] else 0
 
 
 @dataclass
@@ -524,9 +476,7 @@ Command = (
     | Annotated[Render, subcommand("render")]
     | Annotated[Compare, subcommand("compare")]
     | Annotated[Explain, subcommand("explain")]
-    | Annotated[Bench, subcommand("bench")]
     | Annotated[Tradeoff, subcommand("tradeoff")]
-    | Annotated[Reproduce, subcommand("reproduce")]
     | Annotated[View, subcommand("view")]
     | Annotated[Bake, subcommand("bake")]
     | Annotated[Cache, subcommand("cache")]

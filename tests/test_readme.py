@@ -104,9 +104,6 @@ def test_command(folder, words):
         words[2:2] = ["-D", "res=16", "-D", "spp=1"]
     if words[1] == "export":
         words += ["--resolution", "48"]
-    if words[1] == "reproduce":  # a table without pictures and trainings
-        words = [*words[:2], "-o", "reproduced", "--quick", "--scenes", "statue", "--tables", "curves", "--methods",
-                 "TM"]
     if words[1] == "sequence":
         (folder / "scenes/statue/circle.toml").write_text(
             (ROOT / "scenes/statue/circle.toml").read_text().replace("frames = 120", "frames = 4"))
@@ -123,7 +120,7 @@ def test_command(folder, words):
 def test_every_command_is_shown():
     shown = {words[1] if words[0] == "mi-ntf" else words[0] for words in COMMANDS}
     assert shown == {"capture", "inspect", "train", "swap", "mitsuba", "info", "compare", "explain", "bake", "make",
-                     "tradeoff", "reproduce", "export", "render", "sequence", "view", "cache"}
+                     "tradeoff", "export", "render", "sequence", "view", "cache"}
 
 
 def test_readme_is_short():
