@@ -9,7 +9,7 @@ setup:
 
 demo:
 	@$(PYTHON) tools/setup_env.py eval mesh
-	@$(RUN) -m mi_ntf.evaluate.demo
+	@$(RUN) -m benchmarks.demo
 
 # Two workers: tracing in Python is serial, and Dr.Jit's own threads fill what is left.
 test:

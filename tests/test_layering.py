@@ -41,7 +41,7 @@ FORBIDDEN = {
     "data": TORCH,
     "train": RENDERER,
     "sequence": TORCH,
-    # Metrics that live in PyTorch are offered where it is installed; the demo does without.
+    # Metrics that live in PyTorch are offered where it is installed.
     "evaluate": set(),
     "view": TORCH,
 }
@@ -84,8 +84,6 @@ def test_imports_follow_the_picture(file: Path):
         pass  # the one file of `data` that renders
     elif folder == "data":
         forbidden = forbidden | RENDERER
-    elif parts in (("evaluate", "demo.py"), ("evaluate", "demo_report.py")):
-        forbidden = TORCH
     for name in imports_of(file):
         top, *rest = name.split(".")
         assert top not in forbidden, f"{file} imports {name}"

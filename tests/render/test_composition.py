@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from helpers import fields, scenes, ztest
 
+from benchmarks import dial
 from mi_ntf.core import field_file, microfacet, ops
 from mi_ntf.core.architecture import Similarity
-from mi_ntf.evaluate import dial
 from mi_ntf.render.lights import scene_lights
 from mi_ntf.render.scene.media import find_media
 from mi_ntf.render.scene.settings import Settings

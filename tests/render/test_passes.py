@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers import scenes
 
-from mi_ntf.evaluate import dial
+from benchmarks import dial
 from mi_ntf.render.scene.settings import Limits
 from mi_ntf.render.transport import passes
 
