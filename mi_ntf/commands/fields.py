@@ -1,0 +1,206 @@
+"""Commands that make and describe fields: capture, inspect, train, export, info."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from mi_ntf.commands.options import (
+    FlashOffset,
+    OptionalOutput,
+    Output,
+    UsageError,
+    WorkerOptions,
+    check_workers,
+    parse_offset,
+    print_pairs,
+    print_report,
+)
+from mi_ntf.jobs.options import Workers
+
+
+@dataclass
+class Capture:
+    """Photograph a mesh scene with the light at the camera, as training data for a field."""
+
+    scene: Positional[Path]
+    """Mitsuba scene made of meshes."""
+    folder: Positional[Path]
+    """Folder of the data set. An interrupted capture continues in it."""
+    views: int = 100
+    """Number of photographs for training and validation."""
+    size: int = 128
+    """Width and height in pixels."""
+    test_views: int = 20
+    """Number of photographs that are held back for tests."""
+    spp: int = 64
+    """Samples per pixel."""
+    seed: int = 0
+    """Seed of view directions and samples."""
+    flash_offset: FlashOffset = None
+    """Offset of the flash from the lens: right,up,forward in scene lengths."""
+    workers: WorkerOptions = field(default_factory=Workers)
+
+    def run(self) -> None:
+        """Render the photographs."""
+        check_workers(self.workers)
+        from mi_ntf.data.capture import capture
+
+        capture(
+            self.scene,
+            self.folder,
+            views=self.views,
+            size=self.size,
+            test_views=self.test_views,
+            spp=self.spp,
+            seed=self.seed,
+            flash_offset=parse_offset(self.flash_offset) or (0.0, 0.0, 0.0),
+            workers=self.workers,
+        )
+
+
+@dataclass
+class Inspect:
+    """Show a data set before training: cameras, masks, brightness, and warnings."""
+
+    dataset: Positional[Path]
+    """Folder of photographs, in any form that `train` reads."""
+    output: OptionalOutput = None
+    """HTML page to write. The default is DIR-inspect.html in the working folder."""
+    size: int | None = None
+    """Scale photographs to this many pixels along their longer side."""
+    masks: Path | None = None
+    """Folder of masks with the names of the photographs (white: object)."""
+    background: str | None = None
+    """Set to black for photographs without masks that were taken with a flash in a dark room."""
+    flash_offset: FlashOffset = None
+    """Offset of the flash from the lens: right,up,forward."""
+    json: bool = False
+    """Print JSON in place of a summary."""
+
+    def run(self) -> None:
+        """Write the page and print the summary."""
+        offset = parse_offset(self.flash_offset)
+        from mi_ntf.data.inspect import inspect, print_table
+
+        report = inspect(self.dataset, self.output, size=self.size, masks=self.masks, background=self.background,
+                         flash_offset=offset)
+        print_report(report, self.json, print_table)
+
+
+@dataclass
+class Train:
+    """Train a field and its transmittance network on a data set."""
+
+    dataset: Positional[Path]
+    """Photographs: a capture, NeRF-synthetic, NRHints, nerfstudio (transforms.json), LLFF or COLMAP."""
+    output: Output
+    """Field file to write."""
+    preset: str = "fast"
+    """Architecture and schedule."""
+    minutes: float | None = None
+    """Stop after this many minutes."""
+    steps: int | None = None
+    """Stop after this many steps."""
+    seed: int = 0
+    """Seed of weights and samples."""
+    ntf: str | None = None
+    """Transmittance network in place of the preset's: mixture2, logistic, ray or paper."""
+    no_augmentation: bool = False
+    """Learn transmittance on camera rays alone."""
+    no_colour_loss: bool = False
+    """Do not compare pixels lit by the learned transmittance with the photographs."""
+    size: int | None = None
+    """Scale photographs to this many pixels along their longer side, in linear light."""
+    masks: Path | None = None
+    """Folder of masks with the names of the photographs (white: object)."""
+    background: str | None = None
+    """Set to black for photographs without masks that were taken with a flash in a dark room."""
+    flash_offset: FlashOffset = None
+    """Offset of the flash from the lens: right,up,forward in the data set's lengths, or `estimate`."""
+    no_gains: bool = False
+    """Assume one exposure and white balance for all photographs, although the flash's intensity is not known."""
+    no_bounces: bool = False
+    """Assume that the photographs hold no light that the object throws on itself, as in renderings of one bounce."""
+    no_fresnel: bool = False
+    """Assume that the materials have no Fresnel effect, as in renderings with lobes of fixed weight."""
+    visibility_mlp: bool = False
+    """Also train NeRV's visibility network, a function of a point and a direction, on the same transmittance."""
+    field: Path | None = None
+    """Field file whose radiance networks stay. Only its transmittance networks are trained, from new weights."""
+    tensorboard: Path | None = None
+    """Folder for TensorBoard events: losses, validation, speed, preview pictures."""
+    view: bool = False
+    """Show the field in a browser during training. It needs the extra `view`."""
+    baked: bool = False
+    """Also put the field's voxels into the file, so that it loads without a bake or a cache."""
+    json: bool = False
+    """Print the whole report as JSON in place of a summary."""
+
+    def run(self) -> None:
+        """Train, write the field file, and print the report."""
+        if self.minutes is not None and self.steps is not None:
+            raise UsageError("give --minutes or --steps, not both")
+        estimate = self.flash_offset == "estimate"
+        offset = None if estimate else parse_offset(self.flash_offset)
+        reading = {"size": self.size, "masks": self.masks, "background": self.background, "flash_offset": offset}
+        from mi_ntf.train import train
+
+        report = train(self.dataset, self.output, preset=self.preset, minutes=self.minutes, steps=self.steps,
+                       seed=self.seed, tensorboard=self.tensorboard, field=self.field, ntf=self.ntf,
+                       augmentation=not self.no_augmentation, colour_loss=not self.no_colour_loss,
+                       reading=reading, estimate=estimate, gains=not self.no_gains,
+                       visibility_mlp=self.visibility_mlp, bounces=not self.no_bounces,
+                       fresnel=not self.no_fresnel, view=self.view)
+        if report:  # under torchrun, only the first process has one
+            if self.baked:
+                from mi_ntf.render.commands.bake import bake_fields
+
+                bake_fields(self.output, {})
+            print_report(report, self.json, _print_training)
+
+
+def _print_training(report: Mapping[str, object]) -> None:
+    """Print the length of a training run and the quality of its field."""
+    keys = ("steps_done", "seconds", "kept", "faults", "val", "test", "transmittance")
+    print_pairs({key: report[key] for key in keys if report.get(key)})
+
+
+@dataclass
+class Export:
+    """Write a field's surface as a mesh with albedo and roughness, for Blender and other programs."""
+
+    field_file: Annotated[Positional[Path], arg(metavar="FIELD")]
+    """Trained field."""
+    output: Output
+    """Mesh to write: .ply (all attributes), .obj, .glb (colours), .stl."""
+    resolution: int = 256
+    """Voxels per side of the grid that the surface is extracted from, 32 to 512."""
+    level: float | None = None
+    """Density of the surface, 1/(radius of the field's sphere). The default is 10, or less in thin matter."""
+    json: bool = False
+    """Print JSON in place of a table."""
+
+    def run(self) -> None:
+        """Write the mesh and print its figures."""
+        from mi_ntf.export import export
+
+        print_report(export(self.field_file, self.output, self.resolution, self.level), self.json, print_pairs)
+
+
+@dataclass
+class Info:
+    """Describe a field file."""
+
+    field_file: Annotated[Positional[Path], arg(metavar="FIELD")]
+    """Trained field."""
+    json: bool = False
+    """Print JSON in place of a table."""
+
+    def run(self) -> None:
+        """Print the description."""
+        from mi_ntf.core.field_file import describe
+
+        print_report(describe(self.field_file), self.json, print_pairs)
