@@ -14,7 +14,7 @@ from tyro.conf import subcommand
 
 from mi_ntf.commands.analysis import Compare, Explain, Tradeoff
 from mi_ntf.commands.fields import Capture, Export, Info, Inspect, Train
-from mi_ntf.commands.machine import Doctor
+from mi_ntf.commands.machine import Bridge, Doctor
 from mi_ntf.commands.options import UsageError
 from mi_ntf.commands.scenes import Bake, Cache, Render, RenderSequence, Swap, View
 from mi_ntf.core import errors

@@ -1,8 +1,23 @@
-"""Commands that look at the installation: doctor."""
+"""Commands for the installation: bridge, doctor."""
 
 from dataclasses import dataclass
 
 from mi_ntf.commands.options import print_report
+
+
+@dataclass
+class Bridge:
+    """Build the bridge, by which the program `mitsuba` finds the plugins nrf and ntf. It needs a C++ compiler."""
+
+    remove: bool = False
+    """Delete the bridge in place of building it."""
+
+    def run(self) -> None:
+        """Build or delete the bridge and print the paths of its files."""
+        from mi_ntf import build_bridge
+
+        for path in build_bridge.remove() if self.remove else build_bridge.build():
+            print(f"{'removed' if self.remove else 'installed'} {path}")
 
 
 @dataclass
