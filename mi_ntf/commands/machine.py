@@ -6,21 +6,6 @@ from mi_ntf.commands.options import print_report
 
 
 @dataclass
-class Bridge:
-    """Build the bridge, by which the program `mitsuba` finds the plugins nrf and ntf. It needs a C++ compiler."""
-
-    remove: bool = False
-    """Delete the bridge in place of building it."""
-
-    def run(self) -> None:
-        """Build or delete the bridge and print the paths of its files."""
-        from mi_ntf import build_bridge
-
-        for path in build_bridge.remove() if self.remove else build_bridge.build():
-            print(f"{'removed' if self.remove else 'installed'} {path}")
-
-
-@dataclass
 class Doctor:
     """Check Python, Mitsuba, LLVM, CUDA, the bridge and the extras, and name the remedy of each fault."""
 
@@ -34,3 +19,19 @@ class Doctor:
         report = examine()
         print_report(report, self.json, print_table)
         return 0 if report["ok"] else 1
+
+
+@dataclass
+class Bridge:
+    """Compile the bridge for the installed Mitsuba, so that its stock program finds the plugins `nrf` and `ntf`."""
+
+    remove: bool = False
+    """Delete the installed bridge instead."""
+
+    def run(self) -> None:
+        """Print the path of each file that was installed or removed."""
+        from mi_ntf import build_bridge
+
+        files = build_bridge.remove() if self.remove else build_bridge.build()
+        for file in files:
+            print(f"{'removed' if self.remove else 'installed'} {file}")
