@@ -1,15 +1,15 @@
-"""What a field file holds: the networks' shapes, the similarity transform, the provenance.
+"""Header of a field file: the networks' shapes, the similarity transform and the provenance.
 
 A field has three or four networks, each an encoding followed by a ReLU multilayer perceptron:
 
     density        x → 1        raw; σ = exp(raw), see :data:`MAX_LOG_DENSITY`; 1/(unit-sphere radius)
     reflectance    x → 8        raw normal (3), albedo (3), roughness (1), specular weight (1)
     transmittance  ray → 3K−1   raw (a, b) of K logistics, then K−1 weights; :mod:`mi_ntf.core.mixture`
-    visibility     x, ω → 1     raw τ, through a sigmoid, of the way from x towards the light; only where asked for
+    visibility     x, ω → 1     raw τ, through a sigmoid, of the ray from x towards the light; optional
 
-The third sees a ray as its optical depths (encoding `depth`, :mod:`mi_ntf.core.depth_profile`) or, as in the paper, as
-its end points p1 and p2 (encoding `frequency` of the six coordinates). The fourth is the baseline, NeRV's
-(Srinivasan et al. 2021): one query for each point and direction, and nothing makes τ monotone.
+The third network reads a ray as its optical depths (encoding `depth`, :mod:`mi_ntf.core.depth_profile`) or, as in the
+paper, as its end points p1 and p2 (encoding `frequency` of the six coordinates). The fourth is the baseline, NeRV's
+(Srinivasan et al. 2021): one query for each point and direction, with τ not monotone along a ray.
 """
 
 import math
@@ -23,13 +23,14 @@ from .fresnel import DIELECTRIC
 
 FORMAT = 2
 MAX_LOG_DENSITY = 6.5
-"""ln σ is clipped from above: σ ≤ 665 per unit-sphere radius, a skin of 0.0015 radii."""
+"""Upper bound of ln σ: σ ≤ 665 per unit-sphere radius, a skin of 0.0015 radii."""
 MIN_LOG_DENSITY = -12.0
+"""Lower bound of ln σ."""
 LOG_FLOOR = -6.0
-"""Where ln σ is interpolated in space, lower values count as this: they are empty all the same, and must not thin out
-a skin beside them."""
+"""Lower bound of ln σ where it is interpolated in space. Lower values are as empty, but would thin out a skin beside
+them."""
 MAX_OCTAVES = 24
-"""sin(2^k π x) of higher k is noise in single precision."""
+"""Largest number of octaves: sin(2^k π x) of higher k is noise in single precision."""
 NAMES = ("density", "reflectance", "transmittance")
 """Networks of every field."""
 
@@ -38,8 +39,12 @@ NO_VISIBILITY = "the field has no visibility network; train it with `mi-ntf trai
 
 @dataclass(frozen=True)
 class Encoding:
-    """`planes`: per resolution three feature planes (x,y), (x,z), (y,z) of `channels` features, multiplied elementwise.
-    `frequency`: x, sin(2^k π x), cos(2^k π x) for k < octaves. `depth`: of rays, ``depth_profile.features``."""
+    """Features that a network reads.
+
+    Kind ``planes``: for each resolution three feature planes (x,y), (x,z), (y,z) of `channels` features, multiplied
+    elementwise. ``frequency``: x, sin(2^k π x), cos(2^k π x) for k < octaves. ``depth``: ``depth_profile.features`` of
+    rays.
+    """
 
     kind: str
     resolutions: tuple[int, ...] = ()
@@ -47,7 +52,7 @@ class Encoding:
     octaves: int = 0
 
     def width(self, coordinates: int = 3) -> int:
-        """Features of `coordinates` numbers."""
+        """Return the number of features of so many `coordinates`."""
         if self.kind == "depth":
             return FEATURES
         planes = len(self.resolutions) * self.channels
@@ -56,40 +61,46 @@ class Encoding:
 
 @dataclass(frozen=True)
 class Network:
+    """Shape of a network; `hidden`: widths of its hidden layers."""
+
     encoding: Encoding
     hidden: tuple[int, ...]
     components: int = 1
     """Logistics of a ray; 1 for the other networks."""
 
     def inputs(self, name: str) -> int:
+        """Return the number of inputs of the network called `name`."""
         return self.encoding.width(6 if name in ("transmittance", "visibility") else 3)
 
     def outputs(self, name: str) -> int:
+        """Return the number of outputs of the network called `name`."""
         return {"density": 1, "reflectance": 8, "transmittance": 3 * self.components - 1,
                 "visibility": 1}[name]
 
 
 @dataclass(frozen=True)
 class Architecture:
+    """Shapes of the networks of a field."""
+
     density: Network
     reflectance: Network
     transmittance: Network
     visibility: Network | None = None
     fresnel: bool = False
-    """The specular weight is the normal reflectance, and grows towards grazing angles (:mod:`mi_ntf.core.fresnel`)."""
+    """True if the specular weight is the reflectance at normal incidence of :mod:`mi_ntf.core.fresnel`."""
 
     @property
     def least_specular(self) -> float:
-        """The lowest specular weight that the reflectance network can give."""
+        """Lower bound of the reflectance network's specular weight."""
         return DIELECTRIC if self.fresnel else 0.0
 
     def networks(self) -> dict[str, Network]:
-        """Name → network of those that the field has."""
+        """Return name → network of all networks of the field."""
         optional = {} if self.visibility is None else {"visibility": self.visibility}
         return {name: getattr(self, name) for name in NAMES} | optional
 
     def skeleton(self) -> dict[str, tuple[int, ...]]:
-        """Name → shape of every tensor of the file. Layers are (outputs, inputs), planes (3, v, u, channels)."""
+        """Return name → shape of every tensor of the file: layers (outputs, inputs), planes (3, v, u, channels)."""
         shapes: dict[str, tuple[int, ...]] = {}
         for name, net in self.networks().items():
             if net.encoding.kind == "planes":
@@ -104,7 +115,7 @@ class Architecture:
 
 @dataclass(frozen=True)
 class Similarity:
-    """field = (world − center)/radius; lengths in scene units of the capture."""
+    """Transform to field coordinates: field = (world − center)/radius, lengths in scene units of the capture."""
 
     center: tuple[float, float, float] = (0.0, 0.0, 0.0)
     radius: float = 1.0
@@ -112,20 +123,21 @@ class Similarity:
 
 @dataclass(frozen=True)
 class Header:
-    """Everything of a field file but its tensors. `provenance`: how the field was trained, free-form JSON."""
+    """Contents of a field file apart from its tensors; `provenance`: free-form JSON about the training."""
 
     architecture: Architecture
     similarity: Similarity = Similarity()
-    provenance: dict = field(default_factory=dict)
+    provenance: dict[str, Any] = field(default_factory=dict)
 
-    def to_json(self) -> dict:
+    def to_json(self) -> dict[str, Any]:
+        """Return the header as JSON."""
         return {"format": FORMAT} | asdict(self)
 
 
-def header_from_json(data: Any, source: str) -> Header:
-    """Parse and check a header, any JSON; `source` (a file name) starts every error text. Raises MiNtfError."""
+def header_from_json(data: object, source: str) -> Header:
+    """Parse and check a header, any JSON; raise MiNtfError, whose text begins with `source` (a file name)."""
     version = data.get("format") if isinstance(data, dict) else None
-    if version != FORMAT:
+    if not isinstance(data, dict) or version != FORMAT:
         raise MiNtfError(f"{source}: field format {shown(version)}, this build reads {FORMAT}; "
                          "train or export the field anew")
     try:
@@ -147,7 +159,7 @@ def header_from_json(data: Any, source: str) -> Header:
                          "was it written by `mi-ntf train`?") from None
 
 
-def _network(data: dict, name: str) -> Network:
+def _network(data: dict[str, Any], name: str) -> Network:
     legal = {"transmittance": ("frequency", "depth"), "visibility": ("frequency",)}.get(name, ("planes", "frequency"))
     e = _member(data, "encoding", dict)
     kind = _member(e, "kind", str)
@@ -164,7 +176,7 @@ def _network(data: dict, name: str) -> Network:
     return Network(Encoding(kind, resolutions, channels, octaves), hidden, components)
 
 
-def _member(data: dict, key: str, kind: type):
+def _member(data: dict[str, Any], key: str, kind: type) -> Any:
     if key not in data:
         raise ValueError(f"{key} is missing")
     if not isinstance(data[key], kind):
@@ -172,15 +184,15 @@ def _member(data: dict, key: str, kind: type):
     return data[key]
 
 
-def _whole(value: object, what: str, low: int, high: int = 1 << 31) -> int:
+def _whole(value: object, name: str, low: int, high: int = 1 << 31) -> int:
     if type(value) is not int or not low <= value <= high:  # a bool is an int too
-        raise ValueError(f"{what} is {shown(value)}, expected an integer, {low} to {high}")
+        raise ValueError(f"{name} is {shown(value)}, expected an integer, {low} to {high}")
     return value
 
 
-def _number(value: Any, what: str, above: float = -math.inf) -> float:
+def _number(value: Any, name: str, above: float = -math.inf) -> float:
     if type(value) not in (int, float) or not above < value or not abs(value) < 1e30:
-        raise ValueError(f"{what} is {shown(value)}, expected a finite number" + (" above 0" if above == 0 else ""))
+        raise ValueError(f"{name} is {shown(value)}, expected a finite number" + (" above 0" if above == 0 else ""))
     return float(value)
 
 
@@ -192,13 +204,13 @@ FAST = Architecture(
     reflectance=Network(Encoding("planes", (48, 128), 10), (64,)),
     transmittance=Network(Encoding("depth"), (32, 32), components=2),
 )
-"""Trains in minutes on two CPU cores: 12 bilinear fetches per sample and small perceptrons."""
+"""Sizes that train in minutes on two CPU cores: 12 bilinear fetches per sample and small perceptrons."""
 
 _PAPER = Network(Encoding("frequency", octaves=10), (256,) * 8)
 PAPER = Architecture(density=_PAPER, reflectance=_PAPER, transmittance=_PAPER)
 """The paper's sizes (method.md, sections 1 and 4): 8 layers of 256 units on 10 octaves, one logistic from the two end
-points of a ray. Density and reflectance, which the paper reads from one network, are two, as in every field file, and
-no layer sees the encoding again."""
+points of a ray. Density and reflectance, one network in the paper, are two, as in every field file, and no layer sees
+the encoding again."""
 
 VISIBILITY = Network(Encoding("frequency", octaves=6), (128,) * 4)
 """The network `visibility` of fields that are trained with it."""

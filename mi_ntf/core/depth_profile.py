@@ -1,33 +1,48 @@
-"""What the transmittance network reads of a ray: where along the chord the light is used up.
+"""Inputs of the transmittance network: the places along the chord at which a ray's optical depth passes some levels.
 
 Seen from the light-side end of the chord, the optical depth D(t) = ∫_t^h σ grows from 0. A ray is described by the
-places t_j where D passes the `LEVELS`, and by its depth at the far end. A network that sees them has the profile's
-shape before it; one that sees the end points of the ray alone would have to know the whole object by heart (measured
-on the scene `statue` after two minutes of training: RMS error of τ 0.04 against 0.2 and more).
+places t_j where D passes the `LEVELS`, and by its depth at the far end. A network that reads them knows the profile's
+shape; one that reads the end points of the ray alone has to learn the whole object by heart.
 
-All lengths enter relative to a centre c (half of the light is gone) and a width s (between 90 and 10 % of the light),
-so one network serves skins of every width, at every place. Arguments are scalar arrays or tuples of them; `ops` is the
-namespace of elementary functions.
+All lengths enter relative to a centre c (half of the light is absorbed) and a width s (between 90 and 10 % of the
+light), so one network serves skins of every width, at every place. Arguments are scalar arrays or sequences of them;
+`ops` is the namespace of elementary functions.
 """
 
+from collections.abc import Sequence
+
 from . import logistic
+from .ops import Array, Ops
 
 LEVELS = (0.03, 0.1, 0.29, 0.69, 1.39, 2.3, 4.0)
 """Optical depths; τ = 0.97, 0.9, 0.75, 0.5, 0.25, 0.1, 0.02."""
 FEATURES = 2 * len(LEVELS) + 4
+"""Number of the network's inputs."""
 MIN_WIDTH = 2e-3
-"""Half of the thinnest skin that the field can hold (σ ≤ 665)."""
+"""Half of the thinnest skin that the field can hold (σ ≤ 665), field units."""
 _STEEP = 2.5
 
 
-def frame(ops, places, total, h):
-    """``(c, s, t, crossed)`` of a ray.
+def frame(ops: Ops, places: Sequence[Array], total: Array, h: Array) -> tuple[Array, Array, list[Array], list[Array]]:
+    """Return the ray's own frame of reference.
 
-    places  per level, where D passes it (arbitrary where it does not)
-    total   D at the far end (exact up to the last level, beyond that at least that level)
-    h       half chord
+    Parameters
+    ----------
+    places
+        For each level, where D passes it (arbitrary where it does not).
+    total
+        D at the far end: exact up to the last level, beyond that at least that level.
+    h
+        Half chord.
 
-    `t`: the places, −1.2 h where D does not get that far; `crossed`: 1 or 0 per level.
+    Returns
+    -------
+    c, s
+        Centre and width.
+    t
+        The places, −1.2 h where D does not reach the level.
+    crossed
+        For each level 1 if D reaches it, else 0.
     """
     reached = [total >= level for level in LEVELS]
     far = -logistic.MAX_CENTRE * h
@@ -38,19 +53,20 @@ def frame(ops, places, total, h):
     return c, ops.maximum(begin - t[5], MIN_WIDTH), t, crossed
 
 
-def features(ops, places, total, h):
-    """The network's ``FEATURES`` inputs, all of order 1; arguments as in :func:`frame`."""
+def features(ops: Ops, places: Sequence[Array], total: Array, h: Array) -> list[Array]:
+    """Return the network's ``FEATURES`` inputs, all of order 1; arguments as in :func:`frame`."""
     c, s, t, crossed = frame(ops, places, total, h)
     relative = [ops.minimum(ops.maximum((p - c) / s, -4.0), 4.0) for p in t]
     rest = ops.exp(-ops.minimum(total, LEVELS[-1]))
     return [*relative, *crossed, ops.log(s), rest, c / h, ops.minimum((h - c) / s, 20.0) / 10]
 
 
-def components(ops, raw, places, total, h):
-    """Slopes and centres of the ray's logistics from the network's outputs `raw` (a then b for each component).
+def components(ops: Ops, raw: Sequence[Array], places: Sequence[Array], total: Array,
+               h: Array) -> list[tuple[Array, Array]]:
+    """Return slope and centre of each logistic from the network's outputs `raw`, a then b for each component.
 
-    a = (2/s) exp(±2.5), at most e^6.5; b = c ± 4 s: a component far behind the chord is what remains of the light at
-    its far end. Zero outputs are the logistic through the middle of the profile.
+    a = (2/s) exp(±2.5), at most e^6.5; b = c ± 4 s. A component far behind the chord is the light that remains at its
+    far end. Zero outputs are the logistic through the middle of the profile.
     """
     c, s, _, _ = frame(ops, places, total, h)
     result = []

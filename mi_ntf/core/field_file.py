@@ -1,4 +1,4 @@
-"""Field files: one ``.safetensors`` with a JSON header, checked against a skeleton. No pickle is ever read."""
+"""Field files: one ``.safetensors`` with a JSON header, checked against a skeleton. They hold no pickle."""
 
 import json
 from pathlib import Path
@@ -10,19 +10,20 @@ import safetensors.numpy
 from . import files
 from .architecture import Header, Network, header_from_json
 from .errors import MiNtfError
+from .ops import Tensors
 
 _KEY = "mi_ntf"
 _BAKED = "baked."
-"""Begin of the names of arrays that were baked from the tensors (:func:`add_baked`), and their key in the metadata."""
+"""Prefix of the names of arrays that were baked from the tensors (:func:`add_baked`), and their key in the metadata."""
 _LARGEST = 1e36
-"""What no sum of a network may reach: then no order of summation leaves single precision."""
+"""Upper bound of a network's sums, below which no order of summation overflows single precision."""
 
 
-def save(path: str | Path, header: Header, tensors: dict[str, np.ndarray], dtype: type = np.float16) -> None:
-    """Write a field atomically. `tensors`: name → array, exactly ``header.architecture.skeleton()``.
+def save(path: str | Path, header: Header, tensors: Tensors, dtype: type = np.float16) -> None:
+    """Write a field atomically; the names and shapes of `tensors` are ``header.architecture.skeleton()``.
 
-    Planes are stored as `dtype`, layers as float32. float16 keeps 11 bits of features that bilinear
-    interpolation and a trained perceptron smooth anyway and halves the file; planes that it cannot hold are float32.
+    Planes are stored as `dtype`, layers as float32. Planes whose values `dtype` cannot hold are float32. float16 halves
+    the file; interpolation and the perceptron smooth its rounding.
     """
     _check(str(path), header, tensors)
     data: dict[str, np.ndarray] = {
@@ -31,22 +32,22 @@ def save(path: str | Path, header: Header, tensors: dict[str, np.ndarray], dtype
     files.write(path, safetensors.numpy.save(data, metadata={_KEY: json.dumps(header.to_json())}))
 
 
-def load(path: str | Path) -> tuple[Header, dict[str, np.ndarray]]:
-    """Read a field: header and float32 tensors. Every mismatch with the header's skeleton is named in one error."""
+def load(path: str | Path) -> tuple[Header, Tensors]:
+    """Read header and float32 tensors; raise one MiNtfError that names every mismatch with the header's skeleton."""
     header = load_header(path)
     try:
         with safetensors.safe_open(path, "np") as file:
             tensors = {k: file.get_tensor(k) for k in file.keys() if not k.startswith(_BAKED)}
-    except (safetensors.SafetensorError, TypeError, AttributeError) as error:  # the latter two of types NumPy lacks
+    except (safetensors.SafetensorError, TypeError, AttributeError) as error:  # the last two: types that NumPy lacks
         raise MiNtfError(f"{path} is no field file ({str(error)[:200]}); make it anew with `mi-ntf train`") from None
     _check(str(path), header, tensors)
     return header, {k: v.astype(np.float32) for k, v in tensors.items()}
 
 
-def add_baked(path: str | Path, arrays: dict[str, np.ndarray], stamp: str) -> None:
-    """Put `arrays` that were baked from a field into its file, in place of any that are there.
+def add_baked(path: str | Path, arrays: Tensors, stamp: str) -> None:
+    """Store `arrays` that were baked from a field in its file, in place of any older ones.
 
-    `stamp` names what they were made from and how (:func:`load_baked`). Tensors keep their number formats.
+    `stamp` identifies the inputs and version of the bake (:func:`load_baked`). Tensors keep their number formats.
     """
     load(path)
     with safetensors.safe_open(path, "np") as file:
@@ -56,8 +57,8 @@ def add_baked(path: str | Path, arrays: dict[str, np.ndarray], stamp: str) -> No
     files.write(path, safetensors.numpy.save(data, metadata=metadata | {_BAKED: stamp}))
 
 
-def load_baked(path: str | Path, stamp: str) -> dict[str, np.ndarray] | None:
-    """Return the baked arrays of a field file; None where it has none, or they have another stamp."""
+def load_baked(path: str | Path, stamp: str) -> Tensors | None:
+    """Return the baked arrays of a field file; None if it has none, or if they have another stamp."""
     with safetensors.safe_open(path, "np") as file:
         if (file.metadata() or {}).get(_BAKED) != stamp:
             return None
@@ -65,7 +66,7 @@ def load_baked(path: str | Path, stamp: str) -> dict[str, np.ndarray] | None:
 
 
 def load_header(path: str | Path) -> Header:
-    """Read the header alone."""
+    """Read the header without the tensors."""
     if not Path(path).is_file():
         raise MiNtfError(f"field file {path} does not exist; make one with `mi-ntf train DATASET -o {Path(path).name}`")
     try:
@@ -84,7 +85,7 @@ def load_header(path: str | Path) -> Header:
     return header_from_json(data, str(path))
 
 
-def describe(path: str | Path) -> dict:
+def describe(path: str | Path) -> dict[str, object]:
     """Return the table of `mi-ntf info`: header, parameter counts, file size in bytes."""
     header, tensors = load(path)
     counts = {name: sum(v.size for k, v in tensors.items() if k.startswith(name + ".")) for name in
@@ -92,7 +93,7 @@ def describe(path: str | Path) -> dict:
     return {"file": str(path), "bytes": Path(path).stat().st_size, "parameters": counts} | header.to_json()
 
 
-def _check(source: str, header: Header, tensors: dict[str, np.ndarray]) -> None:
+def _check(source: str, header: Header, tensors: Tensors) -> None:
     skeleton = header.architecture.skeleton()
     faults = [f"missing tensor {k}" for k in skeleton if k not in tensors]
     faults += [f"unknown tensor {k[:80]}" for k in tensors if k not in skeleton]
@@ -116,12 +117,12 @@ def _check(source: str, header: Header, tensors: dict[str, np.ndarray]) -> None:
                          ". Train or export the field anew")
 
 
-def _reach(name: str, network: Network, tensors: dict[str, np.ndarray]) -> float:
-    """An upper bound of what the layers of a network hold for any point, ray or direction of the unit sphere."""
+def _reach(name: str, network: Network, tensors: Tensors) -> float:
+    """Return an upper bound of the values in a network's layers for any point, ray or direction of the unit sphere."""
     size = {k: np.abs(v) for k, v in tensors.items() if k.startswith(f"{name}.")}
     planes = [np.prod(size[f"{name}.planes.{i}"].max((1, 2)), 0, np.float64).max()
               for i in range(len(network.encoding.resolutions))]
-    most = largest = max([8.0, *planes])  # other encodings stay below 8: coordinates, sines, logarithms of skins
+    most = largest = float(max([8.0, *planes]))  # other encodings (coordinates, sines, logarithms) stay below 8
     for i in range(len(network.hidden) + 1):
         weight, bias = (size[f"{name}.layers.{i}.{part}"] for part in ("weight", "bias"))
         most = float((weight.sum(1, np.float64) * most + bias).max())
@@ -130,5 +131,5 @@ def _reach(name: str, network: Network, tensors: dict[str, np.ndarray]) -> float
 
 
 def _fitting(value: np.ndarray, dtype: type) -> type:
-    """`dtype`, or float32 where `dtype` cannot hold `value`."""
+    """Return `dtype`, or float32 if `dtype` cannot hold `value`."""
     return dtype if np.abs(value).max() <= np.finfo(dtype).max else np.float32

@@ -1,4 +1,4 @@
-"""Files that are whole or not there: written under another name in their folder, then put in their place.
+"""Atomic writing: a file is written under another name in its folder, then renamed.
 
 Neither an error, nor a full disk, nor ``kill -9`` leaves half a file under the final name.
 """
@@ -16,10 +16,10 @@ from .errors import MiNtfError
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
-    """A temporary name to write to, for libraries that want one; the block holds nothing but the writing.
+    """Yield a temporary name to write to; the block does nothing but the writing.
 
-    At its end the file is complete on the disk and takes the place of `path`. Where the block fails nothing is left
-    behind and `path` stays as it was; MiNtfError names `path` and what the system said.
+    At its end the file is complete on the disk and replaces `path`. If the block fails, the temporary file is removed
+    and `path` stays as it was; MiNtfError names `path` and the system's message.
     """
     path = Path(path)
     temporary = _temporary(path)
@@ -37,16 +37,15 @@ def replacing(path: str | Path) -> Iterator[Path]:
         raise
 
 
-def write(path: str | Path, *content) -> None:
-    """Write `path`: `content` one after the other, text (UTF-8) or anything with bytes. Raises MiNtfError, see
-    :func:`replacing`."""
+def write(path: str | Path, *content: str | bytes | memoryview) -> None:
+    """Write the parts of `content`, text (UTF-8) or bytes, to `path`; raise MiNtfError as :func:`replacing` does."""
     with replacing(path) as temporary, open(temporary, "wb") as file:
         for part in content:
             file.write(part.encode() if isinstance(part, str) else part)
 
 
 def check(path: str | Path) -> None:
-    """Raise the MiNtfError of a place that cannot be written to, before the work whose result belongs there."""
+    """Raise MiNtfError if `path` cannot be written to; to be called before the work whose result belongs there."""
     path = Path(path)
     try:
         if path.is_dir():
@@ -58,7 +57,7 @@ def check(path: str | Path) -> None:
 
 
 def make_folder(path: str | Path) -> None:
-    """Make the folder `path` and those above it, where they are missing. Raises MiNtfError."""
+    """Make the folder `path` and its parents where they are missing; raise MiNtfError if that fails."""
     try:
         Path(path).mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -66,15 +65,15 @@ def make_folder(path: str | Path) -> None:
 
 
 def tidy(path: str | Path) -> None:
-    """Remove what processes of this machine that were killed while they wrote `path` left beside it."""
-    for found in Path(path).parent.glob(glob.escape(f"{Path(path).name}.{platform.node()}-") + "*.part"):
-        number = found.name.split("-")[-1].removesuffix(".part")
+    """Remove the temporary files of `path` that killed processes of this machine left."""
+    for part in Path(path).parent.glob(glob.escape(f"{Path(path).name}.{platform.node()}-") + "*.part"):
+        number = part.name.split("-")[-1].removesuffix(".part")
         if number.isdecimal() and not _alive(int(number)):
-            found.unlink(missing_ok=True)
+            part.unlink(missing_ok=True)
 
 
 def _temporary(path: Path) -> Path:
-    """Name of this thread alone: several threads and processes may write one file at a time."""
+    """Return a name unique to this thread: several threads and processes may write one file at a time."""
     return path.with_name(f"{path.name}.{platform.node()}-{threading.get_native_id()}-{os.getpid()}.part")
 
 

@@ -8,16 +8,16 @@ from contextlib import contextmanager
 
 @contextmanager
 def noticed() -> Iterator[threading.Event]:
-    """Give an event that Ctrl-C sets within the block, besides raising KeyboardInterrupt as always.
+    """Yield an event that Ctrl-C sets within the block, besides raising KeyboardInterrupt as always.
 
-    In other threads than the main one, which receive no signals, the event stays unset.
+    In threads other than the main one, which receive no signals, the event stays unset.
     """
     pressed = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield pressed
         return
 
-    def press(_number, _frame):
+    def press(_number: int, _frame: object) -> None:
         pressed.set()
         raise KeyboardInterrupt
 

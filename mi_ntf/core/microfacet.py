@@ -6,25 +6,25 @@ k: diffuse albedo (linear RGB, [0, 1]); s: specular weight in [0, 1]; roughness 
 ``blendbsdf`` of ``diffuse`` and a GGX ``roughconductor`` with ``material = none``. Fields of real materials weigh the
 two lobes by :mod:`mi_ntf.core.fresnel` instead of 1 − s and s.
 
-ω_i points to the light, ω_o to the viewer, n is the normal: unit 3-component tuples. The diffuse lobe needs only
-⟨n,ω_i⟩ > 0; the specular lobe also needs ⟨n,ω_o⟩ > 0. So ρ is reciprocal where both are positive, and the directional
-albedo ∫ ρ ⟨n,ω_i⟩ dω_i is at most (1 − s) k + s ≤ 1 everywhere. As a volume, the field scatters with
-:func:`scattering`, which makes an opaque skin reflect like a surface of this ρ.
+ω_i points to the light, ω_o to the viewer, n is the normal: unit 3-vectors. The diffuse lobe needs only ⟨n,ω_i⟩ > 0;
+the specular lobe also needs ⟨n,ω_o⟩ > 0. So ρ is reciprocal where both are positive, and the directional albedo
+∫ ρ ⟨n,ω_i⟩ dω_i is at most (1 − s) k + s ≤ 1 everywhere. As a volume, the field scatters with :func:`scattering`, which
+makes an opaque skin reflect like a surface of this ρ.
 """
 
 import math
 
-from .ops import cross, dot, normalize
+from .ops import Array, Ops, Vector, cross, dot, normalize
 
 MIN_ROUGHNESS = 0.15
 INV_PI = 1 / math.pi
 HORIZON = 1e-8
-"""Cosines up to which a direction counts as one along the surface: the square of less is no float32 number that
-derivatives could divide by."""
+"""Largest cosine at which a direction counts as one along the surface. Derivatives divide by its square, which float32
+cannot hold for smaller ones."""
 
 
-def ggx(sin2_h, alpha):
-    """D(h): density of microfacet normals; `sin2_h` = 1 − ⟨n,h⟩² with ⟨n,h⟩ ≥ 0, `alpha` = roughness².
+def ggx(sin2_h: Array, alpha: Array) -> Array:
+    """Return the density D(h) of microfacet normals; `sin2_h` = 1 − ⟨n,h⟩² with ⟨n,h⟩ ≥ 0, `alpha` = roughness².
 
     The sine, not the cosine: at α = 0.02 the rounding of a float32 cosine near 1 moves the peak of D by 5e-4.
     """
@@ -33,89 +33,94 @@ def ggx(sin2_h, alpha):
     return a2 / (math.pi * k * k)
 
 
-def smith(ops, cos, alpha):
-    """G1(ω)/(2⟨n,ω⟩), of the visible share of the microfacets and the cosine ⟨n,ω⟩ = `cos` ≥ 0. In one piece it is
-    finite at grazing directions, where both vanish."""
+def smith(ops: Ops, cos: Array, alpha: Array) -> Array:
+    """Return G1(ω)/(2⟨n,ω⟩) for ⟨n,ω⟩ = `cos` ≥ 0; G1 is the visible fraction of the microfacets.
+
+    The quotient is finite at grazing directions, where both terms vanish.
+    """
     a2 = alpha * alpha
     return 1 / (cos + ops.sqrt(a2 + (1 - a2) * cos * cos))
 
 
-def lobes(ops, wi, wo, n, roughness):
-    """The two lobes times the light's cosine: ``(diffuse, specular)``, scalars, 1/sr.
+def lobes(ops: Ops, wi: Vector, wo: Vector, n: Vector, roughness: Array) -> tuple[Array, Array]:
+    """Return the two lobes times the light's cosine: ``(diffuse, specular)``, scalars, 1/sr.
 
-    ρ·⟨n,ω_i⟩⁺ = (1 − s)·k·diffuse + s·specular. Split so that colour enters outside, once for any number of channels.
+    ρ·⟨n,ω_i⟩⁺ = (1 − s)·k·diffuse + s·specular. Colour enters outside, once for any number of channels.
     """
-    cos_i, _, gloss = _cosines(ops, wi, wo, n, roughness)
-    return cos_i * INV_PI, gloss * cos_i
+    cos_i, _, specular = _cosines(ops, wi, wo, n, roughness)
+    return cos_i * INV_PI, specular * cos_i
 
 
-def scattering(ops, wi, wo, n, roughness, softness=0.0):
-    """The two lobes of the field's phase function f = ρ (c_i + c_o) min(⟨n,ω_i⟩/c_i, ⟨n,ω_o⟩/c_o), 0 unless both
-    cosines are positive; as :func:`lobes`.
+def scattering(ops: Ops, wi: Vector, wo: Vector, n: Vector, roughness: Array,
+               softness: Array = 0.0) -> tuple[Array, Array]:
+    """Return the two lobes of the field's phase function f; otherwise as :func:`lobes`.
+
+    f = ρ (c_i + c_o) min(⟨n,ω_i⟩/c_i, ⟨n,ω_o⟩/c_o), 0 unless both cosines are positive.
 
     c = (⟨n,ω⟩ + √(⟨n,ω⟩² + `softness` (1 − ⟨n,ω⟩²)))/2 is ⟨n,ω⟩ in a flat skin, of softness 0, and more at grazing
     angles of a curved one (:mod:`mi_ntf.core.skin`): the optical depth to the outside is that along the normal over c.
 
-    Why the sum: a half space of any density profile that scatters once with f returns f c_i/(c_i + c_o) (Lommel and
+    The sum: a half space of any density profile that scatters once with f returns f c_i/(c_i + c_o) (Lommel and
     Seeliger; Chandrasekhar 1960, section 6), because the light too is dimmed on its way through the skin to the
     scattering point. With this f that is ρ ⟨n,ω_i⟩: an opaque field looks like the surface, from all sides and under
     all lights. With the paper's ρ ⟨n,ω_i⟩ alone it would lose half of the light and fade towards grazing light.
 
-    Why the lesser: c_i ρ ⟨n,ω_o⟩/c_o where light falls in more steeply than the viewer looks. A curved skin is wider
-    than the surface where it is seen at grazing angles, so what it sends there has to be less, if f is to be reciprocal
-    over the whole sphere, as a phase function has to be. A white field never sends out more than comes in; with
-    ⟨n,ω_i⟩ + ⟨n,ω_o⟩ a white sphere whose skin is 1/25 of its radius thick shines 1.08 in a white furnace. Light and
-    viewer in one direction see ρ ⟨n,ω⟩ exactly.
+    The minimum: f is c_i ρ ⟨n,ω_o⟩/c_o where light falls in more steeply than the viewer looks. A curved skin is wider
+    than the surface at grazing angles of view, so it must send less there for f to be reciprocal over the whole sphere,
+    as a phase function has to be. A white field then never sends out more than comes in. With ⟨n,ω_i⟩ + ⟨n,ω_o⟩ a
+    white sphere whose skin is 1/25 of its radius thick shines 1.08 in a white furnace. Light and viewer in one
+    direction see ρ ⟨n,ω⟩ exactly.
 
-    Nothing goes to below the horizon: such light would scatter again in the skin that it has just left, and every
+    No light is scattered to below the horizon: it would scatter again in the skin that it has just left, and every
     further bounce would add energy that the surface does not have.
     """
-    cos_i, cos_o, gloss = _cosines(ops, wi, wo, n, roughness)
-    both = joint_cosine(ops, cos_i, cos_o, softness)
-    return both * INV_PI, gloss * both
+    cos_i, cos_o, specular = _cosines(ops, wi, wo, n, roughness)
+    joint = joint_cosine(ops, cos_i, cos_o, softness)
+    return joint * INV_PI, specular * joint
 
 
-def joint_cosine(ops, cos_i, cos_o, softness):
-    """(c_i + c_o) min(⟨n,ω_i⟩/c_i, ⟨n,ω_o⟩/c_o), see :func:`scattering`; 0 unless both cosines are above HORIZON.
+def joint_cosine(ops: Ops, cos_i: Array, cos_o: Array, softness: Array) -> Array:
+    """Return (c_i + c_o) min(⟨n,ω_i⟩/c_i, ⟨n,ω_o⟩/c_o), see :func:`scattering`; 0 unless both cosines exceed HORIZON.
 
-    ⟨n,ω⟩/c grows with ⟨n,ω⟩, so the lesser is that of the lesser cosine; as 2/(1 + √(1 + `softness` tan²)) it is
-    exactly 1 in flat skins, and its derivative exactly 0: the quotient's loses its digits at grazing angles.
+    ⟨n,ω⟩/c grows with ⟨n,ω⟩, so the minimum is that of the smaller cosine. As 2/(1 + √(1 + `softness` tan²)) it is
+    exactly 1 in flat skins and its derivative exactly 0; the quotient's loses its digits at grazing angles.
     """
-    lesser = ops.minimum(cos_i, cos_o)
-    across = (1 - lesser * lesser) / ops.maximum(lesser * lesser, HORIZON**2)
-    share = 2 / (1 + ops.sqrt(1 + softness * across))
-    both = (soft_cosine(ops, cos_i, softness) + soft_cosine(ops, cos_o, softness)) * share
-    return ops.where(lesser > HORIZON, both, 0.0 * both)
+    smaller = ops.minimum(cos_i, cos_o)
+    tan2 = (1 - smaller * smaller) / ops.maximum(smaller * smaller, HORIZON**2)
+    ratio = 2 / (1 + ops.sqrt(1 + softness * tan2))
+    joint = (soft_cosine(ops, cos_i, softness) + soft_cosine(ops, cos_o, softness)) * ratio
+    return ops.where(smaller > HORIZON, joint, 0.0 * joint)
 
 
-def diffuse_albedo(albedo, roughness, specular):
-    """Share of a diffuse surface that reflects as much of light from everywhere as both lobes do, of the diffuse lobe's
-    `albedo`: the specular one loses what its microfacets throw onto each other, 1 − 0.267 α − 1.018 α² + 0.667 α³
-    being left (a fit to quadrature, within 0.008)."""
+def diffuse_albedo(albedo: Array, roughness: Array, specular: Array) -> Array:
+    """Return the albedo of a diffuse surface that reflects as much of uniform light as both lobes together.
+
+    `albedo`: of the diffuse lobe. The specular lobe loses light between its microfacets and reflects 1 − 0.267 α −
+    1.018 α² + 0.667 α³ (a fit to quadrature, within 0.008).
+    """
     a = roughness * roughness
     return (1 - specular) * albedo + specular * (1 - a * (0.267 + a * (1.018 - 0.667 * a)))
 
 
-def soft_cosine(ops, cos, softness):
-    """c of :func:`scattering` for ⟨n,ω⟩ = `cos` ≥ 0."""
+def soft_cosine(ops: Ops, cos: Array, softness: Array) -> Array:
+    """Return c of :func:`scattering` for ⟨n,ω⟩ = `cos` ≥ 0."""
     return (cos + ops.sqrt(cos * cos + softness * (1 - cos * cos) + 1e-30)) / 2
 
 
-def _cosines(ops, wi, wo, n, roughness):
-    """⟨n,ω_i⟩⁺, ⟨n,ω_o⟩⁺ and the specular ρ (0 seen from below)."""
+def _cosines(ops: Ops, wi: Vector, wo: Vector, n: Vector, roughness: Array) -> tuple[Array, Array, Array]:
+    """Return ⟨n,ω_i⟩⁺, ⟨n,ω_o⟩⁺ and the specular ρ (0 seen from below)."""
     cos_i, cos_o = ops.maximum(dot(n, wi), 0.0), dot(n, wo)
     alpha = roughness * roughness
     above = ops.maximum(cos_o, 0.0)
     half = normalize(ops, tuple(a + b for a, b in zip(wi, wo, strict=True)))
     # ⟨n,h⟩ > 0 wherever the lobe is not zero, so D needs no sign of it.
     across = cross(n, half)
-    gloss = ggx(dot(across, across), alpha) * smith(ops, cos_i, alpha) * smith(ops, above, alpha)
-    return cos_i, above, ops.where(cos_o > 0, gloss, 0.0 * gloss)
+    specular = ggx(dot(across, across), alpha) * smith(ops, cos_i, alpha) * smith(ops, above, alpha)
+    return cos_i, above, ops.where(cos_o > 0, specular, 0.0 * specular)
 
 
-def lobes_collocated(ops, cos, roughness):
-    """:func:`lobes` for light and viewer in one direction at cosine `cos` to the normal: the half vector is that
-    direction."""
+def lobes_collocated(ops: Ops, cos: Array, roughness: Array) -> tuple[Array, Array]:
+    """Return :func:`lobes` for light and viewer in one direction, the half vector, at cosine `cos` to the normal."""
     c = ops.maximum(cos, 0.0)
     alpha = roughness * roughness
     g = smith(ops, c, alpha)

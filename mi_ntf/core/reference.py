@@ -1,6 +1,6 @@
-"""The networks in NumPy float64: the oracle that the PyTorch and Dr.Jit twins are held against. Slow, short, exact.
+"""The networks in NumPy float64: the oracle of tests for the PyTorch and Dr.Jit twins.
 
-Conventions that the twins share. Points are (n, 3) in field coordinates, inside [−1, 1]³. A plane of resolution r has
+The twins share these conventions. Points are (n, 3) in field coordinates, inside [−1, 1]³. A plane of resolution r has
 its texel centres at u = (i + ½)/r with u = (x + 1)/2; the first named coordinate runs along the last spatial axis;
 beyond the outermost centres the border texel is repeated. Layers compute W x + b; every layer but the last is followed
 by ReLU.
@@ -12,22 +12,25 @@ from . import depth_profile, logistic, mixture, ops, spheres
 from .architecture import MAX_LOG_DENSITY, MIN_LOG_DENSITY, NO_VISIBILITY, Architecture, Encoding
 from .errors import MiNtfError
 from .microfacet import MIN_ROUGHNESS
+from .ops import Array, Tensors
 
 PLANES = ((0, 1), (0, 2), (1, 2))
+"""Axes of each feature plane."""
 
 
 def bilinear(plane: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Values (n, channels) of a plane (rows v, columns u, channels) at u, v in [0, 1]."""
+    """Return the values (n, channels) of a plane (rows v, columns u, channels) at u, v in [0, 1]."""
     r = plane.shape[0]
     x, y = np.clip(u * r - 0.5, 0, r - 1), np.clip(v * r - 0.5, 0, r - 1)
     i, j = np.minimum(x.astype(int), r - 2), np.minimum(y.astype(int), r - 2)
     fx, fy = (x - i)[:, None], (y - j)[:, None]
-    return ((1 - fy) * ((1 - fx) * plane[j, i] + fx * plane[j, i + 1])
-            + fy * ((1 - fx) * plane[j + 1, i] + fx * plane[j + 1, i + 1]))
+    result: np.ndarray = ((1 - fy) * ((1 - fx) * plane[j, i] + fx * plane[j, i + 1])
+                          + fy * ((1 - fx) * plane[j + 1, i] + fx * plane[j + 1, i + 1]))
+    return result
 
 
-def encode(encoding: Encoding, tensors: dict, name: str, x: np.ndarray) -> np.ndarray:
-    """Features (n, encoding.width) of the points `x` (n, 3)."""
+def encode(encoding: Encoding, tensors: Tensors, name: str, x: np.ndarray) -> np.ndarray:
+    """Return the features (n, encoding.width) of the points `x` (n, 3)."""
     if encoding.kind == "frequency":
         angles = [np.pi * 2.0**k * x for k in range(encoding.octaves)]
         return np.concatenate([x, *(f(a) for a in angles for f in (np.sin, np.cos))], axis=1)
@@ -40,8 +43,8 @@ def encode(encoding: Encoding, tensors: dict, name: str, x: np.ndarray) -> np.nd
     return np.concatenate(levels, axis=1)
 
 
-def perceptron(tensors: dict, name: str, x: np.ndarray) -> np.ndarray:
-    """The layers ``name.layers.*`` applied to `x` (n, inputs)."""
+def perceptron(tensors: Tensors, name: str, x: np.ndarray) -> np.ndarray:
+    """Apply the layers ``name.layers.*`` to `x` (n, inputs)."""
     count = sum(k.startswith(f"{name}.layers.") and k.endswith("weight") for k in tensors)
     for i in range(count):
         w, b = (tensors[f"{name}.layers.{i}.{p}"].astype(np.float64) for p in ("weight", "bias"))
@@ -51,15 +54,18 @@ def perceptron(tensors: dict, name: str, x: np.ndarray) -> np.ndarray:
     return x
 
 
-def density(arch: Architecture, tensors: dict, x: np.ndarray) -> np.ndarray:
-    """σ (n,), 1/(unit-sphere radius)."""
+def density(arch: Architecture, tensors: Tensors, x: np.ndarray) -> np.ndarray:
+    """Return σ (n,), 1/(unit-sphere radius)."""
     raw = perceptron(tensors, "density", encode(arch.density.encoding, tensors, "density", x))[:, 0]
-    return np.exp(np.clip(raw, MIN_LOG_DENSITY, MAX_LOG_DENSITY))
+    sigma: np.ndarray = np.exp(np.clip(raw, MIN_LOG_DENSITY, MAX_LOG_DENSITY))
+    return sigma
 
 
-def reflectance(arch: Architecture, tensors: dict, x: np.ndarray) -> np.ndarray:
-    """(n, 8): unit normal, albedo in [0, 1], roughness in [MIN_ROUGHNESS, 1], specular weight in
-    [``arch.least_specular``, 1]."""
+def reflectance(arch: Architecture, tensors: Tensors, x: np.ndarray) -> np.ndarray:
+    """Return unit normal, albedo, roughness and specular weight, (n, 8).
+
+    The albedo lies in [0, 1], the roughness in [MIN_ROUGHNESS, 1], the weight in [``arch.least_specular``, 1].
+    """
     raw = perceptron(tensors, "reflectance", encode(arch.reflectance.encoding, tensors, "reflectance", x))
     normal = np.stack(ops.normalize(ops, tuple(raw[:, :3].T)), axis=1)
     rest = logistic.sigmoid(ops, raw[:, 3:])
@@ -68,19 +74,20 @@ def reflectance(arch: Architecture, tensors: dict, x: np.ndarray) -> np.ndarray:
     return np.concatenate([normal, rest], axis=1)
 
 
-def visibility(arch: Architecture, tensors: dict, x: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """τ (n,) from the points `x` (n, 3) along the unit directions `d` towards the light, by the baseline's network."""
+def visibility(arch: Architecture, tensors: Tensors, x: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """Return the baseline's τ (n,) from the points `x` (n, 3) along the unit directions `d` towards the light."""
     if arch.visibility is None:
         raise MiNtfError(NO_VISIBILITY)
     features = encode(arch.visibility.encoding, tensors, "visibility", np.concatenate([x, d], axis=1))
-    return logistic.sigmoid(ops, perceptron(tensors, "visibility", features)[:, 0])
+    tau: np.ndarray = logistic.sigmoid(ops, perceptron(tensors, "visibility", features)[:, 0])
+    return tau
 
 
-def ray_mixture(arch: Architecture, tensors: dict, o: np.ndarray, d: np.ndarray, places=None, total=None):
-    """``(hit, mixture)`` of the rays through `o` (n, 3) along the unit directions `d` towards the light.
+def ray_mixture(arch: Architecture, tensors: Tensors, o: np.ndarray, d: np.ndarray,
+                places: Array = None, total: Array = None) -> tuple[np.ndarray, mixture.Mixture]:
+    """Return ``(hit, mixture)`` of the rays through `o` (n, 3) along the unit directions `d` towards the light.
 
-    `places` (levels, n), `total` (n,): what the encoding `depth` reads, see :func:`depth_profile.frame`. `mixture`:
-    tuple of ``(w, a, b)``, each (n,).
+    `places` (levels, n), `total` (n,): inputs of the encoding `depth`, see :func:`depth_profile.frame`.
     """
     net = arch.transmittance
     hit, m, h = spheres.chord(ops, tuple(o.T), tuple(d.T))

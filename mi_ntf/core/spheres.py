@@ -9,27 +9,34 @@ Symbols, used everywhere in this project:
     h        half chord, in (0, 1]; the chord covers t' ∈ [−h, h]
     t        t' = ⟨x, d⟩, the signed distance from m along d
 
-Every argument named above is a 3-component tuple (points, directions) or a scalar array; `ops` is the namespace of
-elementary functions (:mod:`mi_ntf.core.ops`).
+Each is a 3-vector (points, directions) or a scalar array; `ops` is the namespace of elementary functions
+(:mod:`mi_ntf.core.ops`).
 """
 
 import numpy as np
 
-from .ops import dot
+from .ops import Array, Ops, Vector, dot
 
 MIN_HALF_CHORD = 0.05
-"""Chords shorter than twice this graze the sphere, where no captured object reaches (the similarity leaves a margin)
-and where float32 loses the end points: their transmittance is 1 by definition. A uniform ray has such a chord with
+"""Half of the shortest chord that counts. Shorter ones graze the sphere, where the similarity's margin leaves no matter
+and float32 loses the end points: their transmittance is 1 by definition. A uniform ray has such a chord with
 probability h² = 0.25 %."""
 
 
-def chord(ops, o, d):
-    """The chord that the line through `o` along the unit vector `d` cuts from the unit sphere.
+def chord(ops: Ops, o: Vector, d: Vector) -> tuple[Array, tuple[Array, ...], Array]:
+    """Return the chord that the line through `o` along the unit vector `d` cuts from the unit sphere.
 
-    Returns ``(hit, m, h)``: `hit` is true where the line meets the sphere in a chord of half length above
-    ``MIN_HALF_CHORD``; `m` the midpoint; `h` the half chord (``MIN_HALF_CHORD`` at least, so that gradients are finite
-    where `hit` is false).
+    Returns
+    -------
+    hit
+        True where the half chord is longer than ``MIN_HALF_CHORD``.
+    m
+        Midpoint of the chord.
+    h
+        Half chord, at least ``MIN_HALF_CHORD``, so that gradients are finite where `hit` is False.
 
+    Notes
+    -----
     disc = b² − (|o|² − 1) with b = ⟨o, d⟩ loses all digits far from the sphere, so it is taken from the midpoint,
     disc = 1 − |o − b d|².
     """
@@ -44,21 +51,20 @@ def chord(ops, o, d):
     return hit, m, h
 
 
-def end_points(m, d, h):
-    """Entry and exit ``(p1, p2)`` of the chord with midpoint `m`, unit direction `d` and half length `h`."""
+def end_points(m: Vector, d: Vector, h: Array) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+    """Return entry and exit ``(p1, p2)`` of the chord with midpoint `m`, unit direction `d` and half length `h`."""
     p1 = tuple(mi - h * di for mi, di in zip(m, d, strict=True))
     p2 = tuple(mi + h * di for mi, di in zip(m, d, strict=True))
     return p1, p2
 
 
-def coordinate(x, d):
-    """t' = ⟨x, ω'⟩: the place of `x` on its ray. No origin is needed, since the midpoint is perpendicular to ω'."""
+def coordinate(x: Vector, d: Vector) -> Array:
+    """Return t' = ⟨x, ω'⟩, the place of `x` on its ray; the midpoint is perpendicular to ω', so no origin is needed."""
     return dot(x, d)
 
 
 def fibonacci(count: int, start: float = 0.0) -> np.ndarray:
-    """`count` unit vectors (count, 3), evenly spread: a Fibonacci lattice down z, its first vector turned by `start`
-    golden angles."""
+    """Return `count` evenly spread unit vectors, a Fibonacci lattice down z that is turned by `start` golden angles."""
     i = np.arange(count)
     z, phi = 1 - (i + 0.5) * 2 / count, (i + start) * np.pi * (3 - 5**0.5)
     across = np.sqrt(1 - z * z)

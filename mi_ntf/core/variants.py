@@ -1,16 +1,16 @@
-"""Mitsuba's variants that the plugins run in, and the threads that it needs. No renderer is imported here."""
+"""Mitsuba's variants that the plugins run in, and the threads that it needs. This module imports no renderer."""
 
-from typing import Any
+from types import ModuleType
 
 VARIANTS = ("cuda_ad_rgb", "llvm_ad_rgb")
-"""Linear RGB, vectorised, with derivatives. Where none is chosen, the first of them that this machine can run, as in
+"""Variants with linear RGB, vectorised, with derivatives. The default is the first one that this machine can run, as in
 the stock program."""
 LEAST_THREADS = 2
-"""Threads of Dr.Jit. With a single one, its choice where there is one core, Mitsuba waits for ever when it reads or
-writes an EXR file."""
+"""Minimum number of Dr.Jit's threads. With one thread, Dr.Jit's default on one core, Mitsuba waits for ever when it
+reads or writes an EXR file."""
 
 
-def enough_threads(dr: Any) -> None:
-    """Give Dr.Jit, the module `dr`, as many threads as Mitsuba needs; more than that stay."""
+def enough_threads(dr: ModuleType) -> None:
+    """Give Dr.Jit, the module `dr`, at least ``LEAST_THREADS`` threads."""
     if dr.thread_count() < LEAST_THREADS:
         dr.set_thread_count(LEAST_THREADS)

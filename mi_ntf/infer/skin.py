@@ -74,7 +74,7 @@ def _measure(grid, n: int, dj: ModuleType) -> tuple[np.ndarray, float]:
         sigma, total = grid.density(x), dj.Float(0)
         for turn in skin.TURNS:
             d = skin.across(ops, normal, tuple(dr.opaque(dj.Float, c) for c in turn))
-            total = total + skin.share(ops, out, _depth(grid, x, d, skin.FLATTEST * out), sigma)
+            total = total + skin.squared_horizon(ops, out, _depth(grid, x, d, skin.FLATTEST * out), sigma)
             dr.eval(total)
         result.ravel()[index] = skin.softness(ops, total / skin.AZIMUTHS, out, below).numpy()
     return spread(result, known), solid

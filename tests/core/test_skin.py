@@ -38,7 +38,7 @@ def test_shares_and_softness():
     """c₀² is the squared ratio of the depths, less what a flat skin would seem to have."""
     out, along, sigma = np.ones(3), np.array([5.0, 1e9, 0.5]), np.full(3, 100.0)
     flat = np.maximum(out / (skin.LENGTH * np.maximum(sigma, 1e-6)), 1 / skin.FLATTEST) ** 2
-    found = skin.share(ops, out, along, sigma)
+    found = skin.squared_horizon(ops, out, along, sigma)
     np.testing.assert_allclose(found, [0.04 - flat[0], 0, 1 - flat[2]])
     depths = np.array([0.5, 3.5, 5.0, 20.0])
     np.testing.assert_allclose(
