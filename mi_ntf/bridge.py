@@ -1,6 +1,6 @@
-"""Python side of the bridge in `plugins/`: registers plugins when Mitsuba asks for them by name.
+"""Python side of the bridge in `bridge_source/`: register plugins when Mitsuba asks for them by name.
 
-The C++ side calls `serve(name, variant)` whenever Mitsuba instantiates one of `PLUGIN_NAMES`
+The C++ side calls `serve(name, variant, version)` whenever Mitsuba instantiates one of `PLUGIN_NAMES`
 through the native entry. Registration replaces that entry, for this name and variant alone.
 """
 
@@ -14,18 +14,25 @@ from mi_ntf.core.errors import MiNtfError
 from mi_ntf.core.variants import VARIANTS
 
 PLUGIN_NAMES = ("nrf", "ntf")
-"""Plugins of this package; `nrf` is medium, phase function and integrator. None has the name of a plugin of Mitsuba's
-own: the bridge's file would take its place in every program that imports mitsuba from this environment."""
+"""Names of the plugins of this package; `nrf` is medium, phase function and integrator.
+
+No name of a plugin of Mitsuba may be added: the bridge's file would replace it in every program that uses this
+environment.
+"""
 
 _lock = threading.Lock()
 
 
-def serve(name: str, variant: str) -> str:
+def serve(name: str, variant: str, built_for: str = "another version of mi_ntf") -> str:
     """Call `register`; return '' or the text of the fault, which C++ hands on to the user.
 
-    A fault comes as one sentence, or with its traceback where MI_NTF_DEBUG=1 asks for it.
+    A fault is described by one sentence, or by its traceback if MI_NTF_DEBUG=1 is set. The bridge was compiled for
+    `built_for`, such as "mitsuba 3.9.1".
     """
     try:
+        if built_for != f"mitsuba {mi.__version__}":
+            raise MiNtfError(f"the bridge was built for {built_for}, installed is mitsuba {mi.__version__}: run "
+                             "`mi-ntf bridge`")
         register(name, variant)
     except BaseException as error:
         return traceback.format_exc() if errors.debug() else errors.sentence(error)
@@ -49,8 +56,8 @@ def register(name: str, variant: str) -> None:
 def register_all(variant: str) -> None:
     """Make `variant` current and register every plugin if they can run in it (for use from Python)."""
     for name in PLUGIN_NAMES:
-        # Mitsuba may load the native entry of a name on first mention, and thereby overwrite
-        # what Python has registered: mention it before.
+        # Mitsuba may load the native entry of a name when the name is used first, which overwrites the registration
+        # from Python. Use it before registering.
         mi.PluginManager.instance().plugin_type(name)
     if variant in VARIANTS:
         register(PLUGIN_NAMES[0], variant)

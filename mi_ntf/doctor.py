@@ -18,9 +18,8 @@ from typing import Any
 from mi_ntf import __version__
 from mi_ntf.jobs.options import cores
 
-PYTHON_MINIMUM = (3, 11)
-MITSUBA = "3.9.1"
-"""The version that pyproject.toml pins: the bridge binds to its C++ interface."""
+PYTHON_MINIMUM = (3, 10)
+MITSUBA_MINIMUM = (3, 9)
 LLVM_MINIMUM = 17
 EXTRAS = {
     "train": ("torch", "tensorboard", "matplotlib", "PIL", "cv2"),
@@ -120,13 +119,14 @@ def check_cores() -> Check:
 
 
 def check_mitsuba() -> list[Check]:
-    """Mitsuba at the version that this package pins, and the Dr.Jit that belongs to it."""
+    """Check that Mitsuba is recent enough, and that Dr.Jit is there."""
     checks = []
-    for package, wanted in (("mitsuba", MITSUBA), ("drjit", "")):
-        found = _version(package)
-        ok = bool(found) and wanted in ("", found)
-        remedy = "" if ok else f"{sys.executable} -m pip install --force-reinstall mitsuba=={MITSUBA}"
-        checks.append(Check(package, ok, True, found or "not installed", remedy))
+    for package in ("mitsuba", "drjit"):
+        version = _version(package)
+        ok = bool(version) and (package == "drjit" or tuple(map(int, version.split(".")[:2])) >= MITSUBA_MINIMUM)
+        minimum = ".".join(map(str, MITSUBA_MINIMUM))
+        remedy = "" if ok else f"{sys.executable} -m pip install 'mitsuba>={minimum},<4'"
+        checks.append(Check(package, ok, True, version or "not installed", remedy))
     return checks
 
 
@@ -156,28 +156,19 @@ def check_cuda() -> Check:
 
 
 def check_bridge() -> Check:
-    """The C++ plugins lie where the stock program looks, and belong to the installed Mitsuba."""
+    """Check that the bridge is where the stock program looks, and belongs to the installed Mitsuba."""
     if not _version("mitsuba"):
         return Check("bridge", False, False, "no Mitsuba to extend")
-    from mi_ntf.bridge import PLUGIN_NAMES
+    from mi_ntf import build_bridge
 
-    folder = plugin_folder()
-    missing = [name for name in PLUGIN_NAMES if not (folder / f"{name}.so").is_file()]
-    reinstall = pip_install("", "--force-reinstall", "--no-deps")
-    if missing:
-        return Check(
-            "bridge",
-            False,
-            False,
-            f"not installed ({', '.join(missing)}); `mi-ntf render` works without it",
-            f"install a C++ compiler (Debian: sudo apt-get install g++), then run `{reinstall}`",
-        )
-    built_for = bridge_version(folder / "nrf.so")
-    if built_for != _version("mitsuba"):
-        return Check(
-            "bridge", False, False, f"built for mitsuba {built_for}, installed is {_version('mitsuba')}", reinstall
-        )
-    return Check("bridge", True, False, f"built for mitsuba {built_for} ({folder})")
+    library = build_bridge.plugin_folder() / "nrf.so"
+    missing, built_for = build_bridge.missing_names(), build_bridge.built_for(library)
+    if not missing:
+        return Check("bridge", True, False, f"built for mitsuba {built_for} ({library.parent})")
+    state = (f"built for mitsuba {built_for}, installed is {_version('mitsuba')}" if built_for else
+             f"not installed ({', '.join(missing)}); `mi-ntf render` works without it")
+    return Check("bridge", False, False, state, "run `mi-ntf bridge` (needs a C++ compiler; Debian: sudo apt-get "
+                 "install g++)")
 
 
 def check_libpython() -> Check:
@@ -215,20 +206,6 @@ def pip_install(extras: str, *options: str) -> str:
     checkout = Path(__file__).resolve().parents[1]
     source = f"-e '{checkout}{extras}'" if (checkout / "pyproject.toml").is_file() else f"'mi-ntf{extras}'"
     return " ".join([sys.executable, "-m pip install", *options, source])
-
-
-def plugin_folder() -> Path:
-    """Folder in which Mitsuba's program looks for plugins, whatever the scene."""
-    spec = importlib.util.find_spec("mitsuba.config")
-    assert spec is not None and spec.origin is not None  # check_mitsuba comes first
-    return Path(spec.origin).parent / "plugins"
-
-
-def bridge_version(library: Path) -> str:
-    """The Mitsuba version that a bridge library was built for, from its mark; '' if it has none."""
-    mark = b"mi_ntf bridge for mitsuba "
-    _, found, rest = library.read_bytes().partition(mark)
-    return rest.partition(b"\0")[0].decode() if found else ""
 
 
 def _version(package: str) -> str:

@@ -3,10 +3,10 @@
 A stand-in for `mi_ntf.render` registers Mitsuba's `prb` as the integrator `nrf`, and a medium of that name.
 """
 
+import os
 import re
 import shutil
 import subprocess
-import tomllib
 from pathlib import Path
 
 import mitsuba as mi
@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 from helpers.programs import run_program
 
-from mi_ntf import bridge, doctor
-
-ROOT = Path(__file__).parents[1]
+from mi_ntf import bridge, build_bridge
+from mi_ntf.core.errors import MiNtfError
 
 SCENE = """
 <scene version="3.0.0">
@@ -80,16 +79,13 @@ def stand_in(tmp_path: Path) -> dict[str, str]:
     return {"PYTHONPATH": str(folder)}
 
 
-def test_installed_under_every_name():
-    names = re.search(r"set\(MI_NTF_PLUGIN_NAMES\s+([^)]*)\)", (ROOT / "CMakeLists.txt").read_text())
-    assert sorted(names[1].split()) == sorted(bridge.PLUGIN_NAMES)
-    for name in bridge.PLUGIN_NAMES:
-        assert doctor.bridge_version(doctor.plugin_folder() / f"{name}.so") == mi.__version__
+def test_it_is_installed_for_this_mitsuba_under_every_name():
+    assert build_bridge.missing_names() == []
 
 
 def test_no_plugin_of_mitsubas_own_is_replaced(tmp_path: Path):
-    """Nor is one that an older build of this package installed left behind."""
-    ours = {file.stem for file in doctor.plugin_folder().glob("*.so") if doctor.bridge_version(file)}
+    """An older build of this package replaced six of them."""
+    ours = {file.stem for file in build_bridge.plugin_folder().glob("*.so") if build_bridge.built_for(file)}
     assert ours == {"nrf", "ntf"}
     code = """
 import mitsuba as mi
@@ -102,11 +98,42 @@ for name in integrators:
     assert done.returncode == 0, done.stderr
 
 
-def test_version_pins_agree():
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    pin = f"mitsuba=={doctor.MITSUBA}"
-    assert pin in project["project"]["dependencies"]
-    assert pin in project["build-system"]["requires"]
+@pytest.fixture
+def plugin_folder(tmp_path: Path, monkeypatch) -> Path:
+    """An empty folder in place of that of Mitsuba's plugins."""
+    monkeypatch.setattr(build_bridge, "plugin_folder", lambda: tmp_path)
+    return tmp_path
+
+
+def test_it_is_built_and_removed_again(plugin_folder: Path):
+    assert build_bridge.missing_names() == ["nrf", "ntf"]
+    assert {file.name for file in build_bridge.build()} == {"nrf.so", "ntf.so"} == set(os.listdir(plugin_folder))
+    assert build_bridge.built_for(plugin_folder / "ntf.so") == mi.__version__ and build_bridge.missing_names() == []
+    assert len(build_bridge.remove()) == 2 and not os.listdir(plugin_folder) and build_bridge.remove() == []
+
+
+@pytest.mark.parametrize("compiler, expected", [("", "no C.. compiler"), ("false", "did not compile")])
+def test_a_missing_or_failing_compiler_is_named_and_changes_nothing(plugin_folder, monkeypatch, compiler, expected):
+    (plugin_folder / "nrf.so").write_bytes(b"former")
+    monkeypatch.setenv("CXX", compiler)
+    monkeypatch.setattr(build_bridge, "COMPILERS", ())
+    with pytest.raises(MiNtfError, match=expected):
+        build_bridge.build()
+    assert os.listdir(plugin_folder) == ["nrf.so"] and (plugin_folder / "nrf.so").read_bytes() == b"former"
+
+
+def test_the_version_is_read_from_the_library(tmp_path: Path):
+    library = tmp_path / "nrf.so"
+    assert build_bridge.built_for(library) == ""
+    library.write_bytes(b"\x7fELF\0mi_ntf bridge for mitsuba 3.8.0\0more")
+    assert build_bridge.built_for(library) == "3.8.0"
+    library.write_bytes(b"\x7fELF\0more")
+    assert build_bridge.built_for(library) == ""
+
+
+def test_a_bridge_for_another_mitsuba_names_the_remedy():
+    assert "built for mitsuba 3.8.0" in bridge.serve("nrf", "llvm_ad_rgb", "mitsuba 3.8.0")
+    assert "run `mi-ntf bridge`" in bridge.serve("nrf", "llvm_ad_rgb")
 
 
 @pytest.mark.parametrize("runs", [4, pytest.param(20, marks=pytest.mark.slow)])

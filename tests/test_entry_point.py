@@ -46,3 +46,23 @@ for name in ("scalar_rgb", "llvm_ad_spectral", "llvm_ad_rgb", "scalar_rgb", "llv
 """
     done = run_program("python", "-c", code, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
+
+
+def test_twenty_changes_of_the_variant_change_nothing(tmp_path: Path):
+    """Mitsuba reloads the module at each change."""
+    code = LOADER + """
+from mi_ntf.render.plugins import registration
+
+variant("llvm_ad_rgb")
+scene = {"type": "nrf", "visibility": "raymarch"}
+first, count = type(mi.load_dict(scene)), []
+callback = registration._on_variant
+registration._on_variant = lambda *names: count.append(names)
+for _ in range(10):
+    variant("scalar_rgb")
+    variant("llvm_ad_rgb")
+assert type(mi.load_dict(scene)) is first
+assert len(registration._classes) == 1
+"""
+    done = run_program("python", "-c", code, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr

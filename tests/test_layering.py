@@ -7,13 +7,17 @@ import ast
 import graphlib
 import re
 import sys
-import tomllib
 from pathlib import Path
 
 import pytest
 from helpers.programs import run_program
 
 from mi_ntf import doctor
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
 
 PACKAGE = Path(__file__).parents[1] / "mi_ntf"
 

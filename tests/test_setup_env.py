@@ -62,11 +62,12 @@ def test_other_systems_get_the_names(setup_env, monkeypatch):
 
 
 def test_fingerprint_follows_the_sources(setup_env, monkeypatch, tmp_path):
-    for name in ("pyproject.toml", "CMakeLists.txt", "plugins/bridge.cpp"):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
+    for name in ("pyproject.toml", "constraints.txt", "mi_ntf/bridge_source/bridge.cpp"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(name)
     monkeypatch.setattr(setup_env, "ROOT", tmp_path)
+    monkeypatch.setattr(setup_env, "CONSTRAINTS", tmp_path / "constraints.txt")
     before = setup_env.fingerprint()
     assert setup_env.fingerprint() == before
-    (tmp_path / "plugins" / "bridge.cpp").write_text("changed")
+    (tmp_path / "mi_ntf" / "bridge_source" / "bridge.cpp").write_text("changed")
     assert setup_env.fingerprint() != before

@@ -26,16 +26,58 @@ PLUGINS = {
 """Heading → file and class of a plugin."""
 OUTPUTS = "transport/aovs.py"
 
+EXAMPLES = {
+    "Integrator `nrf`": (
+        """<integrator type="nrf">
+    <string name="visibility" value="transmittance_map"/>
+    <integer name="max_depth" value="4"/>
+</integrator>""",
+        """{"type": "nrf", "visibility": "transmittance_map", "max_depth": 4}""",
+    ),
+    "Medium `nrf`": (
+        """<shape type="sphere">
+    <point name="center" x="0.101624" y="0.794786" z="0.000442"/> <float name="radius" value="1.002768"/>
+    <bsdf type="null"/>
+    <medium type="nrf" name="interior">
+        <string name="filename" value="scenes/statue/field.safetensors"/>
+    </medium>
+</shape>""",
+        """{
+    "type": "sphere",
+    "center": [0.101624, 0.794786, 0.000442],
+    "radius": 1.002768,
+    "bsdf": {"type": "null"},
+    "interior": {"type": "nrf", "filename": "scenes/statue/field.safetensors"},
+}""",
+    ),
+    "Emitter `ntf`": (
+        """<emitter type="ntf">
+    <emitter type="point"> <point name="position" x="1.5" y="2.6" z="2.7"/> </emitter>
+    <medium type="nrf"> <string name="filename" value="scenes/statue/field.safetensors"/> </medium>
+</emitter>""",
+        """{
+    "type": "ntf",
+    "light": {"type": "point", "position": [1.5, 2.6, 2.7]},
+    "field": {"type": "nrf", "filename": "scenes/statue/field.safetensors"},
+}""",
+    ),
+}
+"""Heading → the plugin as XML and as dictionary of `mi.load_dict`."""
+
 INTRODUCTION = """# Plugins
 
-The parameters of every plugin. This page is made from the docstrings by `python tools/plugin_reference.py`: change
-those, then run it. How the parts play together is told in [rendering](rendering.md).
+This page is generated from the docstrings of the plugins by `python tools/plugin_reference.py`.
+[Lights and effects](guides/lights.md) says how the plugins work together.
+
+- Derivatives: [what can be differentiated](guides/lights.md#derivatives), [notebook](notebooks/derivatives.md).
+- Stock `path`: [a field's shadow](notebooks/stock_path.md) with the emitter `ntf`.
+- Further outputs: [table](#further-outputs-aovs), [notebook](notebooks/outputs.md).
 """
 METHODS = """## Visibility methods
 
-What `visibility` may name, and whether it makes a table for each light. Discrete lights are points, spots, directions
-and the cells of environments; others, such as areas, are drawn at random. More about each is told in
-[rendering](rendering.md#visibility).
+These are the values of `visibility`. Discrete lights are point, spot and directional lights and the cells of
+environments. Other lights, such as area lights, are sampled at random.
+[Accuracy and time](guides/accuracy.md#choose-a-visibility-method) says which one to choose.
 """
 
 
@@ -43,9 +85,16 @@ def page() -> str:
     """The text of docs/plugins.md."""
     parts = [INTRODUCTION]
     for heading, (file, name) in PLUGINS.items():
-        parts.append(f"## {heading}\n\n{markdown(docstring(PACKAGE / file, name))}\n")
+        summary, _, rest = markdown(docstring(PACKAGE / file, name)).partition("\n\n")
+        parts.append("\n\n".join([f"## {heading}", summary, *example(heading), rest, ""]).rstrip("\n") + "\n")
     parts.append(f"## Further outputs (`aovs`)\n\n{markdown(docstring(PACKAGE / OUTPUTS))}\n")
     return "\n".join([*parts, METHODS, methods(), ""])
+
+
+def example(heading: str) -> list[str]:
+    """Return code blocks with the plugin as XML and as dictionary."""
+    blocks = zip(("xml", "python"), EXAMPLES.get(heading, ()), strict=False)
+    return [f"```{language}\n{code}\n```" for language, code in blocks]
 
 
 def docstring(file: Path, name: str | None = None) -> str:

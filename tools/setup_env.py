@@ -20,6 +20,7 @@ ROOT = Path(__file__).resolve().parent.parent
 VENV = ROOT / ".venv"
 PYTHON = VENV / "bin" / "python"
 STAMP = VENV / "mi_ntf_setup.json"
+CONSTRAINTS = ROOT / "tools" / "constraints.txt"  # versions that the tests are run with
 
 LLVM_MINIMUM = 17  # Dr.Jit aborts on older ones at the first kernel with a minimum
 LLVM_PACKAGES = ("libllvm19", "libllvm20", "libllvm21", "libllvm18", "libllvm17")
@@ -35,8 +36,8 @@ LLVM_FOLDERS = (
 
 def main(extras: list[str]) -> None:
     """Bring the environment up to date with `extras`, doing nothing that is done already."""
-    if sys.version_info < (3, 11):  # noqa: UP036 (an older python3 may well be the one that make finds)
-        stop(f"Python 3.11 or newer is needed, this is {sys.version.split()[0]}", "make PYTHON=python3.11 …")
+    if sys.version_info < (3, 10):  # noqa: UP036 (an older python3 may well be the one that make finds)
+        stop(f"Python 3.10 or newer is needed, this is {sys.version.split()[0]}", "make PYTHON=python3.11 …")
     stamp = read_stamp()
     key = fingerprint()
     wanted = sorted(set(extras) | set(stamp.get("extras", [])))
@@ -58,20 +59,22 @@ def main(extras: list[str]) -> None:
         "install",
         "--quiet",
         "--disable-pip-version-check",
+        "--constraint",
+        str(CONSTRAINTS),
         "-e",
         f"{ROOT}[{','.join(wanted)}]" if wanted else str(ROOT),
     )
     link_llvm()
+    run(str(PYTHON), "-m", "mi_ntf", "bridge")
     run(str(PYTHON), "-m", "mi_ntf", "doctor")
-    if not (site_packages() / "mitsuba" / "plugins" / "nrf.so").exists():
-        stop("the C++ part did not build", f"{PYTHON} -m pip install -v -e {ROOT}   (shows the compiler's messages)")
     STAMP.write_text(json.dumps({"key": key, "extras": wanted}))
 
 
 def fingerprint() -> str:
     """Changes with everything that asks for a new installation."""
     digest = hashlib.sha256(str(ROOT).encode())
-    files = [ROOT / "pyproject.toml", ROOT / "CMakeLists.txt", Path(__file__), *sorted((ROOT / "plugins").iterdir())]
+    sources = ROOT / "mi_ntf" / "bridge_source"
+    files = [ROOT / "pyproject.toml", CONSTRAINTS, Path(__file__), *sorted(sources.iterdir())]
     for file in files:
         digest.update(file.read_bytes())
     return digest.hexdigest()

@@ -21,13 +21,18 @@
 Interpolations: :mod:`mi_ntf.sequence.curves`. All lengths are scene lengths, angles degrees.
 """
 
-import tomllib
+import sys
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from ..core.errors import MiNtfError, shown
 from .curves import Track, is_number, only
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
 
 MOST = 10**7
 """Frames."""

@@ -1,10 +1,11 @@
-"""Fields in memory: read and baked once, whoever asks."""
+"""Cache of the fields in memory, each read and baked once."""
 
 import hashlib
 import threading
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from types import ModuleType
 
 import drjit as dr
 import mitsuba as mi
@@ -20,7 +21,7 @@ from ...infer.skin import Softness, measure
 from .. import log, user_cache
 
 QUEUED = 1 << 16
-"""Width of a kernel that Dr.Jit queues instead of running it at once: several blocks."""
+"""Width of a kernel of several blocks, which Dr.Jit queues instead of running it at once."""
 
 # Reentrant, since a thread that waits for a kernel of the bake may start to load the next medium.
 _one_at_a_time = threading.RLock()
@@ -28,8 +29,10 @@ _one_at_a_time = threading.RLock()
 
 @dataclass(frozen=True)
 class LoadedField:
-    """A field file in both representations, and how soft its skins are. `digest`: hash of the networks that were read,
-    whatever has become of the file since."""
+    """A field file in both representations, with the softness of its skins.
+
+    `digest`: hash of the networks as they were read, even if the file has changed since.
+    """
 
     header: Header
     network: NetworkField
@@ -39,20 +42,29 @@ class LoadedField:
 
 
 def voxels(header: Header) -> int:
-    """Voxels per side that a field is baked to unless told: two for each texel of its finest density planes, and 192 at
-    least. Products of three planes are finer than one: of 192² planes, relit pictures differ from the photographed
-    object by 12.8 % with 256 voxels, 12.5 % with 384, 12.4 % with 512."""
+    """Return the default number of voxels per side: two for each texel of the finest density planes, 192 to 512.
+
+    The product of three planes has finer detail than a single plane.
+    """
     finest = max(header.architecture.density.encoding.resolutions, default=0)
     return min(max(192, 2 * finest), 512)
 
 
 def load(path: str, resolution: int | None) -> LoadedField:
-    """Read `path` and bake it at `resolution`³, None for :func:`voxels`; cached by path, the file's identity and time,
-    resolution and variant."""
+    """Read the field file `path` and bake it at `resolution`³ voxels, None for :func:`voxels`.
+
+    The result is cached by path, the file's identity and time, resolution and variant.
+    """
     stat = Path(path).stat() if Path(path).is_file() else None
     _begin_other_media(str(mi.variant()))
     with _one_at_a_time:
         return _load(path, stat and (stat.st_mtime_ns, stat.st_size, stat.st_ino), resolution, mi.variant())
+
+
+def forget() -> None:
+    """Free the fields in memory, apart from those that media of existing scenes hold."""
+    with _one_at_a_time:
+        _load.cache_clear()
 
 
 def _begin_other_media(variant: str) -> None:
@@ -68,25 +80,27 @@ def _begin_other_media(variant: str) -> None:
 
 
 @lru_cache(maxsize=4)
-def _load(path: str, _identity: tuple | None, resolution: int | None, variant: str) -> LoadedField:
+def _load(path: str, _identity: tuple[int, int, int] | None, resolution: int | None, variant: str) -> LoadedField:
     dj = module(variant)
     header, tensors = field_file.load(path)
     with log.timed(f"nrf medium: loaded {path}"):
         network, digest = NetworkField(header, tensors, dj), _digest(header, tensors)
         n = resolution or voxels(header)
-        known = field_file.load_baked(path, _stamp(digest, n))
-        if known is not None:
+        stored = field_file.load_baked(path, _stamp(digest, n))
+        if stored is not None:
             try:
-                return LoadedField(header, network, GridField(known, network, dj), Softness(known, dj), digest)
+                return LoadedField(header, network, GridField(stored, network, dj), Softness(stored, dj), digest)
             except (KeyError, ValueError):
                 log.info(f"nrf medium: the voxels in {path} are damaged")
         arrays = user_cache.kept("fields", user_cache.key(digest, n), lambda: _baked(path, network, n, dj))
         return LoadedField(header, network, GridField(arrays, network, dj), Softness(arrays, dj), digest)
 
 
-def add_baked(path: Path, resolution: int | None = None) -> dict:
-    """Bake a field file and put the voxels into it, so that no later load bakes; return ``file``, ``voxels`` and
-    ``bytes``. Raises MiNtfError."""
+def add_baked(path: Path, resolution: int | None = None) -> dict[str, str | int]:
+    """Bake a field file and store the voxels in it, so that no later load bakes.
+
+    Returns ``file``, ``voxels`` per side and ``bytes`` of the file. Raises MiNtfError.
+    """
     header, tensors = field_file.load(path)
     dj = module(str(mi.variant()))
     n = resolution or voxels(header)
@@ -95,19 +109,19 @@ def add_baked(path: Path, resolution: int | None = None) -> dict:
     return {"file": str(path), "voxels": n, "bytes": Path(path).stat().st_size}
 
 
-def _baked(path: str, network: NetworkField, n: int, dj) -> dict[str, np.ndarray]:
+def _baked(path: str, network: NetworkField, n: int, dj: ModuleType) -> dict[str, np.ndarray]:
     with log.timed(f"nrf medium: baked {path}, {n}³ voxels"):
         arrays = bake(network, n, dj, log.Progress(f"nrf medium: baking {path}, {n}³ voxels"))
         return arrays | measure(GridField(arrays, network, dj), dj)
 
 
 def _stamp(digest: str, n: int) -> str:
-    """Return what tells that arrays in a field file are baked from its tensors, by this version, at n³ voxels."""
+    """Return a text that identifies arrays baked by this version at n³ voxels from the tensors with this digest."""
     return f"{VERSION} {n} {digest}"
 
 
-def _digest(header: Header, tensors: dict) -> str:
-    """SHA-256 of the architecture and the tensors in memory, hexadecimal."""
+def _digest(header: Header, tensors: dict[str, np.ndarray]) -> str:
+    """Return the SHA-256 of the architecture and the tensors in memory, hexadecimal."""
     digest = hashlib.sha256(repr(header.architecture).encode())
     for name, value in sorted(tensors.items()):
         digest.update(name.encode())

@@ -180,7 +180,8 @@ std::string register_from_python(const std::string &name, const std::string &var
     PyObject *text = nullptr;
     if (module) {
         auto call = python_function<PyObject *(*)(PyObject *, const char *, const char *, ...)>("PyObject_CallMethod");
-        text = call(module, "serve", "ss", name.c_str(), variant.c_str());
+        text = call(module, "serve", "sss", name.c_str(), variant.c_str(),
+                    "mitsuba " MI_NTF_MITSUBA_VERSION);
     }
     const char *utf8 = text ? PYTHON(PyUnicode_AsUTF8, const char *, PyObject *)(text) : nullptr;
     if (!utf8) {

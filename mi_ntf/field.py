@@ -1,0 +1,182 @@
+"""Fields and renderings from Python, as NumPy arrays or Dr.Jit arrays."""
+
+from pathlib import Path
+from typing import Any, NamedTuple, TypeAlias
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .core.errors import MiNtfError
+from .core.variants import VARIANTS
+from .infer.visibility.raymarch import RayMarch, default_steps
+from .render import register
+from .render.maps import map_cache
+from .render.scene import loaded
+from .render.scene.frame import Frame
+
+Array: TypeAlias = Any
+"""Array of NumPy, or of Dr.Jit where the arguments are arrays of Dr.Jit."""
+
+
+class Reflectance(NamedTuple):
+    """Reflectance at `n` points.
+
+    Attributes
+    ----------
+    normal
+        Unit vectors in the coordinates of the capture, (n, 3).
+    albedo
+        Diffuse albedo in linear RGB, 0 to 1, (n, 3).
+    roughness
+        Roughness of the specular lobe, 0 to 1, (n,).
+    specular
+        Weight of the specular lobe, 0 to 1, (n,).
+    """
+
+    normal: Array
+    albedo: Array
+    roughness: Array
+    specular: Array
+
+
+class Field:
+    """A neural reflectance field. Use :meth:`load` to make one.
+
+    All coordinates are those of the capture, the world of the photographs. Points and directions are arrays of shape
+    (n, 3), which give NumPy arrays, or Dr.Jit's ``Point3f`` and ``Vector3f``, which give Dr.Jit arrays.
+
+    Attributes
+    ----------
+    path
+        The field file.
+    center, radius
+        Sphere around the object. The density outside of it is 0.
+    """
+
+    def __init__(self, path: Path, field: loaded.LoadedField):
+        similarity = field.header.similarity
+        self.path = path
+        self.center: np.ndarray = np.array(similarity.center, np.float64)
+        self.radius = float(similarity.radius)
+        self._frame, self._grid = Frame(similarity, np.eye(4), 1.0), field.grid
+
+    @classmethod
+    def load(cls, path: str | Path, resolution: int | None = None) -> "Field":
+        """Read a field file. The voxels are read from the cache, or baked first.
+
+        Parameters
+        ----------
+        path
+            Field file (``.safetensors``) of ``mi-ntf train``.
+        resolution
+            Voxels per side, 16 to 1024. By default it follows from the field.
+
+        Raises
+        ------
+        MiNtfError
+            If the file is missing or no field.
+        """
+        if mi.variant() is None:
+            mi.set_variant(*VARIANTS)
+        register()
+        if resolution is not None and not 16 <= resolution <= 1024:
+            raise MiNtfError(f"resolution is {resolution}, expected 16 to 1024 voxels per side")
+        return cls(Path(path), loaded.load(str(path), resolution))
+
+    def density(self, points: ArrayLike) -> Array:
+        """Return the extinction coefficient at `points`, in 1/capture unit, (n,)."""
+        sigma = self._grid.density(self._frame.point_to_field(_vectors(points))) / self._frame.length
+        return _like(points, sigma)
+
+    def transmittance(self, origins: ArrayLike, directions: ArrayLike, distance: ArrayLike = np.inf) -> Array:
+        """Return the transmittance of rays, exp(−∫ σ dt), by a march in steps of half a voxel or less.
+
+        Parameters
+        ----------
+        origins, directions
+            (n, 3); directions are normalised.
+        distance
+            Length of the rays in capture units, one number or (n,). The default is infinite.
+
+        Returns
+        -------
+        array of shape (n,)
+            0 to 1. Optical depths above 12 count as opaque.
+        """
+        start, direction = _vectors(origins), dr.normalize(_vectors(directions))
+        width = max(dr.width(start), dr.width(direction))
+        length = mi.Float(distance) / self._frame.length
+        march = RayMarch(self._grid, default_steps(1 / self._grid.resolution))
+        tau = march.tau(self._frame.point_to_field(start), self._frame.direction_to_field(direction), length, None,
+                        dr.full(mi.Bool, True, width))
+        return _like(origins, tau)
+
+    def reflectance(self, points: ArrayLike) -> Reflectance:
+        """Return normal, albedo, roughness and specular weight at `points`. They mean nothing where density is 0."""
+        normal, albedo, roughness, specular = self._grid.reflectance(self._frame.point_to_field(_vectors(points)))
+        world = self._frame.direction_to_world(normal)
+        return Reflectance(*(_like(points, value) for value in (world, mi.Color3f(*albedo), roughness, specular)))
+
+    def shape(self) -> dict[str, Any]:
+        """Return the field as a shape for ``mi.load_dict``: a sphere without surface, filled by the ``nrf`` medium."""
+        return {"type": "sphere", "center": self.center.tolist(), "radius": self.radius, "bsdf": {"type": "null"},
+                "interior": {"type": "nrf", "filename": str(self.path)}}
+
+
+def relight(field: Field, *emitters: dict[str, Any], sensor: dict[str, Any] | None = None, size: int = 256,
+            spp: int = 16, seed: int = 0, **integrator: Any) -> np.ndarray:
+    """Render a field under any emitters of Mitsuba.
+
+    Parameters
+    ----------
+    field
+        The field.
+    emitters
+        Emitters for ``mi.load_dict``.
+    sensor
+        Sensor for ``mi.load_dict``. By default a perspective camera looks at the field along −z, y up.
+    size
+        Pixels per side of the default sensor's film.
+    spp
+        Samples per pixel.
+    seed
+        Seed of the random numbers.
+    integrator
+        Parameters of the ``nrf`` integrator, such as ``visibility``.
+
+    Returns
+    -------
+    array of shape (height, width, 3)
+        Linear RGB.
+    """
+    distance = 4 * field.radius
+    camera = sensor or {
+        "type": "perspective", "fov": 30.0,
+        "to_world": mi.ScalarTransform4f().look_at(field.center + np.array([0, 0, distance]), field.center, [0, 1, 0]),
+        "film": {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgb"}}
+    lights = {f"emitter_{index}": emitter for index, emitter in enumerate(emitters)}
+    scene = mi.load_dict({"type": "scene", "integrator": {"type": "nrf", **integrator}, "sensor": camera,
+                          "field": field.shape(), **lights})
+    return np.array(mi.render(scene, spp=spp, seed=mi.UInt32(seed)))[..., :3]
+
+
+def clear_caches() -> None:
+    """Free the fields and maps that this process keeps in memory. ``mi-ntf cache --clear`` empties the disk's cache."""
+    loaded.forget()
+    map_cache.forget()
+
+
+def _vectors(values: ArrayLike) -> "mi.Vector3f":
+    if dr.is_array_v(values):
+        return mi.Vector3f(values)
+    return mi.Vector3f(np.atleast_2d(np.asarray(values, np.float32)).T)
+
+
+def _like(points: ArrayLike, values: Any) -> Array:
+    """Return `values` as NumPy array, (n,) or (n, 3), unless `points` belong to Dr.Jit."""
+    if dr.is_array_v(points):
+        return values
+    array = np.array(values)
+    return array.T if array.ndim == 2 else array
