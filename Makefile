@@ -2,7 +2,7 @@
 PYTHON ?= python3
 RUN := .venv/bin/python
 
-.PHONY: setup demo test hard-cases mutants clean
+.PHONY: setup demo docs test hard-cases mutants clean
 
 setup:
 	@$(PYTHON) tools/setup_env.py
@@ -10,6 +10,12 @@ setup:
 demo:
 	@$(PYTHON) tools/setup_env.py eval mesh
 	@$(RUN) -m benchmarks.demo
+
+# The documentation site; its notebooks are executed, and warnings are errors.
+docs:
+	@$(PYTHON) tools/setup_env.py docs
+	@$(RUN) -m sphinx -W --keep-going -q -b html docs out/docs
+	@echo out/docs/index.html
 
 # Two workers: tracing in Python is serial, and Dr.Jit's own threads fill what is left.
 test:

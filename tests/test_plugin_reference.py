@@ -1,9 +1,14 @@
 """docs/plugins.md says what the docstrings and the registry say."""
 
+import ast
+import re
 import sys
 from pathlib import Path
 
+import mitsuba as mi
 import pytest
+
+import mi_ntf
 
 from mi_ntf.infer.visibility import names
 from mi_ntf.render.plugins import properties
@@ -44,6 +49,26 @@ def test_the_page_is_up_to_date(reference):
 def test_every_name_has_a_row(heading, legal):
     for name in legal:
         assert f"\n| `{name}` | " in section(heading)
+
+
+def test_examples_load_and_agree(reference, monkeypatch):
+    """The XML and the dictionary of each example make the same object."""
+    monkeypatch.chdir(ROOT)
+    mi_ntf.register()
+    for xml, dictionary in reference.EXAMPLES.values():
+        from_xml, from_dict = mi.load_string(_versioned(xml)), mi.load_dict(ast.literal_eval(dictionary))
+        assert type(from_xml) is type(from_dict)
+        assert _described(from_xml) == _described(from_dict)
+
+
+def _versioned(xml: str) -> str:
+    """Return a fragment of a scene as a document of its own."""
+    return re.sub(r"^(<\w+)", r'\1 version="3.9.0"', xml)
+
+
+def _described(plugin: mi.Object) -> str:
+    """Return the text of a plugin without identifiers and addresses."""
+    return re.sub(r'id = "[^"]*"|0x[0-9a-f]+|_arg_\d+|__root__[\w.]*', "", str(plugin))
 
 
 def test_tables_become_markdown(reference):

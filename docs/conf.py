@@ -1,0 +1,31 @@
+"""Configuration of the documentation site: `make docs` builds it into out/docs without a network."""
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent))
+from mi_ntf import __version__  # noqa: E402
+
+project = "mi_ntf"
+author = "the mi_ntf authors"
+project_copyright = author
+release = version = __version__
+
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+exclude_patterns = ["_build"]
+highlight_language = "none"
+html_theme = "furo"
+html_title = f"mi_ntf {release}"
+html_show_sphinx = False
+html_theme_options = {"footer_icons": []}
+
+myst_heading_anchors = 3
+myst_enable_extensions = ["deflist", "dollarmath"]
+
+nb_execution_mode = "force"
+nb_execution_timeout = 120  # kernels are compiled at the first build; a later one takes at most 30 s a notebook
+nb_execution_raise_on_error = True
+nb_merge_streams = True
+
+autodoc_member_order = "bysource"
+autodoc_typehints = "description"
