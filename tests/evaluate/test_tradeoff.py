@@ -275,7 +275,8 @@ def test_what_is_built_is_built_anew_for_each_way(folder, tmp_path, monkeypatch)
     made = []
     cached = building.map_cache.cached
     monkeypatch.setattr(building.map_cache, "cached",
-                        lambda name, make, *rest: cached(name, lambda *v: made.append(name) or make(*v), *rest))
+                        lambda name, make, *rest, **options: cached(
+                            name, lambda *v: made.append(name) or make(*v), *rest, **options))
     for _ in range(2):
         shutil.rmtree(tmp_path / "out", ignore_errors=True)
         study.tradeoff(folder / "one.xml", tmp_path / "out", {"res": "16"}, 1.0, quiet=True)

@@ -151,7 +151,8 @@ def test_the_cache_is_of_many_threads(monkeypatch):
     def ask(number):
         name, texels = str(number % 50), np.full(16, number % 50, np.float32)
         made = SimpleNamespace(values=texels, texels=texels)
-        found = map_cache.cached(name, lambda *_: made, 16, 20 * texels.nbytes, each=[name], some=lambda rows: made)
+        found = map_cache.cached(name, lambda *_: made, 16, 20 * texels.nbytes, light_keys=[name],
+                                 make_part=lambda rows: made)
         return found.values[0] == number % 50
 
     interval = sys.getswitchinterval()
@@ -161,10 +162,10 @@ def test_the_cache_is_of_many_threads(monkeypatch):
             assert all(pool.map(ask, range(3000)))
     finally:
         sys.setswitchinterval(interval)
-    assert len(map_cache._maps) <= 20 + 8 and set(map_cache._lights) <= set(map_cache._maps)
+    assert len(map_cache._maps) <= 20 + 8 and set(map_cache._light_keys) <= set(map_cache._maps)
     assert map_cache._used <= set(map_cache._maps)
     map_cache.forget()
-    assert not map_cache._lights and not map_cache._used
+    assert not map_cache._light_keys and not map_cache._used
 
 
 # --- keys ------------------------------------------------------------------------------------------------------------

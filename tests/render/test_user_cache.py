@@ -193,7 +193,7 @@ def test_bricks_of_wrong_arrays():
 
 
 def test_progress(monkeypatch):
-    """A line every PATIENCE seconds, with the time left; none of short work."""
+    """A line every INTERVAL seconds, with the time left; none of short work."""
     clock, lines = [0.0], []
     monkeypatch.setattr(log.time, "perf_counter", lambda: clock[0])
     monkeypatch.setattr(log, "info", lines.append)

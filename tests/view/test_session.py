@@ -98,8 +98,8 @@ def test_only_the_layer_of_a_moved_light_is_rendered_and_its_map_alone_made(scen
     map_cache.forget()
     made = []
     cached = map_cache.cached
-    monkeypatch.setattr(map_cache, "cached", lambda name, make, count, *more: cached(
-        name, lambda *values: (made.append(count), make(*values))[1], count, *more))
+    monkeypatch.setattr(map_cache, "cached", lambda name, make, count, *rest, **options: cached(
+        name, lambda *values: (made.append(count), make(*values))[1], count, *rest, **options))
     view = session(scene(POINT, SECOND, ENVIRONMENT))
     view.preview()
     picture = view._previews[0]

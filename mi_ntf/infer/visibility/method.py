@@ -5,7 +5,11 @@ Every method's file ends with its own :class:`Method`; :data:`mi_ntf.infer.visib
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
+
+import numpy as np
+
+from ..lights import LightTable
 
 COARSEST, FINE_MAPS = 192, 4
 """Texels along a side of the maps of many lights, at least; number of lights whose maps are as fine as the voxels."""
@@ -38,6 +42,27 @@ class Options:
     cache: bool = False
 
 
+class Keep(Protocol):
+    """Cache of a method's maps, in memory and on disk.
+
+    Parameters
+    ----------
+    make
+        Makes the map: ``make()`` computes the texels, ``make(values)`` takes those that were kept.
+    channels
+        Numbers of a texel; a light has the square of ``map_resolution`` texels.
+    step
+        Length of a step of the march that fills the map, in field units.
+    directions, options
+        Table of directions of a field's own maps, which do not depend on the lights, and their options.
+    make_part
+        Makes the map of some rows of the light table, where the texels of each light do not depend on other lights.
+    """
+
+    def __call__(self, make: Callable[..., Any], *, channels: int, step: float, directions: LightTable | None = None,
+                 options: Options | None = None, make_part: Callable[[np.ndarray], Any] | None = None) -> Any: ...
+
+
 @dataclass(frozen=True)
 class Method:
     """
@@ -46,11 +71,7 @@ class Method:
     build        ``(medium, table, options, dj, keep)`` → an object with ``tau``, in the medium's field coordinates, and
                  with ``stream``, an opaque seed that the renderer sets, where lookups draw numbers.
                  `table`: the :class:`mi_ntf.infer.lights.LightTable` that what is held per light is made for; None:
-                 the others. ``keep(width, step, make)`` → ``make()``, or ``make(values)`` where what it would make,
-                 `width` numbers for each of the squared ``map_resolution`` rays of each light, marched in steps of
-                 `step`, is at hand; for a field's own maps their table of directions and their options come after
-                 `make`. ``some=``: a function of rows of `table` that makes a map of these lights alone, where each
-                 light's numbers are its own
+                 the others. `keep`: a :class:`Keep`
     rays         ``(lights, resolution)`` → number of rays, each marched or asked for once, that fill what is held for a
                  field; `lights` of the table, `resolution` texels along a side of their maps
     numbers      ``(medium, table, options)`` → what is held for each of the squared ``map_resolution`` rays of a light,

@@ -174,7 +174,8 @@ def build(medium, lights, options: Options, dj, keep) -> TransmittanceAtlas:
     def make(values=None):
         return TransmittanceMap(directions, own.map_resolution, medium.field.grid.hull, source, dj, values, own.half)
 
-    maps = keep(channels(source.components, source.weights), step, make, directions, own)
+    maps = keep(make, channels=channels(source.components, source.weights), step=step, directions=directions,
+                options=own)
     march = raymarch.build(medium, lights, options, dj, keep)
     # Voxels will do, also for a field that is its networks.
     return TransmittanceAtlas(medium.field.grid.density, maps, begin, march, own, dj)

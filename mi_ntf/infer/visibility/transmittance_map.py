@@ -146,11 +146,11 @@ def build(medium, table, options: Options, dj, keep) -> TransmittanceMap:
     def make(values=None):
         return TransmittanceMap(table, options.map_resolution, medium.field.grid.hull, source, dj, values)
 
-    def some(rows):
+    def make_part(rows):
         return TransmittanceMap(table.chosen(rows), options.map_resolution, medium.field.grid.hull, source, dj)
 
     # What a network's source makes of a light depends on where the others are.
-    return keep(width(medium, table, options), step, make, some=None if network else some)
+    return keep(make, channels=width(medium, table, options), step=step, make_part=None if network else make_part)
 
 
 METHOD = Method(

@@ -10,7 +10,7 @@ from ...core.errors import MiNtfError
 from ...core.variants import VARIANTS
 from ...infer.visibility import REGISTRY
 from ..lights import scene_lights
-from ..maps import building, map_file
+from ..maps import building, map_cache, map_file
 from ..plugins.registration import load_scene
 from ..scene import loaded
 from ..scene.media import find_media
@@ -65,4 +65,4 @@ def _options(settings) -> building.Options:
 def _written(output: Path, medium, table, options, maps) -> dict:
     map_file.write(output, medium, table, options, maps)
     return {"file": str(output), "lights": table.count, "resolution": options.map_resolution,
-            "components": map_file.components(medium, options), "bytes": output.stat().st_size}
+            "components": map_cache.components(medium, options), "bytes": output.stat().st_size}

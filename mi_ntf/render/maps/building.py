@@ -1,37 +1,49 @@
-"""Visibility methods for the renderer: integrator and ``ntf`` emitter build theirs here. What is held per light is in
-parts that fit into memory, and found again in files and caches."""
+"""Construction of visibility methods for the integrator and the ``ntf`` emitter.
 
+Methods that store a table for each light are built in runs of lights that fit into `map_memory`. Their tables are taken
+from a map file or from the cache if possible.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
+import numpy as np
 
 from ...core.errors import MiNtfError
+from ...infer.lights import LightTable
 from ...infer.texels import DTYPES
 from ...infer.visibility import REGISTRY
 from ...infer.visibility.marched_suns import MarchedSuns
 from ...infer.visibility.method import Options
 from .. import log, timing
+from ..scene.media import NRFMedium
+from ..scene.settings import Settings
 from . import map_cache
 
 
-def resolved(settings, lights: int, media):
-    """Return `settings` with a `map_resolution` for so many lights where it is 0."""
+def resolved(settings: Settings, lights: int, media: Sequence[NRFMedium]) -> Settings:
+    """Return `settings` with a `map_resolution` that suits the number of lights, where it is 0."""
     if settings.map_resolution:
         return settings
     method = REGISTRY["transmittance_map" if settings.visibility == "auto" else settings.visibility]
-    return settings.but(map_resolution=method.resolution(lights, max(m.field.grid.resolution for m in media)))
+    voxels = max(m.field.grid.resolution for m in media)
+    return replace(settings, map_resolution=method.resolution(lights, voxels))
 
 
-def options(integrator) -> Options:
-    """The options of an ``nrf`` integrator."""
-    wanted = ("map_resolution", "map_source", "map_components", "map_memory", "map_file")
-    found = {name: getattr(integrator, name) for name in wanted if hasattr(integrator, name)}
-    return Options(2 / integrator.samples, **found, cache=True)
+def options(settings: Settings) -> Options:
+    """Return the options of a visibility method under `settings`."""
+    return Options(2 / settings.samples, settings.map_resolution, settings.map_source, settings.map_components,
+                   map_memory=settings.map_memory, map_file=settings.map_file, cache=True)
 
 
-def parts(method: str, media, table, options: Options) -> list:
-    """``(first, last)`` of runs of lights whose maps or volumes, of all `media`, fit into `map_memory`; one run for
-    methods that hold nothing per light. Raises MiNtfError where not even one light fits."""
+def parts(method: str, media: Sequence[NRFMedium], table: LightTable, options: Options) -> list[tuple[int, int]]:
+    """Return ``(first, end)`` of each run of lights whose tables, for all `media`, fit into `map_memory`.
+
+    It is one run for methods that store nothing per light. Raises MiNtfError if not even one light fits.
+    """
     size = max(size_per_light(method, medium, table, options) for medium in media)
     if not size or not table.count:
         return [(0, table.count)]
@@ -46,51 +58,59 @@ def parts(method: str, media, table, options: Options) -> list:
     return [(first, min(first + count, table.count)) for first in range(0, table.count, count)]
 
 
-def size_per_light(method: str, medium, table, options: Options) -> int:
-    """Bytes of one light's map or volume; 0 for methods that hold nothing per light."""
-    found = REGISTRY[method]
-    if not found.numbers or found.per_field:
+def size_per_light(name: str, medium: NRFMedium, table: LightTable, options: Options) -> int:
+    """Return the bytes of one light's table under the method `name`; 0 if the method stores nothing per light."""
+    method = REGISTRY[name]
+    if not method.numbers or method.per_field:
         return 0
-    return 4 * found.numbers(medium, table, options) * options.map_resolution**2
+    return 4 * method.numbers(medium, table, options) * options.map_resolution**2
 
 
-def size_per_field(method: str, medium, table, options: Options) -> int:
-    """Bytes of what is held for a field, whatever the lights."""
-    found = REGISTRY[method]
-    return 4 * found.numbers(medium, table, options) if found.numbers and found.per_field else 0
+def size_per_field(name: str, medium: NRFMedium, table: LightTable, options: Options) -> int:
+    """Return the bytes that the method `name` stores for a field, independently of the lights."""
+    method = REGISTRY[name]
+    return 4 * method.numbers(medium, table, options) if method.numbers and method.per_field else 0
 
 
-def build(method: str, medium, table, options: Options):
-    """The visibility `method` (never ``auto``) of `medium`, in its field coordinates; None for ``none``.
+def build(name: str, medium: NRFMedium, table: LightTable | None, options: Options):
+    """Build a visibility method for `medium`, in its field coordinates.
 
-    `table`: the :class:`mi_ntf.infer.lights.LightTable` of the same coordinates, which maps and volumes are made for;
-    None serves the others.
+    Parameters
+    ----------
+    name
+        Name of the method, never ``auto``; ``none`` gives None.
+    table
+        Lights in the same coordinates, for which the method stores tables; None for sampled lights.
     """
 
-    def keep(width: int, step: float, make, directions=None, own: Options = options, some=None):
+    def keep(make: Callable[..., Any], *, channels: int, step: float, directions: LightTable | None = None,
+             options: Options = options, make_part: Callable[[np.ndarray], Any] | None = None) -> Any:
         lights = directions or table
-        if own.map_file:
+        assert lights is not None  # methods for sampled lights store nothing per light
+        if options.map_file:
             from . import map_file  # few renders need EXR
 
-            resolver = mi.file_resolver()  # type: ignore[operator]  # an object in the stub
-            path = Path(str(resolver.resolve(own.map_file)))
-            return make(map_file.read(path, medium, lights, own, width))
-        if not own.cache:
+            return make(map_file.read(Path(log.resolve(options.map_file)), medium, lights, options, channels))
+        if not options.cache:
             return make()
-        name = map_cache.key(medium, lights, own, width, step)
-        # Of several runs of lights, each needs all of the memory, and none of their maps comes again in this picture.
-        limit = own.map_memory * 2**20 if lights.count == lights.total else 0
-        known = map_cache.lights(medium, lights, own, width, step) if some and limit and lights.count > 1 else None
-        return map_cache.cached(name, make, lights.count * own.map_resolution**2 * width, limit, known, some,
-                                DTYPES[own.half], directions is None)
+        # A run of several gets all of the memory, and its maps are not needed again in this picture.
+        limit = options.map_memory * 2**20 if lights.count == lights.total else 0
+        split = make_part is not None and limit and lights.count > 1
+        return map_cache.cached(
+            map_cache.key(medium, lights, options, channels, step), make,
+            lights.count * options.map_resolution**2 * channels, limit,
+            light_keys=map_cache.light_keys(medium, lights, options, channels, step) if split else None,
+            make_part=make_part, dtype=np.dtype(DTYPES[options.half]), placed=directions is None)
 
-    if not REGISTRY[method].numbers:
-        return REGISTRY[method].build(medium, table, options, mi, keep)
-    size = "" if REGISTRY[method].per_field else f", {table.count} × {options.map_resolution}² texels"
-    with timing.building(), log.timed(f"nrf integrator: made the {method}{size}"):
-        return REGISTRY[method].build(medium, table, options, mi, keep)
+    method = REGISTRY[name]
+    if not method.numbers:
+        return method.build(medium, table, options, mi, keep)
+    size = "" if method.per_field or table is None else f", {table.count} × {options.map_resolution}² texels"
+    with timing.building(), log.timed(f"nrf integrator: made the {name}{size}"):
+        return method.build(medium, table, options, mi, keep)
 
 
-def with_suns(looked_up, suns, medium, table, options: Options) -> MarchedSuns:
-    """`looked_up`, what :func:`build` made, with a march to those lights that are `suns`."""
-    return MarchedSuns(looked_up, build("raymarch", medium, table, options), suns, mi)
+def with_suns(lookup, suns: np.ndarray, medium: NRFMedium, table: LightTable | None, options: Options
+              ) -> MarchedSuns:
+    """Return the visibility method `lookup` with rays marched to the lights for which the mask `suns` (n,) is True."""
+    return MarchedSuns(lookup, build("raymarch", medium, table, options), suns, mi)

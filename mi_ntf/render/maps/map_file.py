@@ -1,14 +1,16 @@
-"""Transmittance maps as EXR: ``mi-ntf bake``, and the integrator's ``map_file``.
+"""Transmittance maps as EXR, which ``mi-ntf bake`` writes and the integrator's ``map_file`` reads.
 
-A multi-part file, one part a light, channels ``a`` and ``b`` (one logistic) or ``w0 a0 b0 w1 a1 b1`` (mixtures;
-see :mod:`mi_ntf.core.mixture`), float32, an atlas's of half precision, the light's rays along rows and columns as in
-:mod:`mi_ntf.infer.visibility.light_rays`. The attribute ``mi_ntf`` of each part is JSON: the field's hash, the light's
-place in field coordinates, how the map was made and a hash of its texels.
+The file has one part per light, with channels ``a`` and ``b`` (one logistic) or ``w0 a0 b0 w1 a1 b1`` (mixtures; see
+:mod:`mi_ntf.core.mixture`). They are float32, those of an atlas float16. Rows and columns are the light's rays as in
+:mod:`mi_ntf.infer.visibility.light_rays`. The attribute ``mi_ntf`` of each part is JSON: the inputs of the map
+(:func:`.map_cache.description`), the light's place in field coordinates and a hash of the texels.
 """
 
 import hashlib
 import json
 import math
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,160 +18,172 @@ import OpenEXR
 
 from ...core import files
 from ...core.errors import MiNtfError
+from ...infer.lights import LightTable
 from ...infer.texels import DTYPES
 from ...infer.visibility.light_rays import frames
+from ...infer.visibility.method import Options
+from ...infer.visibility.transmittance_map import TransmittanceMap
+from ..scene.media import NRFMedium
+from .map_cache import description
 
 ATTRIBUTE = "mi_ntf"
+COLUMNS = 11
+"""Index of the number of columns in a row of :func:`.light_rays.frames`."""
 
 
-def write(path: Path, medium, table, options, maps) -> None:
-    """Write `maps`, one after the other those of all lights of `table`. Raises MiNtfError, and leaves no half file,
-    where that cannot be done."""
-    shapes = [_shape(row, options.map_resolution)
-              for row in frames(table, medium.field.grid.hull, options.map_resolution)]
+def write(path: Path, medium: NRFMedium, lights: LightTable, options: Options, maps: Iterable[TransmittanceMap]
+          ) -> None:
+    """Write `maps`, which together are those of all `lights`, in order.
+
+    Raises MiNtfError if the file cannot be written; no part of it is left then.
+    """
+    shapes = _shapes(medium, lights, options)
     window = np.zeros(2, np.int32), np.array(shapes, np.int32).max(0)[::-1] - 1
-    parts: list = []
+    parts: list[OpenEXR.Part] = []
     for tmap in maps:
         for values in tmap.values.reshape(tmap.count, -1, tmap.width):
             k = len(parts)
             lines, columns = shapes[k]
             texels = values[: lines * columns].reshape(lines, columns, tmap.width)
-            about = _description(medium, options) | _light(table, k) | {"texels": _digest(texels)}
+            record = description(medium, options) | _light(lights, k) | {"texels": _digest(texels)}
             header = {
                 "name": f"light {k}", "type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION,
-                "displayWindow": window, ATTRIBUTE: json.dumps(about),
+                "displayWindow": window, ATTRIBUTE: json.dumps(record),
             }
-            channels = {name: np.ascontiguousarray(texels[..., c]) for c, name in _names(tmap.width).items()}
+            channels = {name: np.ascontiguousarray(texels[..., c]) for c, name in _channels(tmap.width).items()}
             parts.append(OpenEXR.Part(header, channels))
     with files.replacing(path) as temporary:
         OpenEXR.File(parts).write(str(temporary))
 
 
-def read(path: Path, medium, table, options, width: int) -> np.ndarray:
-    """The numbers of the map that `path` holds, for a :class:`TransmittanceMap` of `table`'s lights, `width` a texel.
+def read(path: Path, medium: NRFMedium, lights: LightTable, options: Options, channels: int) -> np.ndarray:
+    """Return the numbers of the map of `lights` in `path`, `channels` numbers per texel.
 
-    Raises MiNtfError, naming file and scene, where it was made from another field, for other lights or with other
-    settings, or where it does not hold what was written.
+    Raises MiNtfError with the names of file and scene if the map is one of another field, of other lights or of other
+    settings, or if the file is damaged.
     """
     if not path.is_file():
         raise MiNtfError(f"map_file {path} does not exist; make it with `mi-ntf bake SCENE.xml -o {path.name}`")
-    headers = _parts(path, header_only=True)  # sizes are judged before memory is taken for them
-    if len(headers) != table.total:
-        raise MiNtfError(f"map_file {path} holds {len(headers)} lights, the scene has {table.total}; bake it anew")
-    mine = slice(table.first, table.first + table.count)
-    shapes = [_shape(row, options.map_resolution)
-              for row in frames(table, medium.field.grid.hull, options.map_resolution)]
+    headers = _parts(path, header_only=True)  # sizes are checked before memory is allocated for them
+    if len(headers) != lights.total:
+        raise MiNtfError(f"map_file {path} holds {len(headers)} lights, the scene has {lights.total}; bake it anew")
+    run = slice(lights.first, lights.first + lights.count)
+    shapes = _shapes(medium, lights, options)
     digests = []
-    for k, (part, shape) in enumerate(zip(headers[mine], shapes, strict=True)):
-        about = _about(path, k, part)
-        _compare(path, k, about, _description(medium, options) | _light(table, k))
-        if _size(part) != shape:
-            raise _damaged(path, k, f"is {_size(part)} texels, expected {shape}")
-        digests.append(about.get("texels"))
+    for k, (part, shape) in enumerate(zip(headers[run], shapes, strict=True)):
+        record = part.record()
+        part.compare(record, description(medium, options) | _light(lights, k))
+        if part.size != shape:
+            raise part.damaged(f"is {part.size} texels, expected {shape}")
+        digests.append(record.get("texels"))
     largest = options.map_resolution**2
-    for k, part in enumerate(headers):
-        if math.prod(_size(part)) * len(part.header["channels"]) > largest * max(width, 4):
-            raise _damaged(path, k, f"is {_size(part)} texels of {len(part.header['channels'])} channels")
+    for part in headers:
+        if math.prod(part.size) * part.count > largest * max(channels, 4):
+            raise part.damaged(f"is {part.size} texels of {part.count} channels")
     parts = _parts(path)
-    if len(parts) != table.total:  # the library leaves out those that it cannot read
-        raise MiNtfError(f"map_file {path} is damaged: {len(parts)} of {table.total} lights can be read; bake it anew")
-    values = np.zeros((table.count, largest, width), DTYPES[options.half])
-    for k, (part, digest) in enumerate(zip(parts[mine], digests, strict=True)):
-        texels = _texels(path, k, part, shapes[k], values)
+    if len(parts) != lights.total:  # the library leaves out those that it cannot read
+        raise MiNtfError(f"map_file {path} is damaged: {len(parts)} of {lights.total} lights can be read; bake it anew")
+    values = np.zeros((lights.count, largest, channels), DTYPES[options.half])
+    for row, part, shape, digest in zip(values, parts[run], shapes, digests, strict=True):
+        texels = part.texels(shape, channels, values.dtype)
         if _digest(texels) != digest:
-            raise _damaged(path, k, "holds other texels than were written")
-        values[k, : shapes[k][0] * shapes[k][1]] = texels.reshape(-1, width)
+            raise part.damaged("holds other texels than were written")
+        row[: math.prod(shape)] = texels.reshape(-1, channels)
     return values.ravel()
 
 
-def _parts(path: Path, header_only: bool = False) -> list:
+@dataclass(frozen=True)
+class _Part:
+    """Part `index` of the file `path`: one light's header and channels."""
+
+    path: Path
+    index: int
+    part: OpenEXR.Part
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Lines and columns by the header."""
+        (left, top), (right, bottom) = (corner.tolist() for corner in self.part.header["dataWindow"])
+        return bottom - top + 1, right - left + 1
+
+    @property
+    def count(self) -> int:
+        """Number of channels by the header."""
+        return len(self.part.header["channels"])
+
+    def damaged(self, fault: str) -> MiNtfError:
+        """Return the error that names the `fault` of this part."""
+        return MiNtfError(f"map_file {self.path}, light {self.index}: {fault}; the file is damaged, bake it anew")
+
+    def record(self) -> dict[str, object]:
+        """Return the content of the attribute ``mi_ntf``."""
+        if ATTRIBUTE not in self.part.header:
+            raise MiNtfError(f"map_file {self.path} is an EXR file of another program; make it with `mi-ntf bake`")
+        try:
+            record = json.loads(self.part.header[ATTRIBUTE])
+        except (TypeError, ValueError, RecursionError):
+            record = None
+        if not isinstance(record, dict):
+            raise self.damaged(f"its attribute {ATTRIBUTE} is no JSON object")
+        return record
+
+    def compare(self, record: dict[str, object], expected: dict[str, object]) -> None:
+        """Raise MiNtfError if an entry of `record` is not the expected one."""
+        for name, value in expected.items():
+            if not _same(record.get(name), value):
+                raise MiNtfError(f"map_file {self.path}, light {self.index}: {name} is {str(record.get(name))[:80]}, "
+                                 f"the scene's is {value}; bake it anew or render with the settings it was baked with")
+
+    def texels(self, shape: tuple[int, int], channels: int, dtype: np.dtype) -> np.ndarray:
+        """Return the texels, (lines, columns, channels)."""
+        names = _channels(channels)
+        if set(self.part.channels) != set(names.values()):
+            raise self.damaged(f"has channels {', '.join(sorted(self.part.channels))}, "
+                               f"expected {', '.join(names.values())}")
+        texels = np.zeros((*shape, channels), dtype)
+        for c, name in names.items():
+            pixels = self.part.channels[name].pixels
+            if pixels.shape != shape or pixels.dtype != dtype:
+                raise self.damaged(f"channel {name} is {pixels.dtype} of shape {pixels.shape}")
+            texels[..., c] = pixels
+        return texels
+
+
+def _parts(path: Path, header_only: bool = False) -> list[_Part]:
     try:
-        return OpenEXR.File(str(path), header_only=header_only).parts
+        parts = OpenEXR.File(str(path), header_only=header_only).parts
     except Exception as error:  # the library has many kinds
         raise MiNtfError(f"map_file {path} is no EXR file ({error}); make it with `mi-ntf bake`") from None
-
-
-def _size(part) -> tuple[int, int]:
-    """Lines and columns, by the header."""
-    (left, top), (right, bottom) = (corner.tolist() for corner in part.header["dataWindow"])
-    return bottom - top + 1, right - left + 1
-
-
-def _damaged(path: Path, k: int, fault: str) -> MiNtfError:
-    return MiNtfError(f"map_file {path}, light {k}: {fault}; the file is damaged, bake it anew")
-
-
-def _about(path: Path, k: int, part) -> dict:
-    """The attribute of light `k`."""
-    if ATTRIBUTE not in part.header:
-        raise MiNtfError(f"map_file {path} is an EXR file of another program; make it with `mi-ntf bake`")
-    try:
-        found = json.loads(part.header[ATTRIBUTE])
-    except (TypeError, ValueError, RecursionError):
-        found = None
-    if not isinstance(found, dict):
-        raise _damaged(path, k, f"its attribute {ATTRIBUTE} is no JSON object")
-    return found
-
-
-def _texels(path: Path, k: int, part, shape: tuple[int, int], like: np.ndarray) -> np.ndarray:
-    """(lines, columns, width) numbers, as wide and of the type as `like`."""
-    names = _names(like.shape[-1])
-    if set(part.channels) != set(names.values()):
-        raise _damaged(path, k, f"has channels {', '.join(sorted(part.channels))}, expected "
-                                + ", ".join(names.values()))
-    texels = np.zeros((*shape, like.shape[-1]), like.dtype)
-    for c, name in names.items():
-        pixels = part.channels[name].pixels
-        if pixels.shape != shape or pixels.dtype != like.dtype:
-            raise _damaged(path, k, f"channel {name} is {pixels.dtype} of shape {pixels.shape}")
-        texels[..., c] = pixels
-    return texels
+    return [_Part(path, k, part) for k, part in enumerate(parts)]
 
 
 def _digest(texels: np.ndarray) -> str:
     return hashlib.sha256(np.ascontiguousarray(texels, texels.dtype.newbyteorder("<")).data).hexdigest()
 
 
-def _compare(path: Path, k: int, found: dict, wanted: dict) -> None:
-    for name, value in wanted.items():
-        other = found.get(name)
-        if not _same(other, value):
-            raise MiNtfError(f"map_file {path}, light {k}: {name} is {str(other)[:80]}, the scene's is {value}; "
-                             "bake it anew or render with the settings it was baked with")
-
-
-def _same(a, b) -> bool:
-    """Alike in type and value; floating point up to rounding."""
+def _same(a: object, b: object) -> bool:
+    """Return True if both have one type and value; floating-point numbers may differ by rounding."""
     if type(a) is not type(b):
         return False
-    if isinstance(b, list):
+    if isinstance(a, list) and isinstance(b, list):
         return len(a) == len(b) and all(map(_same, a, b))
-    return math.isclose(a, b, rel_tol=1e-5, abs_tol=1e-6) if isinstance(b, float) else a == b
+    if isinstance(a, float) and isinstance(b, float):
+        return math.isclose(a, b, rel_tol=1e-5, abs_tol=1e-6)
+    return a == b
 
 
-def components(medium, options) -> int:
-    return medium.field.network.components if options.map_source == "network" else options.map_components
+def _light(lights: LightTable, k: int) -> dict[str, object]:
+    return {"kind": "point" if lights.is_point[k] else "directional", "where": lights.where[k].tolist()}
 
 
-def _description(medium, options) -> dict:
-    return {"field": medium.field.digest, "representation": medium.representation,
-            "grid": medium.field.grid.resolution, "map_resolution": options.map_resolution,
-            "map_source": options.map_source, "map_components": components(medium, options),
-            "samples": 2 / options.step}
+def _shapes(medium: NRFMedium, lights: LightTable, options: Options) -> list[tuple[int, int]]:
+    """Return the lines and columns of each light's map."""
+    columns = frames(lights, medium.field.grid.hull, options.map_resolution)[:, COLUMNS]
+    return [(int((options.map_resolution**2 + 0.5) // n), int(n)) for n in columns]
 
 
-def _light(table, k: int) -> dict:
-    return {"kind": "point" if table.is_point[k] else "directional", "where": table.where[k].tolist()}
-
-
-def _shape(row: np.ndarray, resolution: int) -> tuple[int, int]:
-    """Lines and columns of the map of a light with this row."""
-    return int((resolution**2 + 0.5) // row[11]), int(row[11])
-
-
-def _names(width: int) -> dict[int, str]:
-    """Place in a texel → channel."""
-    if width == 2:
+def _channels(count: int) -> dict[int, str]:
+    """Return the channel name of each number of a texel that is stored: index → name."""
+    if count == 2:
         return {0: "a", 1: "b"}
-    return {4 * k + j: f"{name}{k}" for k in range(width // 4) for j, name in enumerate("wab")}
+    return {4 * k + j: f"{name}{k}" for k in range(count // 4) for j, name in enumerate("wab")}
