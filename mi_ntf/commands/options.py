@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import Annotated, TypeVar
 
@@ -52,7 +53,8 @@ def definitions(items: Sequence[str]) -> dict[str, str]:
 def print_report(report: Report, as_json: bool, print_table: Callable[[Report], None]) -> None:
     """Print the result of a command as JSON, or for a reader by `print_table`."""
     if as_json:
-        print(json.dumps(report, indent=2, default=str))
+        data = asdict(report) if is_dataclass(report) and not isinstance(report, type) else report
+        print(json.dumps(data, indent=2, default=str))
     else:
         print_table(report)
 

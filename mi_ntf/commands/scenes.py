@@ -144,8 +144,6 @@ class RenderSequence:
     """Factor of the environment's radiance."""
     shard: Annotated[str, arg(metavar="i/n")] = "1/1"
     """Render the i-th of n shards, counted from 1."""
-    lights: Annotated[int, arg(metavar="N")] = 1
-    """Render each frame in N parts by its lights, which shards share; when all are there, they become the frame."""
     film: Annotated[Path | None, arg(metavar="FILE")] = None
     """MP4 or WebM of all frames: linear values, clipped to 0..1, with sRGB's curve. It needs the extra `video`."""
     exposure: float = 0.0
@@ -166,6 +164,7 @@ class RenderSequence:
         fixed = definitions(self.define)
         from mi_ntf.render.scene.environment_option import Environment
         from mi_ntf.sequence import command
+        from mi_ntf.sequence.film import Film
 
         try:
             i, n = command.shard(self.shard)
@@ -173,19 +172,16 @@ class RenderSequence:
             raise UsageError(str(error)) from None
         if self.film and (n > 1 or self.check):
             raise UsageError("--film shows all frames: give it without --shard and --check when they are there")
-        if self.lights < 1:
-            raise UsageError(f"--lights is {self.lights}, expected the number of parts, 1 or more")
-        line = command.frames_of(self.timeline, self.parameters, fixed)
+        frames = command.frames_of(self.timeline, self.parameters, fixed)
         environment = Environment(self.env, self.env_rotate, self.env_scale)
-        tasks = command.tasks_of(self.scene, self.output, line.frames, self.lights, self.mode, environment)[i - 1 :: n]
+        tasks = command.tasks_of(self.scene, self.output, frames.frames, self.mode, environment)[i - 1 :: n]
         if self.check:
-            found = command.check(tasks)
-            faults = command.faults(found)
-            print_report(found, self.json, lambda r: print(f"{r['done']} of {r['images']} images are there"))
-            for text in faults:
+            result = command.check(tasks)
+            print_report(result, self.json, command.print_check)
+            for text in result.faults:
                 print(f"mi-ntf: {text}", file=sys.stderr)
-            return 1 if faults else 0
-        film = (self.film, line.fps, self.exposure) if self.film else None
-        report = command.run(tasks, quiet=self.json, film=film, workers=self.workers)
-        print_report(report, self.json, command.print_summary)
+            return 1 if result.faults else 0
+        film = Film(self.film, frames.fps, self.exposure) if self.film else None
+        summary = command.run(tasks, quiet=self.json, film=film, workers=self.workers)
+        print_report(summary, self.json, command.print_summary)
         return 0

@@ -1,1 +1,1 @@
-"""Many frames of one scene: what changes from frame to frame, and rendering it in one process or in shards of many."""
+"""Many frames of one scene: what changes between them, and rendering them in one process or in several."""

@@ -33,8 +33,8 @@ def circle(tmp_path):
     return path
 
 
-def tasks(scene, folder, frames, parts=1):
-    return command.tasks_of(scene, folder, frames, parts)
+def tasks(scene, folder, frames):
+    return command.tasks_of(scene, folder, frames)
 
 
 def pixels(path):
@@ -146,7 +146,6 @@ def test_shards_make_all_frames_once(scene, circle, tmp_path, capsys):
     (["--shard", "half"], "--shard is half"),
     (["--timeline", "a", "--parameters", "b"], "not both"),
     (["--shard", "1/2", "--film", "x.mp4"], "--film shows all frames"),
-    (["--lights", "0"], "--lights is 0"),
 ])
 def test_bad_usage(words, says, capsys):
     assert cli.main(["sequence", "scene.xml", "-o", "out", *words]) == 2
@@ -173,50 +172,7 @@ LIGHTS = """<emitter type="constant"><rgb name="radiance" value="0.1"/></emitter
         <rgb name="intensity" value="60, 50, 40"/></emitter>
     <emitter type="point" id="other"><point name="position" x="-3" y="2" z="3"/>
         <rgb name="intensity" value="9, 30, 50"/></emitter>
-    <emitter type="directional"><vector name="direction" x="0" y="-1" z="-0.6"/></emitter>
-    <shape type="rectangle"><transform name="to_world"><rotate x="1" angle="-90"/><scale value="4"/>
-        <translate y="-1.8"/></transform></shape>"""
-
-
-@pytest.mark.parametrize(("visibility", "depth", "surface"), [
-    ("raymarch", 3, True), ("transmittance_map", 2, True),
-    ("transmittance_atlas", 3, False)])
-def test_parts_of_the_lights_add_up_to_the_frame(scene, tmp_path, visibility, depth, surface):
-    """Background, surfaces, bounces and opacity are there once. In parts, bounced light is marched where maps would
-    serve the whole. The brightest lights, which an atlas marches to, come last."""
-    path = scene(LIGHTS if surface else LIGHTS.split("<shape")[0])
-    frame = Frame(0, {"visibility": visibility, "depth": str(depth), "spp": "4"})
-    (alone,) = tasks(path, tmp_path / "whole", [frame])
-    work.render(alone)
-    parts = tasks(path, tmp_path / "out", [frame], 3)
-    images = []
-    for task in parts:
-        work.render(task)
-        images.append(pixels(task.path))
-    assert all(image[..., :3].max() > 0.003 for image in images)
-    assert all(image[..., 3].max() == 0 for image in images[1:])
-    np.testing.assert_allclose(sum(images), pixels(alone.path), atol=2e-6, rtol=1e-5)
-
-
-def test_parts_become_the_frame_when_all_are_there(scene, tmp_path, capsys):
-    path, out = scene(LIGHTS), tmp_path / "out"
-    words = ["sequence", str(path), "-o", str(out), "--lights", "2", "-D", "spp=1"]
-    assert cli.main([*words, "--shard", "2/2"]) == 0
-    assert list(contents(out)) == ["frame_0000.lights2of2.exr"]
-    assert cli.main([*words, "--shard", "2/2", "--check"]) == 0
-    assert cli.main([*words, "--check"]) == 1
-    assert "frame_0000.lights1of2.exr is missing" in capsys.readouterr().err
-    assert cli.main([*words, "--shard", "1/2"]) == 0
-    assert list(contents(out)) == ["frame_0000.exr"]
-    assert cli.main([*words, "--check"]) == 0
-    before = contents(out)
-    assert cli.main(words) == 0 and contents(out) == before
-
-
-def test_pictures_that_are_no_sums_over_lights_are_refused(scene, tmp_path):
-    (task, _) = tasks(scene(), tmp_path / "out", [Frame(0, {"more": "depth"})], 2)
-    with pytest.raises(MiNtfError, match=r"aovs.*give whole frames to shards"):
-        work.render(task)
+    <emitter type="directional"><vector name="direction" x="0" y="-1" z="-0.6"/></emitter>"""
 
 
 @pytest.fixture
@@ -257,7 +213,7 @@ def test_of_several_lights_those_that_moved_get_maps_anew(scene, tmp_path, kept_
     monkeypatch.setattr(map_cache, "_joined", counting)
     values = {"visibility": "transmittance_map", "spp": "4"}
     frames = [Frame(i, values, lights={"other": {"position": [-3 + i, 2, 3]}}) for i in range(2)]
-    line = tasks(scene(LIGHTS.split("<shape")[0]), tmp_path / "out", frames)
+    line = tasks(scene(LIGHTS), tmp_path / "out", frames)
     for task in line:
         work.render(task)
     assert made == [[512 + 1]]  # after the constant light's, and the lamp

@@ -8,7 +8,7 @@ from mi_ntf.sequence import curves, parameters, timeline
 
 
 def curve(keys, interpolation, at):
-    track = curves.Track({"keys": keys, "interpolation": interpolation}, 1, "x")
+    track = curves.track({"keys": keys, "interpolation": interpolation}, 1, "x")
     return [float(track.at(f)[0]) for f in at]
 
 
@@ -40,13 +40,13 @@ def test_smooth_is_monotone_for_numbers_and_catmull_rom_for_positions():
     keys = [[0, 0.0], [2, 1.0], [5, 1.5], [6, 0.0]]
     at = [1, 3, 4.5, 5.5]
     assert curve(keys, "smooth", at) == curve(keys, "monotone", at)
-    rows = curves.Track({"keys": [[f, [v, 2 * v, 0]] for f, v in keys]}, 3, "p")
+    rows = curves.track({"keys": [[f, [v, 2 * v, 0]] for f, v in keys]}, 3, "p")
     np.testing.assert_allclose([rows.at(f)[:2] for f in at],
                                [[v, 2 * v] for v in curve(keys, "catmull-rom", at)], atol=1e-14)
 
 
 def test_a_circle_about_an_axis():
-    track = curves.Track({"start": [3, 5, 1], "centre": [1, 0, 1], "degrees": {"keys": [[0, 0], [4, 360]],
+    track = curves.track({"start": [3, 5, 1], "centre": [1, 0, 1], "degrees": {"keys": [[0, 0], [4, 360]],
                                                                                  "interpolation": "linear"}}, 3, "p")
     np.testing.assert_allclose([track.at(f) for f in range(5)],
                                [[3, 5, 1], [1, 5, -1], [-1, 5, 1], [1, 5, 3], [3, 5, 1]], atol=1e-12)
@@ -82,7 +82,7 @@ def test_what_a_timeline_says_of_its_frames(tmp_path):
     assert line.frames[1].camera == {"origin": [1, 0, 4], "target": [0, 0, 0]}
     assert line.frames[1].lights == {"lamp": {"position": [1, 2, 3]}}
     assert line.frames[1].environment == {"degrees": 45}
-    assert set(line.frames[0].told()) == {"parameters", "camera", "lights", "environment"}
+    assert set(line.frames[0].values()) == {"parameters", "camera", "lights", "environment"}
 
 
 @pytest.mark.parametrize(("text", "says"), [
@@ -94,7 +94,7 @@ def test_what_a_timeline_says_of_its_frames(tmp_path):
     ("frames = 2\n[parameters]\na = { keys = [[1, 1], [0, 2]] }", r"frames \[1.0, 0.0\], which must increase"),
     ("frames = 2\n[parameters]\na = { keys = [] }", r"parameters.a: keys is \[\]"),
     ("frames = 2\n[parameters]\na = { keys = [[0, 1]], interpolation = 'cubic' }", "interpolation is 'cubic'"),
-    ("frames = 2\n[parameters]\na = { keys = [[0, 'x'], [1, 'y']], interpolation = 'linear' }", "between texts"),
+    ("frames = 2\n[parameters]\na = { keys = [[0, 'x'], [1, 'y']], interpolation = 'linear' }", "texts cannot be"),
     ("frames = 2\n[camera]\norigin = [0, 0, 1]", "camera needs both origin and target"),
     ("frames = 2\n[lights.a]\nposition = [0, 0]", r"lights.a.position is \[0, 0\], expected \[x, y, z\]"),
     ("frames = 2\n[lights.a]\nposition = [0, 0, nan]", "expected"),
