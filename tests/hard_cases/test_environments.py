@@ -11,7 +11,7 @@ from helpers.variants import VARIANT
 
 import mi_ntf.render
 from mi_ntf.core.errors import MiNtfError
-from mi_ntf.render.lights import environment, light_rows, recent, scene_lights, sun
+from mi_ntf.render.lights import environment, light_gradients, light_rows, recent, scene_lights, sun
 
 
 @pytest.fixture(autouse=True)
@@ -37,7 +37,7 @@ def sphere(side: int = 240):
 
 def looked_up(emitter, d):
     """Radiance (n, 3) that Mitsuba's own `eval` shows a camera in the directions `d`."""
-    return np.array(environment.seen(emitter, mi.Vector3f(*d.T.astype(np.float32)))).T
+    return np.array(environment.background(emitter, mi.Vector3f(*d.T.astype(np.float32)))).T
 
 
 def turned(how: str):
@@ -170,7 +170,7 @@ def test_one_map_makes_the_same_lights_twice(rng):
     image = rng.uniform(0, 1, (300, 601, 3)).astype(np.float32)
     a = environment.cells(image.copy(), 512)
     assert environment.cells(image.copy(), 512) is a  # kept
-    environment._kept.clear()
+    environment._cells_of_images.clear()
     b = environment.cells(image.copy(), 512)
     assert b is not a
     assert (a.power == b.power).all() and (a.direction == b.direction).all() and (a.bounds == b.bounds).all()
@@ -184,9 +184,9 @@ def test_lights_that_are_kept_are_of_the_same_map(rng):
     image[3, 4] += 1
     brighter = environment.cells(image, 32)
     assert brighter.power.sum() > first.power.sum()
-    for limit in range(1, recent.KEPT + 4):
+    for limit in range(1, recent.SIZE + 4):
         environment.cells(image, limit)
-    assert len(environment._kept) == recent.KEPT
+    assert len(environment._cells_of_images) == recent.SIZE
     assert environment.cells(image, 32) is not brighter
 
 
@@ -206,9 +206,9 @@ def test_skies_that_are_kept_are_of_the_same_parameters():
     moved = sun.sky(emitter)
     assert moved.axis[0] == pytest.approx(-clear.axis[0])
     assert np.abs(moved.image - clear.image).max() > 0.1 * clear.image.max()
-    for turbidity in np.linspace(2, 9, recent.KEPT + 1):
+    for turbidity in np.linspace(2, 9, recent.SIZE + 1):
         sun.sky(mi.load_dict({"type": "sunsky", "turbidity": float(turbidity)}))
-    assert len(sun._kept) == recent.KEPT
+    assert len(sun._skies) == recent.SIZE
     assert sun.sky(emitter) is not moved
 
 
@@ -275,7 +275,7 @@ def test_power_has_the_gradient_of_every_texel(size, rng):
     data = mi.traverse(loaded)["data"]
     texels = mi.Float(data.array)
     dr.enable_grad(texels)
-    power = environment.power(texels * 2.0, data.shape[:2], cells)
+    power = light_gradients.cell_power(texels * 2.0, data.shape[:2], cells)
     np.testing.assert_allclose(np.array(dr.detach(power)).T, rows.power, rtol=1e-5)
     dr.backward(power)
     found = np.array(dr.grad(texels)).reshape(data.shape)[:, 1:-1, 0]

@@ -1,8 +1,13 @@
-"""Mitsuba's emitters as rows of a light table: point, spot and directional lights as they are, environments as a
-directional light for each of their cells."""
+"""Mitsuba's emitters as rows of a light table.
 
-from collections.abc import Callable
+Point, spot and directional lights are one row each, environments one directional light for each of their cells.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import drjit as dr
 import mitsuba as mi
@@ -17,8 +22,13 @@ NO_CONE = (0.0, 0.0, 1.0, 8.0, 9.0)
 
 @dataclass(frozen=True)
 class Rows:
-    """Lights in scene coordinates: `where`, `power`, `is_point`, `cones` of :class:`mi_ntf.infer.lights.LightTable`,
-    power per square of a scene unit; `cones` is None where no light has one."""
+    """Lights in scene coordinates, with the arrays of :class:`mi_ntf.infer.lights.LightTable`.
+
+    where     (n, 3) position of a point light, direction towards a directional one
+    power     (n, 3) intensity, in units of the scene's length, or irradiance
+    is_point  (n,) bool
+    cones     (n, 5), or None if no light has a cone
+    """
 
     where: np.ndarray
     power: np.ndarray
@@ -26,7 +36,7 @@ class Rows:
     cones: np.ndarray | None = None
 
     def table(self, frame: Frame) -> LightTable:
-        """These lights in the field coordinates of `frame`."""
+        """Return these lights in the field coordinates of `frame`."""
         where = np.where(
             self.is_point[:, None],
             frame.world_to_field_numpy(self.where),
@@ -37,29 +47,28 @@ class Rows:
             cones = np.concatenate([frame.world_to_field_numpy(cones[:, :3], direction=True), cones[:, 3:]], axis=1)
         return LightTable(where, self.power, self.is_point, frame.length, mi, cones)
 
-    def strength(self, places: list) -> np.ndarray:
-        """(n,) irradiance of each light where it is strongest of all `places`, cones left aside."""
-        light = np.abs(self.power).mean(1)
+    def strength(self, places: Sequence[np.ndarray]) -> np.ndarray:
+        """Return the irradiance (n,) of each light at the nearest of `places`, without regard to cones."""
+        light: np.ndarray = np.abs(self.power).mean(1)
         if not self.is_point.any() or not places:
             return light
         squares = np.stack([((self.where - place) ** 2).sum(1) for place in places]).min(0)
         return np.where(self.is_point, light / np.maximum(squares, 1e-12), light)
 
-    def part(self, kept: np.ndarray) -> "Rows":
-        """Return the lights for which the mask `kept` (n,) is True."""
-        cones = None if self.cones is None else self.cones[kept]
-        return Rows(self.where[kept], self.power[kept], self.is_point[kept], cones)
+    def part(self, selected: np.ndarray) -> Rows:
+        """Return the lights with the numbers, or the mask, `selected`."""
+        cones = None if self.cones is None else self.cones[selected]
+        return Rows(self.where[selected], self.power[selected], self.is_point[selected], cones)
 
 
-def join(parts: list[Rows], dark: bool = False) -> Rows:
+def join(parts: Sequence[Rows], dark: bool = False) -> Rows:
     """Return the rows of all `parts` in order, without those of zero power unless `dark`."""
     if not parts:
         return Rows(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, bool))
     where, power, is_point = (
         np.concatenate([getattr(p, name) for p in parts]) for name in ("where", "power", "is_point")
     )
-    # What is negative counts, as it does for Mitsuba.
-    lit = (power != 0).any(axis=1) | dark
+    lit = (power != 0).any(axis=1) | dark  # negative light counts, as it does for Mitsuba
     cones = None
     if any(p.cones is not None for p in parts):
         cones = np.concatenate([np.tile(NO_CONE, (len(p.power), 1)) if p.cones is None else p.cones for p in parts])
@@ -67,10 +76,10 @@ def join(parts: list[Rows], dark: bool = False) -> Rows:
     return Rows(where[lit], power[lit], is_point[lit], cones)
 
 
-def delta(emitter, kind: str) -> Rows:
-    """A ``point``, ``spot`` or ``directional`` light. Its power comes from Mitsuba's own sampling."""
+def delta(emitter: mi.Emitter, kind: str) -> Rows:
+    """Return the row of a ``point``, ``spot`` or ``directional`` light; its power comes from Mitsuba's sampling."""
     if kind == "directional":
-        direction, power, _ = _look(emitter, np.zeros(3))
+        direction, power, _ = _sampled_from(emitter, np.zeros(3))
         return Rows(direction, power, np.array([False]))
     parameters = mi.traverse(emitter)
     if kind == "point":
@@ -81,48 +90,60 @@ def delta(emitter, kind: str) -> Rows:
         position, axis = matrix[:3, 3], matrix[:3, 2] / np.linalg.norm(matrix[:3, 2])
         angles = [np.radians(float(np.ravel(parameters[name])[0])) for name in ("beam_width", "cutoff_angle")]
         cones = np.array([[*axis, *angles]])
-    # From one unit off, or as far as float32 needs to tell the two points apart.
-    _, weight, distance = _look(emitter, position + axis * max(1.0, 1e-3 * np.abs(position).max()))
+    # Sampled from a distance of 1, or from as far as float32 needs to tell the two points apart.
+    _, weight, distance = _sampled_from(emitter, position + axis * max(1.0, 1e-3 * np.abs(position).max()))
     return Rows(position[None], weight * distance**2, np.array([True]), cones)
 
 
-def _look(emitter, p: np.ndarray):
-    """Direction towards `emitter` (1, 3), its weight (1, 3) and distance, sampled at the scene point `p`."""
+def _sampled_from(emitter: mi.Emitter, p: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return the direction (1, 3) from the scene point `p` to `emitter`, its weight (1, 3) and distance, as sampled."""
     it = dr.zeros(mi.Interaction3f)
     it.p = mi.Point3f(p.tolist())
-    dr.make_opaque(it.p)  # or every place of a light would be compiled into kernels of its own
-    ds, weight = emitter.sample_direction(it, mi.Point2f(0.5), True)
+    dr.make_opaque(it.p)  # or each place of a light would be compiled into kernels of its own
+    ds, weight = emitter.sample_direction(it, mi.Point2f(0.5))
     dr.eval(ds.d, ds.dist, weight)
-    to_host = (np.array(v, np.float64).reshape(1, 3) for v in (ds.d, weight))
-    return *to_host, float(np.ravel(ds.dist)[0])
+    direction, power = (np.array(v, np.float64).reshape(1, 3) for v in (ds.d, weight))
+    return direction, power, float(ds.dist[0])
 
 
-def sky(emitter, kind: str, limit: int) -> tuple[Rows, environment.Cells]:
-    """At most `limit` directional lights for an ``envmap``, ``constant`` or ``sunsky``, and the cells that they are of;
-    the sun of a ``sunsky`` comes last, a light of its own."""
-    found = sun.sky(emitter) if kind == "sunsky" else None
-    limit = max(1, limit - bool(found))
-    cells = environment.cells(found.image, limit) if found else environment.cells_of(emitter, kind, limit)
+Lit: TypeAlias = tuple[Rows, environment.Cells | None]
+"""Rows of an emitter, and the cells of an environment."""
+
+
+def sky(emitter: mi.Emitter, kind: str, limit: int) -> Lit:
+    """Return at most `limit` directional lights of an ``envmap``, ``constant`` or ``sunsky``, and their cells.
+
+    The sun of a ``sunsky`` is a light of its own and comes last.
+    """
+    sun_and_sky = sun.sky(emitter) if kind == "sunsky" else None
+    limit = max(1, limit - bool(sun_and_sky))
+    cells = (environment.cells(sun_and_sky.image, limit) if sun_and_sky
+             else environment.cells_of(emitter, kind, limit))
     rotation, _ = environment.placement(emitter, kind)
     where, power = cells.direction @ rotation.T, cells.power
-    if found:
-        where, power = np.concatenate([where, found.axis[None]]), np.concatenate([power, found.power[None]])
+    if sun_and_sky:
+        where = np.concatenate([where, sun_and_sky.axis[None]])
+        power = np.concatenate([power, sun_and_sky.power[None]])
     return Rows(where, power, np.zeros(len(power), bool)), cells
+
+
+def _one(emitter: mi.Emitter, kind: str, limit: int) -> Lit:
+    return delta(emitter, kind), None
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of emitter. `name`: the plugin's; `rows`: ``(emitter, name, limit)`` → :class:`Rows`, at most `limit` of
-    them, and the cells of an environment or None; it is None itself for what is no finite set of lights and is drawn at
-    random. `single`: it is always one row."""
+    """Kind of emitter.
+
+    name    of the plugin
+    rows    ``(emitter, name, limit)`` → at most `limit` :class:`Rows`, and the cells of an environment or None; None if
+            the emitter is no finite set of lights, so that Mitsuba samples it at random
+    single  the emitter is always one row
+    """
 
     name: str
-    rows: Callable | None = None
+    rows: Callable[[mi.Emitter, str, int], Lit] | None = None
     single: bool = False
-
-
-def _one(emitter, name: str, limit: int):
-    return delta(emitter, name), None
 
 
 KINDS = {
@@ -137,10 +158,33 @@ KINDS = {
     "DirectionalArea": Kind("directionalarea"),
     "Projector": Kind("projector"),
 }
-"""Mitsuba's class name → what is known of it. Others are drawn at random, by Mitsuba's own sampling."""
+"""Mitsuba's class name → kind of emitter. Emitters of other classes are sampled at random, by Mitsuba."""
 
 
-def kind(emitter) -> Kind:
-    """The kind of an emitter, of ``ntf`` that of what it wraps."""
+def kind(emitter: mi.Emitter) -> Kind:
+    """Return the kind of an emitter; the kind of an ``ntf`` emitter is that of the light that it wraps."""
     inner = getattr(emitter, "inner", None)
-    return kind(inner) if inner is not None else KINDS.get(emitter.class_name(), Kind(emitter.class_name()))
+    class_name = str(emitter.class_name())
+    return kind(inner) if inner is not None else KINDS.get(class_name, Kind(class_name))
+
+
+@dataclass(frozen=True)
+class Discrete:
+    """An emitter that is a finite set of lights, with its kind, its rows, and the cells of an environment."""
+
+    emitter: mi.Emitter
+    kind: str
+    rows: Rows
+    cells: environment.Cells | None = None
+
+    @property
+    def shining(self) -> int:
+        """Number of an environment's cells that have power."""
+        return int((self.cells.weight > 0).sum()) if self.cells else 0
+
+    @classmethod
+    def of(cls, emitter: mi.Emitter, name: str, environment_lights: int) -> Discrete:
+        """Return the lights of an emitter; an environment has at most `environment_lights` rows, dark ones included."""
+        rows = kind(emitter).rows
+        assert rows is not None  # see is_discrete
+        return cls(emitter, name, *rows(emitter, name, environment_lights))

@@ -1,68 +1,83 @@
-"""Results that every trial and every frame asks for again."""
+"""Cache of results that every trial and every frame requests again."""
 
-from collections.abc import Callable
-from typing import Any
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable
+from typing import Generic, TypeVar
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-KEPT = 8
+from ...infer.types import Array
+
+SIZE = 8
+Result = TypeVar("Result")
 
 
-class Recent(dict):
-    """Cache of the `kept` results that were asked for last, by their inputs."""
+class Recent(dict[Hashable, Result], Generic[Result]):
+    """Cache of the `size` results that were requested last, by their inputs."""
 
-    def __init__(self, kept: int = KEPT):
+    def __init__(self, size: int = SIZE) -> None:
         super().__init__()
-        self._kept = kept
+        self._size = size
 
-    def of(self, key, make: Callable[[], Any]):
-        """Return the result of `key`; it is `make()` if none is kept."""
-        found = self.pop(key) if key in self else make()
-        while len(self) >= self._kept:
+    def of(self, key: Hashable, make: Callable[[], Result]) -> Result:
+        """Return the result of `key`; call `make` if it is not in the cache."""
+        result = self.pop(key) if key in self else make()
+        while len(self) >= self._size:
             del self[next(iter(self))]
-        self[key] = found
-        return found
+        self[key] = result
+        return result
 
 
 class Version:
-    """The parameters of Mitsuba objects at one moment, as a key: equal to another while none has been assigned a new
-    value.
+    """Key that tells the parameters of Mitsuba objects at one moment from other values.
 
-    Arrays are compared by their Dr.Jit variables, since reading all texels of a large map takes long. A copy of each
-    array is kept, so that no other variable gets its index meanwhile. Neither the objects nor anything that carries
-    gradients is kept, since these would outlive their scene.
+    Two keys are equal as long as no parameter has been assigned a new value. Arrays are compared by the index of their
+    Dr.Jit variables, since reading all texels of a large map takes long. A copy of each array is stored, so that no
+    other variable gets its index meanwhile. Neither the objects nor anything that carries gradients is stored, since
+    these would outlive their scene.
 
-    owners    type of the objects, given or nested, whose parameters count
-    attached  whether a parameter carries gradients
+    Parameters
+    ----------
+    owners
+        Type of the objects, `objects` themselves or nested ones, whose parameters count.
+
+    Attributes
+    ----------
+    attached : bool
+        True if a parameter carries gradients.
     """
 
-    def __init__(self, *objects, owners: type = object):
+    def __init__(self, *objects: mi.Object, owners: type = object) -> None:
         values = [value for parameters in map(mi.traverse, objects) for name, value in parameters
                   if isinstance(parameters.properties[name][2], owners)]
         self.attached = any(dr.grad_enabled(value) for value in values)
-        # Copies: an object's own array, held by reference, would be written to in place.
+        # Copies, since an object's own array, held by reference, would be written to in place.
         self._arrays = [type(value)(dr.detach(value)) for value in values if _is_large(value)]
         self._key = (*(o.class_name() for o in objects), *map(_identity, values))
 
-    def __eq__(self, other) -> bool:
+    def __eq__(self, other: object) -> bool:
         return isinstance(other, Version) and self._key == other._key
 
     def __hash__(self) -> int:
         return hash(self._key)
 
-    def once(self, kept: Recent, make: Callable[[], Any], *more):
-        """Return the result in `kept` for this version and the inputs `more`; it is `make()` if there is none."""
-        return make() if self.attached else kept.of((self, *more), make)
+    def once(self, cache: Recent[Result], make: Callable[[], Result], *inputs: Hashable) -> Result:
+        """Return the result for this version and further `inputs` from `cache`; call `make` if it is not there.
+
+        Nothing is cached if a parameter carries gradients.
+        """
+        return make() if self.attached else cache.of((self, *inputs), make)
 
 
-def _is_large(value) -> bool:
+def _is_large(value: object) -> bool:
     """Return True if `value` is a tensor or an array of more than one number."""
-    return dr.is_tensor_v(value) or (dr.is_array_v(value) and dr.depth_v(value) == 1 and dr.width(value) > 1)
+    return bool(dr.is_tensor_v(value) or (dr.is_array_v(value) and dr.depth_v(value) == 1 and dr.width(value) > 1))
 
 
-def _identity(value) -> tuple | bytes:
+def _identity(value: Array) -> Hashable:
     if not _is_large(value):
         return np.array(dr.detach(getattr(value, "matrix", value))).tobytes()
     array = value.array if dr.is_tensor_v(value) else value
