@@ -1,5 +1,7 @@
 """Camera, lights and environment of a frame, put into its parsed scene."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable, Sequence
 from typing import cast
 
@@ -91,11 +93,11 @@ def _turn_environment(emitters: Sequence[mi.Properties], values: Values) -> None
         props["to_world"] = mi.ScalarTransform4f().rotate(axis, values["degrees"]) @ _to_world(props)
 
 
-def _to_world(props: mi.Properties) -> "mi.ScalarTransform4f":
+def _to_world(props: mi.Properties) -> mi.ScalarTransform4f:
     return cast("mi.ScalarTransform4f", props.get("to_world", mi.ScalarTransform4f()))
 
 
-def _look_at(origin: list[float], target: list[float], up: list[float], name: str) -> "mi.ScalarTransform4f":
+def _look_at(origin: list[float], target: list[float], up: list[float], name: str) -> mi.ScalarTransform4f:
     way = np.subtract(target, origin)
     if not np.linalg.norm(np.cross(way, up)) > 1e-9 * np.linalg.norm(way) * np.linalg.norm(up):
         raise MiNtfError(f"{name}: from origin {origin} to target {target} with up {up} there is no upright view; "

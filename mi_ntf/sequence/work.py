@@ -4,6 +4,8 @@
 stay in the process for the next frame. Maps that neither of the last two frames used are freed.
 """
 
+from __future__ import annotations
+
 import hashlib
 import json
 import time
