@@ -1,57 +1,69 @@
-"""Where the camera of a view stands: as a browser turns it, as Mitsuba's sensor has it."""
+"""The camera of a view: its pose as a browser has it, and Mitsuba's sensor."""
+
+from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
+import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from mi_ntf.core.errors import MiNtfError
 
 from .parameters import Parameters, numbers
 
-KINDS = ("PerspectiveCamera", "ThinLensCamera")
+SENSORS = ("PerspectiveCamera", "ThinLensCamera")
+Triple: TypeAlias = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class Pose:
-    """`origin`, `target`: points of the scene; `up`: a direction; `fov`: of the picture's height, degrees."""
+    """Pose of a camera: the scene points `origin` and `target`, direction `up`, and field of view in degrees.
 
-    origin: tuple[float, float, float]
-    target: tuple[float, float, float]
-    up: tuple[float, float, float]
+    `fov` is that of the picture's height.
+    """
+
+    origin: Triple
+    target: Triple
+    up: Triple
     fov: float
 
     @property
-    def matrix(self) -> np.ndarray:
-        """(4, 4) camera to scene, Mitsuba's axes: x left, y up, z forward."""
-        origin, target = np.array(self.origin), np.array(self.target)
-        forward = _unit(target - origin)
-        left = _unit(np.cross(self.up, forward))
-        matrix = np.eye(4)
-        matrix[:3] = np.stack([left, np.cross(forward, left), forward, origin], axis=1)
-        return matrix
+    def matrix(self) -> NDArray[np.float64]:
+        """Camera to scene, (4, 4), with Mitsuba's axes: x left, y up, z forward."""
+        return look_at(self.origin, self.target, self.up)
 
 
-def pose_of(sensor, parameters: Parameters, center: np.ndarray) -> Pose:
-    """That of a sensor; its target is the point of its axis that is nearest to `center`. Raises MiNtfError where it is
-    no camera with a pinhole or a lens."""
-    if sensor.class_name() not in KINDS:
+def look_at(origin: ArrayLike, target: ArrayLike, up: ArrayLike) -> NDArray[np.float64]:
+    """Return the (4, 4) transform of an object at `origin` whose z axis points to `target`, in double precision."""
+    vectors = (np.asarray(v, np.float64).tolist() for v in (origin, target, up))
+    return np.array(mi.ScalarTransform4d().look_at(*vectors).matrix, np.float64).reshape(4, 4)
+
+
+def pose_of(sensor: mi.Sensor, parameters: Parameters, center: np.ndarray) -> Pose:
+    """Return the pose of a sensor. Its target is the point of the optical axis that is nearest to `center`.
+
+    Raises MiNtfError for sensors other than ``perspective`` and ``thinlens``.
+    """
+    if sensor.class_name() not in SENSORS:
         raise MiNtfError(f"the scene's sensor is {sensor.class_name()}; mi-ntf view turns perspective and thinlens "
                          "ones")
     matrix = numbers(parameters.get(sensor, "to_world"))
     origin, forward, up = matrix[:3, 3], _unit(matrix[:3, 2]), _unit(matrix[:3, 1])
-    away = max(float((center - origin) @ forward), 1e-3)
+    distance = max(float((center - origin) @ forward), 1e-3)
     width, height = (int(n) for n in sensor.film().crop_size())
     fov = fov_of_height(float(numbers(parameters.get(sensor, "x_fov"))[0]), width / height)
-    return Pose(three(origin), three(origin + away * forward), three(up), fov)
+    return Pose(triple(origin), triple(origin + distance * forward), triple(up), fov)
 
 
-def fov_of_height(x_fov: float, aspect: float) -> float:
-    """Degrees of the height of a picture `aspect` times as wide as high, of those of its width."""
-    return float(np.degrees(2 * np.arctan(np.tan(np.radians(x_fov) / 2) / aspect)))
+def fov_of_height(fov_of_width: float, aspect: float) -> float:
+    """Return the vertical field of view in degrees of a picture `aspect` times as wide as high."""
+    return float(np.degrees(2 * np.arctan(np.tan(np.radians(fov_of_width) / 2) / aspect)))
 
 
-def place(sensor, parameters: Parameters, pose: Pose, size: tuple[int, int]) -> None:
-    """Put the sensor where `pose` says, with a picture of (width, height) pixels."""
+def place(sensor: mi.Sensor, parameters: Parameters, pose: Pose, size: tuple[int, int]) -> None:
+    """Give the sensor the pose `pose` and a picture of (width, height) pixels."""
     film = sensor.film()
     if tuple(int(n) for n in film.crop_size()) != size:
         parameters.set(film, "size", size)
@@ -62,10 +74,11 @@ def place(sensor, parameters: Parameters, pose: Pose, size: tuple[int, int]) -> 
     parameters.update()
 
 
-def _unit(v) -> np.ndarray:
-    return np.asarray(v, np.float64) / max(float(np.linalg.norm(v)), 1e-12)
+def triple(vector: ArrayLike) -> Triple:
+    """Return a vector as plain numbers."""
+    x, y, z = np.asarray(vector, np.float64).tolist()
+    return x, y, z
 
 
-def three(v) -> tuple[float, float, float]:
-    """As plain numbers."""
-    return float(v[0]), float(v[1]), float(v[2])
+def _unit(vector: np.ndarray) -> NDArray[np.float64]:
+    return np.asarray(vector / max(float(np.linalg.norm(vector)), 1e-12), np.float64)

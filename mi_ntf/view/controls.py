@@ -1,39 +1,53 @@
-"""A view's controls in a browser (viser): nothing is fetched from, or shared with, another machine."""
+"""A view's controls in a browser (viser). Nothing is fetched from, or shared with, another machine."""
+
+from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import viser
+from viser import transforms
 
 from mi_ntf.infer.visibility import names
 from mi_ntf.page_server import serve
 
 from . import environments
-from .camera import Pose, three
+from .camera import Pose, triple
+from .display import Bytes
 from .lights import Light
 from .save import beside_scene, save
-from .session import SEEN, Session
+from .session import AOVS, Session
 from .viewer import Viewer
 
 LIGHT, NOTHING = "light", "–"
-JPEG = 90
+JPEG_QUALITY = 90
+T = TypeVar("T")
+
+
+@dataclass
+class Gizmo:
+    """Handles of a light in the scene, and the numbers on the page that show its position."""
+
+    handles: viser.TransformControlsHandle
+    position: viser.GuiVector3Handle | None = None
 
 
 class Controls:
-    """The page of `session` at `host`:`port`, or the next port that is free; ``url`` says where."""
+    """The page of `session` at `host`:`port`, or the next free port. Its address is ``url``."""
 
-    def __init__(self, session: Session, host: str = "127.0.0.1", port: int = 8080, samples: int = 64):
+    def __init__(self, session: Session, host: str = "127.0.0.1", port: int = 8080, samples: int = 64) -> None:
         self.session = session
         self.server, self.url = serve(f"mi-ntf: {session.path.name}", host, port)
         self.viewer = Viewer(session, self._show, self._tell, samples)
-        self.gizmos: dict[int, Any] = {}
-        self._camera()
-        self._picture_folder()
+        self.gizmos: dict[int, Gizmo] = {}
+        self._set_camera()
+        self._add_picture_folder()
         for light in session.lights:
-            self._light_folder(light)
-        self._environments()
-        self._file_folder()
+            self._add_light_folder(light)
+        self._add_environments()
+        self._add_file_folder()
 
     def run(self) -> None:
         """Serve until :meth:`stop`, rendering in this thread."""
@@ -44,31 +58,33 @@ class Controls:
             self.server.stop()
 
     def stop(self) -> None:
+        """End :meth:`run`."""
         self.viewer.stop()
 
-    def _show(self, picture: np.ndarray, status: str) -> None:
-        self.server.scene.set_background_image(picture, format="jpeg", jpeg_quality=JPEG)
+    def _show(self, picture: Bytes, status: str) -> None:
+        self.server.scene.set_background_image(picture, format="jpeg", jpeg_quality=JPEG_QUALITY)
         self._status.content = status
 
     def _tell(self, text: str) -> None:
         self._answer.content = text
 
-    def _camera(self) -> None:
-        pose, first = self.session.pose, self.server.initial_camera
+    def _set_camera(self) -> None:
+        pose, initial = self.session.pose, self.server.initial_camera
         self.server.scene.set_up_direction(pose.up)
-        first.up, first.position, first.look_at = (np.array(v) for v in (pose.up, pose.origin, pose.target))
-        first.fov = float(np.radians(pose.fov))
+        initial.up, initial.position, initial.look_at = (np.array(v) for v in (pose.up, pose.origin, pose.target))
+        initial.fov = float(np.radians(pose.fov))
 
-        @self.server.on_client_connect
-        def _(client: viser.ClientHandle) -> None:
-            client.camera.on_update(lambda _: self._looked(client.camera))
+        def follow(client: viser.ClientHandle) -> None:
+            client.camera.on_update(lambda _: self._on_camera(client.camera))
 
-    def _looked(self, view: viser.CameraHandle) -> None:
-        """The browser's camera is elsewhere, or its window has another shape."""
-        turn = viser.transforms.SO3(np.array(view.wxyz)).as_matrix()
+        self.server.on_client_connect(follow)
+
+    def _on_camera(self, view: viser.CameraHandle) -> None:
+        """Follow the browser's camera and the shape of its window."""
+        turn = transforms.SO3(np.array(view.wxyz)).as_matrix()
         position, aspect = np.array(view.position, np.float64), float(view.aspect)
-        away = float(np.linalg.norm(np.array(view.look_at) - position))
-        pose = Pose(three(position), three(position + away * turn[:, 2]), three(-turn[:, 1]),
+        distance = float(np.linalg.norm(np.array(view.look_at) - position))
+        pose = Pose(triple(position), triple(position + distance * turn[:, 2]), triple(-turn[:, 1]),
                     float(np.degrees(view.fov)))
 
         def do() -> None:
@@ -79,51 +95,51 @@ class Controls:
 
         self.viewer.change("camera", do, "camera")
 
-    def _picture_folder(self) -> None:
+    def _add_picture_folder(self) -> None:
         gui, viewer, session = self.server.gui, self.viewer, self.session
         self._status, self._answer = gui.add_markdown(""), gui.add_markdown("")
         with gui.add_folder("Picture"):
             visibility = gui.add_dropdown("visibility", tuple(names()), initial_value=session.settings.visibility)
             depth = gui.add_number("max_depth", session.settings.max_depth, min=-1, max=64, step=1,
-                                   hint="2: light scatters once; more of it when the picture rests")
-            shown = gui.add_dropdown("shown", (LIGHT, *SEEN), initial_value=LIGHT)
+                                   hint="2: single scattering; longer paths are rendered when nothing moves")
+            aov = gui.add_dropdown("shown", (LIGHT, *AOVS), initial_value=LIGHT)
             stops = gui.add_slider("exposure", -6.0, 6.0, 0.1, 0.0, hint="stops")
-            other = gui.add_dropdown("compared with", (NOTHING, *names()), initial_value=NOTHING)
-            share = gui.add_slider("split", 0.0, 1.0, 0.01, 0.5)
+            second = gui.add_dropdown("compared with", (NOTHING, *names()), initial_value=NOTHING)
+            split = gui.add_slider("split", 0.0, 1.0, 0.01, 0.5)
             error = gui.add_button("Error against raymarch")
         self._link(visibility, "visibility", lambda v: session.choose(visibility=v))
         self._link(depth, "depth", lambda v: session.choose(max_depth=int(v)))
-        self._link(shown, "shown", lambda v: session.choose(shown="" if v == LIGHT else v))
-        self._link(other, "other", lambda v: session.choose(other="" if v == NOTHING else v))
+        self._link(aov, "shown", lambda v: session.choose(aov="" if v == LIGHT else v))
+        self._link(second, "second", lambda v: session.choose(second_visibility="" if v == NOTHING else v))
         self._link(stops, "stops", lambda v: setattr(viewer, "stops", v), "shown")
-        self._link(share, "share", lambda v: setattr(viewer, "share", v), "shown")
+        self._link(split, "split", lambda v: setattr(viewer, "split", v), "shown")
         error.on_click(lambda _: viewer.change("error", self._measure, "shown"))
 
-    def _link(self, handle: Any, name: str, do: Callable[[Any], Any], kind: str = "other") -> None:
-        """`do` with the value of a control whenever it has another."""
+    def _link(self, handle: viser.GuiInputHandle[T], name: str, do: Callable[[T], object], kind: str = "other") -> None:
+        """Call `do` with the value of a control after each change by a browser."""
 
-        def update(event) -> None:
-            if event.client is not None:  # not where this program set it
+        def update(event: viser.GuiEvent[viser.GuiInputHandle[T]]) -> None:
+            if event.client is not None:  # None where this program set the value
                 value = handle.value
                 self.viewer.change(name, lambda: do(value), kind)
 
         handle.on_update(update)
 
     def _measure(self) -> None:
-        found = ", ".join(f"{100 * e:.2f} %" for e in self.session.error())
-        self._tell(f"Relative RMSE against raymarch: {found}")
+        errors = ", ".join(f"{100 * e:.2f} %" for e in self.session.error())
+        self._tell(f"Relative RMSE against raymarch: {errors}")
 
-    def _light_folder(self, light: Light) -> None:
+    def _add_light_folder(self, light: Light) -> None:
         gui, name = self.server.gui, f"{light.number} {light.kind}"
         if light.can_move or light.can_point:
-            self._gizmo(light, name)
+            self._add_gizmo(light, name)
         if not (light.can_move or light.can_turn or light.can_dim):
             return
         with gui.add_folder(name):
             if light.can_move:
-                place = gui.add_vector3("position", three(np.round(light.position, 6)), step=0.01)
-                self._link(place, f"light {name}", lambda v: self._typed(light, v), "light")
-                self.gizmos[light.number].place = place
+                position = gui.add_vector3("position", triple(np.round(light.position, 6)), step=0.01)
+                self._link(position, f"light {name}", lambda v: self._type_position(light, v), "light")
+                self.gizmos[light.number].position = position
             if light.can_turn:
                 turn = gui.add_slider("rotation", -180.0, 180.0, 1.0, 0.0, hint="degrees about the camera's up axis")
                 self._link(turn, f"turn {name}", light.turn, "light")
@@ -131,54 +147,52 @@ class Controls:
                 dim = gui.add_slider("brightness", -4.0, 4.0, 0.1, 0.0, hint="stops")
                 self._link(dim, f"dim {name}", lambda v: light.dim(2.0**v), "light")
 
-    def _gizmo(self, light: Light, name: str) -> None:
-        """Handles at a light, or, of one from far away, beside the fields."""
+    def _add_gizmo(self, light: Light, name: str) -> None:
+        """Add handles at a light, or beside the fields for a directional light."""
         radius = max(m.frame.length for m in self.session.media)
-        turns = light.can_point
-        at = light.position if light.can_move else self.session.center - 1.5 * radius * light.direction
-        controls = self.server.scene.add_transform_controls(
-            f"/lights/{name}", scale=0.35 * radius, depth_test=False, disable_rotations=not turns,
-            disable_axes=not light.can_move, disable_sliders=not light.can_move,
-            position=tuple(at), wxyz=viser.transforms.SO3.from_matrix(light.placement[:3, :3]).wxyz if turns
-            else (1, 0, 0, 0))
-        self.gizmos[light.number] = _Gizmo(controls)
+        position = light.position if light.can_move else self.session.center - 1.5 * radius * light.direction
+        wxyz = transforms.SO3.from_matrix(light.placement[:3, :3]).wxyz if light.can_point else (1, 0, 0, 0)
+        handles = self.server.scene.add_transform_controls(
+            f"/lights/{name}", scale=0.35 * radius, depth_test=False, disable_rotations=not light.can_point,
+            disable_axes=not light.can_move, disable_sliders=not light.can_move, position=tuple(position), wxyz=wxyz)
+        self.gizmos[light.number] = Gizmo(handles)
 
-        @controls.on_update
-        async def _(event) -> None:
-            position, wxyz = np.array(controls.position), np.array(controls.wxyz)
-            self.viewer.change(f"light {name}", lambda: self._dragged(light, position, wxyz), "light")
+        async def follow(_event: viser.TransformControlsEvent) -> None:
+            position, wxyz = np.array(handles.position), np.array(handles.wxyz)
+            self.viewer.change(f"light {name}", lambda: self._drag(light, position, wxyz), "light")
 
-    def _dragged(self, light: Light, position: np.ndarray, wxyz: np.ndarray) -> None:
+        handles.on_update(follow)
+
+    def _drag(self, light: Light, position: np.ndarray, wxyz: np.ndarray) -> None:
         if light.can_move:
             light.move(position)
-            place = self.gizmos[light.number].place
-            if place is not None:
-                place.value = three(np.round(position, 6))
+            numbers = self.gizmos[light.number].position
+            if numbers is not None:
+                numbers.value = triple(np.round(position, 6))  # type: ignore[misc]  # read-only in the stub
         if light.can_point:
-            light.point(viser.transforms.SO3(wxyz).as_matrix()[:, 2])
+            light.point(transforms.SO3(wxyz).as_matrix()[:, 2])
 
-    def _typed(self, light: Light, value) -> None:
-        light.move(value)
-        self.gizmos[light.number].controls.position = value
+    def _type_position(self, light: Light, position: tuple[float, float, float]) -> None:
+        light.move(position)
+        self.gizmos[light.number].handles.position = position
 
-    def _environments(self) -> None:
-        """A choice of files for the environment: those beside its own."""
+    def _add_environments(self) -> None:
+        """Add a choice of files for the environment, those beside its present one."""
         session = self.session
         if not any(light.can_turn for light in session.lights):
             return
-        found = environments.beside(session)
+        pictures = {path.name: path for path in reversed(environments.beside(session))}
         with self.server.gui.add_folder("Environment"):
-            choice = self.server.gui.add_dropdown("file", tuple(p.name for p in found) or ("–",))
+            choice = self.server.gui.add_dropdown("file", tuple(reversed(pictures)) or (NOTHING,))
             button = self.server.gui.add_button("Open")
 
         def do() -> None:
-            chosen = next((p for p in found if p.name == choice.value), None)
-            if chosen is not None:
-                environments.swap_environment(session, chosen)
+            if choice.value in pictures:
+                environments.swap_environment(session, pictures[choice.value])
 
         button.on_click(lambda _: self.viewer.change("environment", do, "light"))
 
-    def _file_folder(self) -> None:
+    def _add_file_folder(self) -> None:
         gui, path = self.server.gui, self.session.path
         with gui.add_folder("File"):
             name = gui.add_text("name", f"{path.stem}_view.xml", hint="of a file beside the scene")
@@ -191,20 +205,13 @@ class Controls:
         save(self.session, out)
         self._tell(f"Saved {out}")
 
-    def _step_back(self, event) -> None:
-        """Move the camera away from the fields until all lights that have a place are in view."""
+    def _step_back(self, event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
+        """Move the camera away from the fields until all lights with a position are in view."""
         if event.client is None:
             return
         view, center = event.client.camera, self.session.center
-        places = [light.position for light in self.session.lights if light.can_move]
-        reach = max([float(np.linalg.norm(p - center)) for p in places], default=0.0)
-        away = np.array(view.position, np.float64) - center
-        away *= (0.5 * reach + reach / np.tan(min(float(view.fov), 2.0) / 2)) / max(float(np.linalg.norm(away)), 1e-9)
-        view.position, view.look_at = tuple(center + away), tuple(center)
-
-
-class _Gizmo:
-    """The handles of a light, and the numbers that show its place, if there are any."""
-
-    def __init__(self, controls: Any):
-        self.controls, self.place = controls, None  # type: Any, Any
+        positions = [light.position for light in self.session.lights if light.can_move]
+        reach = max([float(np.linalg.norm(p - center)) for p in positions], default=0.0)
+        back = np.array(view.position, np.float64) - center
+        back *= (0.5 * reach + reach / np.tan(min(float(view.fov), 2.0) / 2)) / max(float(np.linalg.norm(back)), 1e-9)
+        view.position, view.look_at = tuple(center + back), tuple(center)

@@ -1,4 +1,4 @@
-"""Environment maps of a view: which there are, and one in place of another."""
+"""Environment maps of a view: the available files, and the exchange of one for another."""
 
 import tempfile
 from pathlib import Path
@@ -15,16 +15,18 @@ ENDINGS = (".exr", ".hdr")
 
 
 def beside(session: Session) -> list[Path]:
-    """Pictures that could be environments: those in the folders of the scene's files, of which results of renders are
-    not told apart."""
+    """Return the pictures in the folders of the scene's files, those in use first.
+
+    They may include results of renders.
+    """
+    in_use = [p.resolve() for p in _files(session)]
     folders = {session.path.parent, *(p.parent for p in _files(session))}
-    found = sorted({p.resolve() for folder in folders for p in folder.iterdir() if p.suffix.lower() in ENDINGS})
-    own = [p.resolve() for p in _files(session)]
-    return [p for p in found if p in own] + [p for p in found if p not in own]
+    pictures = sorted({p.resolve() for folder in folders for p in folder.iterdir() if p.suffix.lower() in ENDINGS})
+    return [p for p in pictures if p in in_use] + [p for p in pictures if p not in in_use]
 
 
 def _files(session: Session) -> list[Path]:
-    """Those of the environments that are there now."""
+    """Return the files of the present environments."""
     root = swap.parse(session.path)
     values = {d.get("name", ""): d.get("value", "") for d in root.iter("default")} | session.define
     swap.inline(root, session.path, session.path.parent, values, lambda content: content.find("emitter") is not None)
@@ -34,8 +36,10 @@ def _files(session: Session) -> list[Path]:
 
 
 def swap_environment(session: Session, picture: Path) -> None:
-    """Let the file `picture` (latitude and longitude, EXR or HDR) be the scene's environment. Raises MiNtfError where
-    the scene has none, or the file is no picture."""
+    """Use the file `picture` (latitude-longitude, EXR or HDR) as the scene's environment.
+
+    Raises MiNtfError where the scene has none, or the file is no picture.
+    """
     if not any(light.can_turn for light in session.lights):
         raise MiNtfError('the scene has no environment map to swap; give it an <emitter type="envmap">')
     try:

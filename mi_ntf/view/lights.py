@@ -1,32 +1,40 @@
-"""The lights of a view: where they are, and how they are moved."""
+"""The lights of a view: their places, and how they are changed."""
+
+from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
+import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from .parameters import Parameters, numbers
+from mi_ntf.core import rotation
+
+from .camera import look_at
+from .parameters import Parameters, Value, numbers
 
 POWER = {"PointLight": "intensity.value", "SpotLight": "intensity.value", "DirectionalEmitter": "irradiance.value",
          "EnvironmentMapEmitter": "scale", "ConstantBackgroundEmitter": "radiance.value"}
-"""Mitsuba's class name → parameter that light is in proportion to."""
+"""Parameter that the emitted light is proportional to, by Mitsuba's class name."""
 NAMES = {"PointLight": "point", "SpotLight": "spot", "DirectionalEmitter": "directional",
          "EnvironmentMapEmitter": "envmap", "ConstantBackgroundEmitter": "constant"}
 
 
 @dataclass
 class Light:
-    """Emitter `number` of the scene, of kind `kind` (the plugin's name): what of it can be changed, and how it was.
+    """Emitter `number` of the scene and its changes since the scene was opened.
 
-    moved      since the scene was opened
-    version    grows with every change
-    brightness factor on what it emits in the scene
-    degrees    that an environment is turned about `up`
+    kind        name of the plugin
+    up          axis about which an environment turns, unit vector
+    moved       True after a change of place or direction
+    version     number of changes
+    brightness  factor of the emission
+    degrees     angle by which an environment is turned about `up`
     """
 
     number: int
     kind: str
-    emitter: Any
+    emitter: mi.Emitter
     parameters: Parameters
     up: np.ndarray
     moved: bool = False
@@ -36,47 +44,51 @@ class Light:
 
     def __post_init__(self) -> None:
         self._power = numbers(self._get(POWER[self.emitter.class_name()])) if self.can_dim else None
-        placed = self.kind in ("spot", "directional", "envmap")
-        self._placement = numbers(self._get("to_world")) if placed else np.eye(4)
+        has_transform = self.kind in ("spot", "directional", "envmap")
+        self._placement = numbers(self._get("to_world")) if has_transform else np.eye(4)
 
     @property
     def can_move(self) -> bool:
+        """True for lights with a position."""
         return self.kind in ("point", "spot")
 
     @property
     def can_point(self) -> bool:
+        """True for lights with a direction."""
         return self.kind in ("spot", "directional")
 
     @property
     def can_turn(self) -> bool:
+        """True for environment maps."""
         return self.kind == "envmap"
 
     @property
     def can_dim(self) -> bool:
+        """True if the emission is a number or colour."""
         name = POWER.get(self.emitter.class_name())
         return name is not None and self.parameters.has(self.emitter, name)
 
     @property
-    def position(self) -> np.ndarray:
-        """(3,) of a point or spot light."""
+    def position(self) -> NDArray[np.float64]:
+        """Position of a point or spot light, (3,)."""
         return numbers(self._get("position")) if self.kind == "point" else self._placement[:3, 3]
 
     @property
-    def direction(self) -> np.ndarray:
-        """(3,) that a spot or directional light shines in, unit."""
-        return self._placement[:3, 2] / np.linalg.norm(self._placement[:3, 2])
+    def direction(self) -> NDArray[np.float64]:
+        """Direction of the light of a spot or directional light, unit vector (3,)."""
+        return np.asarray(self._placement[:3, 2] / np.linalg.norm(self._placement[:3, 2]))
 
     @property
-    def placement(self) -> np.ndarray:
-        """(4, 4) light to scene."""
+    def placement(self) -> NDArray[np.float64]:
+        """Light to scene, (4, 4)."""
         return self._placement
 
     @property
-    def power(self) -> np.ndarray | None:
-        """What it emits now; None where that is no number or colour."""
+    def power(self) -> NDArray[np.float64] | None:
+        """Present emission, a number or colour. None for lights that cannot be dimmed."""
         return None if self._power is None else self._power * self.brightness
 
-    def move(self, position) -> None:
+    def move(self, position: ArrayLike) -> None:
         """Put a point or spot light at the scene point `position`."""
         self.moved = True
         if self.kind == "point":
@@ -86,46 +98,39 @@ class Light:
             self._placement[:3, 3] = position
             self._set("to_world", self._placement)
 
-    def point(self, direction) -> None:
+    def point(self, direction: ArrayLike) -> None:
         """Let a spot or directional light shine along `direction`."""
         self.moved = True
-        z = np.asarray(direction, np.float64) / np.linalg.norm(direction)
-        x = np.cross(self.up if abs(z @ self.up) < 0.99 else np.roll(self.up, 1), z)
-        x /= np.linalg.norm(x)
-        self._placement = self._placement.copy()
-        self._placement[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
-        self._set("to_world", self._placement)
+        forward = np.asarray(direction, np.float64) / np.linalg.norm(direction)
+        up = self.up if abs(forward @ self.up) < 0.99 else np.roll(self.up, 1)
+        placement = look_at((0, 0, 0), forward, up)
+        placement[:3, 3] = self._placement[:3, 3]
+        self._placement = placement
+        self._set("to_world", placement)
 
     def turn(self, degrees: float) -> None:
-        """Turn an environment to `degrees` about the camera's up axis, counted from where the scene has it."""
+        """Turn an environment to `degrees` about the camera's up axis, relative to its place in the scene file."""
         self.degrees = float(degrees)
-        self._set("to_world", rotation(self.up, self.degrees) @ self._placement)
+        turned = self._placement.copy()
+        turned[:3] = rotation.about(self.up, self.degrees) @ turned[:3]
+        self._set("to_world", turned)
 
     def dim(self, brightness: float) -> None:
-        """Let it emit `brightness` times what it does in the scene."""
+        """Set the emission to `brightness` times that in the scene file."""
         self.brightness = float(brightness)
         power = self.power
         assert power is not None  # see can_dim
         self._set(POWER[self.emitter.class_name()], power if len(power) > 1 else float(power[0]))
 
-    def _get(self, name: str):
+    def _get(self, name: str) -> Value:
         return self.parameters.get(self.emitter, name)
 
-    def _set(self, name: str, value) -> None:
+    def _set(self, name: str, value: ArrayLike) -> None:
         self.parameters.set(self.emitter, name, value)
         self.version += 1
 
 
-def find(scene, parameters: Parameters, up: np.ndarray) -> list[Light]:
-    """All lights of a scene, in its order."""
+def lights_of(scene: mi.Scene, parameters: Parameters, up: np.ndarray) -> list[Light]:
+    """Return all lights of a scene, in its order."""
     return [Light(number, NAMES.get(e.class_name(), e.class_name()), e, parameters, up)
             for number, e in enumerate(scene.emitters())]
-
-
-def rotation(axis: np.ndarray, degrees: float) -> np.ndarray:
-    """(4, 4), by the right hand about the unit vector `axis` (Rodrigues)."""
-    angle, k = np.radians(degrees), np.cross(np.eye(3), axis)
-    matrix = np.eye(4)
-    matrix[:3, :3] += np.sin(angle) * k
-    matrix[:3, :3] += (1 - np.cos(angle)) * k @ k
-    return matrix

@@ -1,33 +1,40 @@
 """Scene parameters by the object that they belong to, set so that no kernel is compiled for a new value."""
 
-from typing import Any
+from __future__ import annotations
+
+from typing import Any, TypeAlias
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Value: TypeAlias = Any
+"""A parameter's value: a number, vector, colour or transform of the current variant."""
 
 
 class Parameters:
     """The traversed parameters of `scene`."""
 
-    def __init__(self, scene):
+    def __init__(self, scene: mi.Scene) -> None:
         self._all = mi.traverse(scene)
         self._changed = False
 
-    def get(self, node, name: str) -> Any:
-        """Parameter `name` of the object `node`."""
+    def get(self, node: mi.Object, name: str) -> Value:
+        """Return the parameter `name` of the object `node`."""
         return self._all[self._key(node, name)]
 
-    def has(self, node, name: str) -> bool:
-        return any(self._of(key, node, name) for key in self._all.properties)
+    def has(self, node: mi.Object, name: str) -> bool:
+        """Return True if the object `node` has the parameter `name`."""
+        return any(self._belongs(key, node, name) for key in self._all.properties)
 
-    def set(self, node, name: str, value) -> None:
-        """`value`: numbers or an array, in the form that the parameter has. It counts from :meth:`update` on."""
+    def set(self, node: mi.Object, name: str, value: ArrayLike) -> None:
+        """Set a parameter to numbers, in the form that it has. The scene uses them after :meth:`update`."""
         key = self._key(node, name)
         old = self._all[key]
         if isinstance(old, mi.AffineTransform4f):
             matrix = mi.Matrix4f(np.asarray(value, np.float64).tolist())
-            dr.make_opaque(matrix)  # a number that Python knows would be compiled into kernels
+            dr.make_opaque(matrix)  # literals would be compiled into kernels
             new = mi.AffineTransform4f(matrix)
         else:
             new = type(old)(value) if np.ndim(value) == 0 else type(old)(np.asarray(value).tolist())
@@ -37,19 +44,19 @@ class Parameters:
         self._changed = True
 
     def update(self) -> None:
-        """Tell the objects what was set."""
+        """Let the objects take the values that were set."""
         if self._changed:
             self._all.update()
             self._changed = False
 
-    def _key(self, node, name: str) -> str:
+    def _key(self, node: mi.Object, name: str) -> str:
         for key in self._all.properties:
-            if self._of(key, node, name):
-                return key
+            if self._belongs(key, node, name):
+                return str(key)
         raise KeyError(f"{node.class_name()} has no parameter {name}")
 
-    def _of(self, key: str, node, name: str) -> bool:
-        """Whether `key` is the parameter `name` of `node`; names with a dot belong to an object inside it."""
+    def _belongs(self, key: str, node: mi.Object, name: str) -> bool:
+        """Return True if `key` is the parameter `name` of `node`. A dotted name belongs to an object inside of it."""
         if not (key == name or key.endswith("." + name)):
             return False
         owner = self._all.properties[key][2]
@@ -58,8 +65,8 @@ class Parameters:
         return owner is node
 
 
-def numbers(value) -> np.ndarray:
-    """Any of Mitsuba's numbers, vectors (n,) and matrices (4, 4), float64."""
+def numbers(value: Value) -> NDArray[np.float64]:
+    """Return any of Mitsuba's numbers, vectors as (n,) and matrices as (4, 4)."""
     if isinstance(value, mi.AffineTransform4f):
         return np.array(value.matrix, np.float64).reshape(4, 4)
     return np.array(value, np.float64).ravel()

@@ -1,95 +1,104 @@
-"""One picture of a view: a method's image of the scene, of one layer a light, in passes that add up."""
+"""One picture of a view: the image of the scene by one method, in layers by lights and in passes that add up."""
 
-from dataclasses import fields, replace
-from typing import Any
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields
+from typing import Any, TypeAlias
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from mi_ntf.render.scene.settings import Limits, Settings
 from mi_ntf.render.transport import rendering
 from mi_ntf.render.transport.seen import Seen
 
+Group: TypeAlias = tuple[int, ...] | None
+"""Numbers of the emitters of a layer. None stands for all."""
+
 
 class Interrupted(Exception):
-    """A pass was given up, because something moved."""
+    """Exception that ends a pass, because something moved."""
 
 
 class Picture:
-    """Renders `scene` by `settings`; in place of an ``nrf`` integrator, whose attributes it has.
+    """Renderer of `scene` by `settings`, which has the attributes of an ``nrf`` integrator.
 
-    `groups`: numbers of the emitters of each layer; None: one layer of all. Layers of lights that stay as they were are
-    kept, and so is what the camera's rays meet (`seen`).
+    `groups` has the emitters of each layer; None makes one layer of all. Layers of unchanged lights are stored, and so
+    are the intersections of the camera's rays (`seen`).
     """
 
-    def __init__(self, scene, settings: Settings, groups: list[tuple[int, ...]] | None = None):
-        self.scene, self.settings, self.groups = scene, settings, groups
+    def __init__(self, scene: mi.Scene, settings: Settings, groups: list[tuple[int, ...]] | None = None) -> None:
+        self.scene, self.settings = scene, settings
+        self.groups: list[Group] = list(groups) if groups else [None]
         self.limits, self.timeout, self.chunk = Limits(), -1.0, rendering.CHUNK
         self.patches: Any = None
         self.chosen: Any = None
-        self.achieved: dict = {}
+        self.achieved: dict[str, object] = {}
         self.aovs: tuple[str, ...] = ()
         self.lights_seen = 0
         self.seen: Seen | None = None
-        self.stop = lambda: False
-        self._layers: dict[tuple, tuple[Any, np.ndarray]] = {}
-        self._rays: Any = None
-        self.rendered: list[tuple] = []
-        self._take(settings)
-
-    def _take(self, settings: Settings) -> None:
+        self.stop: Callable[[], bool] = lambda: False
+        self._layers: dict[Group, tuple[tuple[object, ...], np.ndarray]] = {}
+        self._samples: tuple[object, ...] = ()
+        self.rendered: list[Group] = []
         for each in fields(settings):
             setattr(self, each.name, getattr(settings, each.name))
 
     def should_stop(self) -> bool:
-        """Asked for each chunk of pixels; leaves the render by an exception where something moved."""
+        """Raise Interrupted if something moved. The renderer asks for each chunk of pixels."""
         if self.stop():
             raise Interrupted
         return False
 
-    def image(self, sensor, rays: tuple, versions: dict[int, int], seed: int, spp: int, keep: bool) -> np.ndarray:
-        """(h, w, 4) linear RGB and opacity of `spp` samples a pixel.
+    def image(self, sensor: mi.Sensor, rays: object, versions: dict[int, int], seed: int, spp: int,
+              keep: bool) -> np.ndarray:
+        """Return linear RGB and opacity, (h, w, 4).
 
-        `rays`: whatever the camera's rays depend on; with it, `seed` and `spp` the same, only layers are rendered whose
-        lights have other `versions` (by emitter). `keep`: False keeps nothing of this image for another one.
+        Parameters
+        ----------
+        sensor
+            Camera.
+        rays
+            All that the camera's rays depend on. While it, `seed` and `spp` stay the same, stored layers are used.
+        versions
+            Version of each light, by the emitter's number. A layer with other versions is rendered again.
+        seed, spp
+            Seed of the samples, and samples per pixel.
+        keep
+            False to store nothing.
         """
         if not keep:
             self.seen = None
-            return self._sum([self._render(sensor, group, seed, spp) for group in self._groups()])
-        if self._rays != (rays, seed, spp):
-            self._rays, self.seen, self._layers = (rays, seed, spp), Seen(), {}
+            return self._sum([self._render(sensor, group, seed, spp) for group in self.groups])
+        if self._samples != (rays, seed, spp):
+            self._samples, self.seen, self._layers = (rays, seed, spp), Seen(), {}
         layers = []
-        for group in self._groups():
-            now = tuple(sorted(versions.items())) if group is None else tuple(versions[i] for i in group)
-            found = self._layers.get(group or ())
-            if found is None or found[0] != now:
-                found = now, self._render(sensor, group, seed, spp)
-                self._layers[group or ()] = found
-            layers.append(found[1])
+        for group in self.groups:
+            version: tuple[object, ...] = (
+                tuple(sorted(versions.items())) if group is None else tuple(versions[i] for i in group))
+            stored = self._layers.get(group)
+            if stored is None or stored[0] != version:
+                stored = self._layers[group] = version, self._render(sensor, group, seed, spp)
+            layers.append(stored[1])
         return self._sum(layers)
 
-    def _groups(self) -> list:
-        return list(self.groups) if self.groups else [None]
-
-    def _render(self, sensor, group: tuple[int, ...] | None, seed: int, spp: int) -> np.ndarray:
+    def _render(self, sensor: mi.Sensor, group: Group, seed: int, spp: int) -> np.ndarray:
         self.only = group
-        self.rendered.append(group or ())
-        with dr.suspend_grad():
+        self.rendered.append(group)
+        with dr.suspend_grad():  # type: ignore[no-untyped-call]
             return np.array(rendering.render(self, self.scene, sensor, seed, spp, True))
 
     @staticmethod
     def _sum(layers: list[np.ndarray]) -> np.ndarray:
-        """Light adds; opacity is the same in all."""
+        """Return the sum of light, and the opacity, which is the same in all layers."""
         first = layers[0]
         if first.shape[2] == 3:
             first = np.concatenate([first, np.ones_like(first[..., :1])], axis=2)
-        total = first.copy()
+        total: np.ndarray = first.copy()
         for layer in layers[1:]:
             total[..., :3] += layer[..., :3]
             # A layer that shows an environment is opaque.
             total[..., 3:4] = np.maximum(total[..., 3:4], layer[..., 3:4] if layer.shape[2] > 3 else 1)
         return total
-
-    def but(self, **changed) -> "Picture":
-        """Another one, by other settings."""
-        return Picture(self.scene, replace(self.settings, **changed), self.groups)

@@ -1,4 +1,4 @@
-"""The XML of a scene that was changed in a view."""
+"""XML of a scene that was changed in a view."""
 
 import os
 from pathlib import Path
@@ -17,8 +17,10 @@ CHANGED = ("emitter", "sensor", "integrator")
 
 
 def beside_scene(session: Session, name: str) -> Path:
-    """Path of the file that a page's user calls `name`. Raises MiNtfError unless it is an XML file beside the scene: a
-    page writes nowhere else."""
+    """Return the path of the file `name` beside the scene.
+
+    Raises MiNtfError for any other place and for endings other than .xml: a page may write nowhere else.
+    """
     if Path(name).name != name or Path(name).suffix != ".xml":
         raise MiNtfError(f"name is {shown(name)}; scenes are saved beside the opened one: give a name without folders, "
                          "ending in .xml")
@@ -26,11 +28,24 @@ def beside_scene(session: Session, name: str) -> Path:
 
 
 def save(session: Session, out: Path, environment: Path | None = None) -> None:
-    """Write `out`: the scene of `session` as it is now. What was not changed stays as it was written; includes that
-    hold a light, a sensor or an integrator are inlined, comments are lost, and the values of $names that the session
-    was opened with become their defaults. `environment`: picture file in place of the present one.
+    """Write the scene of `session` as it is now.
 
-    Raises MiNtfError if `out` is the scene itself, or a changed light is not an <emitter> of the scene's top level.
+    Unchanged elements stay as they were written. Includes that hold a light, a sensor or an integrator are inlined,
+    comments are lost, and the session's values of $names become their defaults.
+
+    Parameters
+    ----------
+    session
+        View of the scene.
+    out
+        XML file to write.
+    environment
+        Picture file in place of the present environment.
+
+    Raises
+    ------
+    MiNtfError
+        If `out` is the scene itself, or a changed light is not an <emitter> of the scene's top level.
     """
     if out.resolve() == session.path.resolve():
         raise MiNtfError(f"{out} is the scene that is being viewed; choose another name")
@@ -50,10 +65,10 @@ def save(session: Session, out: Path, environment: Path | None = None) -> None:
                 place = os.path.relpath(environment, out.parent)
                 _replace(_element(root, session, light, values), ("filename", "bitmap"),
                          ET.Element("string", name="filename", value=Path(place).as_posix()))
-    if session.pose != session.opened:
+    if session.pose != session.initial_pose:
         _write_pose(root, session)
     for name in ("visibility", "max_depth"):
-        if getattr(session.settings, name) != getattr(session.before, name):
+        if getattr(session.settings, name) != getattr(session.initial_settings, name):
             _write_setting(root, name, getattr(session.settings, name))
     ET.indent(root, "    ")
     files.make_folder(out.parent)
@@ -62,23 +77,23 @@ def save(session: Session, out: Path, environment: Path | None = None) -> None:
 
 def _set_defaults(root: ET.Element, define: dict[str, str]) -> None:
     for name, value in define.items():
-        found = [d for d in root.iter("default") if d.get("name") == name]
-        for default in found[1:]:
+        defaults = [d for d in root.iter("default") if d.get("name") == name]
+        for default in defaults[1:]:
             root.remove(default)
-        if found:
-            found[0].set("value", value)
+        if defaults:
+            defaults[0].set("value", value)
         else:
             root.insert(0, ET.Element("default", name=name, value=value))
 
 
 def _element(root: ET.Element, session: Session, light: Light, values: dict[str, str]) -> ET.Element:
-    """The element of `light`: Mitsuba keeps the order of lights of a kind."""
-    found = [e for e in root.findall("emitter") if swap.substitute(e.get("type", ""), values) == light.kind]
-    same = [other for other in session.lights if other.kind == light.kind]
-    if len(found) != len(same):
-        raise MiNtfError(f"{session.path} has {len(found)} <emitter> of type {light.kind} at its top level, and the "
-                         f"scene {len(same)}; put them there to save what was changed")
-    return found[same.index(light)]
+    """Return the XML element of `light`. Mitsuba preserves the order of lights of one kind."""
+    elements = [e for e in root.findall("emitter") if swap.substitute(e.get("type", ""), values) == light.kind]
+    lights = [other for other in session.lights if other.kind == light.kind]
+    if len(elements) != len(lights):
+        raise MiNtfError(f"{session.path} has {len(elements)} <emitter> of type {light.kind} at its top level, and the "
+                         f"scene {len(lights)}; put them there to save what was changed")
+    return elements[lights.index(light)]
 
 
 def _write_light(element: ET.Element, light: Light) -> None:
@@ -90,7 +105,7 @@ def _write_light(element: ET.Element, light: Light) -> None:
         transform = element.find("transform[@name='to_world']")
         if transform is None:
             transform = ET.SubElement(element, "transform", name="to_world")
-        # The last step of a transform is done last.
+        # Mitsuba applies the steps of a transform in their order.
         x, y, z = (repr(float(c)) for c in light.up)
         ET.SubElement(transform, "rotate", x=x, y=y, z=z, angle=repr(light.degrees))
     if light.brightness != 1 and light.power is not None:
@@ -102,7 +117,7 @@ def _write_light(element: ET.Element, light: Light) -> None:
 
 
 def _write_pose(root: ET.Element, session: Session) -> None:
-    """Origin, target and up of the first sensor; its angle stays."""
+    """Write origin, target and up of the first sensor. Its field of view stays."""
     sensor = root.find("sensor")
     if sensor is None:
         raise MiNtfError(f"{session.path} has no <sensor> at its top level, so the camera cannot be saved")
@@ -113,8 +128,8 @@ def _write_pose(root: ET.Element, session: Session) -> None:
     _replace(sensor, ("to_world",), transform)
 
 
-def _write_setting(root: ET.Element, name: str, value) -> None:
-    """A property of the integrator; where it is a $name, that name's default."""
+def _write_setting(root: ET.Element, name: str, value: str | int) -> None:
+    """Write a property of the integrator, or the default of the $name that it refers to."""
     integrator = root.find("integrator")
     assert integrator is not None  # the scene was rendered by it
     old = next((e for e in integrator if e.get("name") == name), None)
@@ -128,7 +143,7 @@ def _write_setting(root: ET.Element, name: str, value) -> None:
 
 
 def _replace(parent: ET.Element, names: tuple[str, ...], new: ET.Element) -> None:
-    """`new` in place of the children of these names."""
+    """Replace the children with one of the `names` by `new`."""
     for child in [c for c in parent if c.get("name") in names]:
         parent.remove(child)
     parent.append(new)

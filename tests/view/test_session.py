@@ -154,7 +154,7 @@ def test_lights_beyond_the_eighth_share_a_layer_until_they_move(scene):
 
 def test_methods_side_by_side_and_their_error(scene):
     view = session(scene(POINT))
-    view.choose(visibility="transmittance_map", other="none")
+    view.choose(visibility="transmittance_map", second_visibility="none")
     frame = view.preview()
     by_map, without = frame.image, frame.right
     assert relative_rmse(without, fresh(view.path, visibility="none")) < SAME
@@ -166,17 +166,17 @@ def test_methods_side_by_side_and_their_error(scene):
 
 def test_other_outputs(scene):
     view = session(scene(POINT, SECOND))
-    view.choose(shown="normal")
+    view.choose(aov="normal")
     image = view.preview().image
     seen = np.abs(image).max(-1) > 0
     assert image.shape == (32, 32, 3) and np.allclose(np.linalg.norm(image[seen], axis=-1), 1, atol=1e-5)
-    view.choose(shown="depth")
+    view.choose(aov="depth")
     depth = view.refine().image[..., 0]
     assert 3 < depth[depth > 0].min() and depth.max() < 8  # the camera is 5.3 away
 
 
 @pytest.mark.parametrize(("wrong", "text"), [
-    ({"visibility": "map"}, 'visibility is "map", expected one of'), ({"shown": "motion"}, 'there is no "motion"')])
+    ({"visibility": "map"}, 'visibility is "map", expected one of'), ({"aov": "motion"}, 'there is no "motion"')])
 def test_unknown_names_are_told(scene, wrong, text):
     with pytest.raises(MiNtfError, match=text):
         session(scene(POINT)).choose(**wrong)
