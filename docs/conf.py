@@ -20,6 +20,7 @@ html_show_sphinx = False
 html_theme_options = {"footer_icons": []}
 
 myst_heading_anchors = 3
+napoleon_use_ivar = True
 myst_enable_extensions = ["deflist", "dollarmath"]
 
 nb_execution_mode = "force"

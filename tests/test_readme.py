@@ -10,24 +10,28 @@ from pathlib import Path
 import OpenEXR
 import pytest
 from data import forms
+from helpers.command_process import CommandProcess
 from helpers.programs import run_program
 
+from mi_ntf import cli
+
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
-TEXT = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md"))]
+TEXT = "\n".join(page.read_text(encoding="utf-8") for page in PAGES if page.name != "plugins.md")
 BLOCKS = re.findall(r"```(\w+)\n(.*?)```", TEXT, re.S)
-COMMANDS = [line.split("#")[0] for line in TEXT.splitlines() if re.match(r"    (mi-ntf|mitsuba|make) ", line)]
+COMMANDS = [line.split("#")[0] for line in TEXT.splitlines() if re.match(r"    (mi-ntf|mitsuba|make|python) ", line)]
 COMMANDS = [line.split() for line in dict.fromkeys(map(str.rstrip, COMMANDS))]
-SMALLER = {"--minutes": "0.1", "--steps": "20", "--size": "24", "--budget": "5s"}
+SMALLER = {"--minutes": "0.03", "--steps": "10", "--size": "24", "--budget": "5s"}
 CAPTURE = {"--views": "12", "--size": "24", "--test-views": "1", "--spp": "2"}
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """The shipped scenes, a mesh scene of one's own, photographs with a COLMAP model, and two images, as the pages'
-    commands expect them."""
+    """Make a folder with the files that the pages' commands expect: the shipped scenes, a scene of meshes, photographs
+    with a COLMAP model, two images."""
     folder = tmp_path_factory.mktemp("readme")
     shutil.copytree(ROOT / "scenes", folder / "scenes")
+    shutil.copytree(ROOT / "docs/gallery", folder / "docs/gallery")
     sys.path.insert(0, str(ROOT / "examples"))
     try:
         from own_mesh import BOXES
@@ -36,6 +40,8 @@ def folder(tmp_path_factory):
     (folder / "scene.xml").write_text(BOXES.replace('value="96"', 'value="24"'))
     for name in ("skull_flash", "mine"):
         forms.colmap(folder / name)
+    timeline = folder / "scenes/statue/circle.toml"
+    timeline.write_text(timeline.read_text().replace("frames = 120", "frames = 4"))
     shutil.copy(ROOT / "scenes/statue/reference_point.exr", folder / "reference.exr")
     with OpenEXR.File(str(folder / "reference.exr"), separate_channels=True) as file:  # a render that differs a little
         channels = {name: channel.pixels * (1 if name == "A" else 1.02) for name, channel in file.channels().items()}
@@ -44,27 +50,39 @@ def folder(tmp_path_factory):
     return folder
 
 
-def check(*words, folder):
-    own = {"XDG_CACHE_HOME": str(folder / "cache")} if words[1] == "cache" else {}  # not the user's
-    done = run_program(*words, cwd=folder, **own)
-    assert done.returncode == 0, f"{words}\n{done.stdout}\n{done.stderr}"
-    return done.stdout
+@pytest.fixture(scope="module")
+def process(folder):
+    """Start the process of all commands but `mitsuba`. Its cache is not the user's."""
+    process = CommandProcess(folder, MI_NTF_CACHE="memory", XDG_CACHE_HOME=str(folder / "cache"))
+    yield process
+    process.close()
+
+
+def check(process, folder, *words):
+    """Run a command and return what it printed."""
+    if words[0] == "mitsuba":
+        done = run_program(*words, cwd=folder)
+        code, text = done.returncode, done.stdout + done.stderr
+    else:
+        code, text = process.run(*words)
+    assert code == 0, f"{' '.join(words)}\n{text}"
+    return text
 
 
 @pytest.mark.parametrize(("language", "code"), BLOCKS, ids=[language for language, _ in BLOCKS])
-def test_snippet(folder, language, code):
+def test_snippet(folder, process, language, code):
     if language == "xml":
         (folder / "snippet.xml").write_text(code.replace('"256"', '"24"').replace('value="16"', 'value="2"'))
-        check("mitsuba", "-m", "llvm_ad_rgb", "-o", "snippet.exr", "snippet.xml", folder=folder)
+        check(process, folder, "mitsuba", "-m", "llvm_ad_rgb", "-o", "snippet.exr", "snippet.xml")
         assert (folder / "snippet.exr").stat().st_size > 0
     else:
-        assert language == "python"
-        (folder / "snippet.py").write_text(code + "assert image.shape == (64, 64, 4)\n")
-        check("python", "snippet.py", folder=folder)
+        assert language == "python" and "assert" in code
+        (folder / "snippet.py").write_text(code)
+        check(process, folder, "python", "snippet.py")
 
 
 def opened(words, folder):
-    """A view of `words` is served, and ended."""
+    """Start a view, read its page, and end it."""
     command = [sys.executable, "-m", "mi_ntf", *words[1:], "--size", "16", "--samples", "1", "--port", "8190"]
     with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as program:
         try:
@@ -74,59 +92,63 @@ def opened(words, folder):
             program.terminate()
 
 
-def _marks(words) -> list:
-    """How shipped fields were trained takes minutes here too, some trainings differ by their options alone, and prices
-    are measured by other tests: `make hard-cases` runs those."""
-    dear = {"--measure", "mine.safetensors", "knot-photographs", "scenes/skull/field.safetensors"}
-    slow = dear & set(words) or words[:3] == ["mi-ntf", "train", "skull_flash"]
-    return [pytest.mark.slow] if slow else []
-
-
-@pytest.mark.parametrize(
-    "words", [pytest.param(words, marks=_marks(words), id=" ".join(words)) for words in COMMANDS])
-def test_command(folder, words):
-    """In their order: later ones use the files of earlier ones."""
-    if words[0] == "make":  # they install, or run this suite
-        assert re.search(rf"^{words[1]}:", (ROOT / "Makefile").read_text(), re.M)
-        return
-    if words[1] == "view":
-        opened(words, folder)
-        return
+def smaller(words):
+    """Return the words of a command with settings that take seconds."""
     words = list(words)
     for option, value in SMALLER.items():
         if option in words:
             words[words.index(option) + 1] = value
-    if words[1] == "capture":
+    if words[0] == "mitsuba":
+        if "scenes/" in words[-1] or "gallery/" in words[-1]:  # a swapped one is small by itself
+            words[1:1] = ["-D", "res=16"]
+    elif words[:2] == ["python", "docs/gallery/make.py"]:
+        words += ["--size", "12", "--spp", "1", "--out", "pictures"]
+    elif words[1] == "capture":
         words += [word for k, v in CAPTURE.items() if k not in words for word in (k, v)]
-    if words[0] == "mitsuba" and "scenes/" in words[-1]:  # a swapped one is small by itself
-        words[1:1] = ["-D", "res=16"]
-    if words[:2] == ["mi-ntf", "render"]:
+    elif words[1] == "render":
         words[2:2] = ["-D", "res=16", "-D", "spp=1"]
-    if words[1] == "export":
+    elif words[1] == "export":
         words += ["--resolution", "48"]
-    if words[1] == "sequence":
-        (folder / "scenes/statue/circle.toml").write_text(
-            (ROOT / "scenes/statue/circle.toml").read_text().replace("frames = 120", "frames = 4"))
-        check(*words, "-D", "res=16", "-D", "spp=1", folder=folder)
-        return
-    if words[1] in ("explain", "bake", "tradeoff"):
+    elif words[1] in ("explain", "bake", "tradeoff", "sequence") and "scenes" in " ".join(words):
         words += ["-D", "res=16", "-D", "spp=1"]
     if words[1] == "tradeoff" and "--budget" not in words:
         words += ["--budget", SMALLER["--budget"]]
-    printed = check(*words, folder=folder)
-    assert words[1] != "info" or "similarity" in printed
+    return words
+
+
+NEEDS_MORE = {
+    "mi-ntf bridge": "tests/test_bridge.py builds it",
+    "python -m benchmarks.": "tests/benchmarks runs the scripts",
+    "python scenes/skull/make_picture.py": "the photographs are not part of this project",
+}
+"""Beginnings of commands that are not run → the reason."""
+
+
+@pytest.mark.parametrize("words", [pytest.param(words, id=" ".join(words)) for words in COMMANDS])
+def test_command(folder, process, words):
+    """In their order: later commands use the files of earlier ones."""
+    line = " ".join(words)
+    if words[0] == "make":  # they install, or run this suite
+        assert re.search(rf"^{words[1]}:", (ROOT / "Makefile").read_text(), re.M)
+    elif any(line.startswith(start) for start in NEEDS_MORE):
+        script = words[2].replace(".", "/") + ".py" if words[1] == "-m" else words[1]
+        assert words[0] == "mi-ntf" or (ROOT / script).is_file()
+    elif words[1] == "view":
+        opened(words, folder)
+    else:
+        printed = check(process, folder, *smaller(words))
+        assert words[1] != "info" or "similarity" in printed
 
 
 def test_every_command_is_shown():
-    shown = {words[1] if words[0] == "mi-ntf" else words[0] for words in COMMANDS}
-    assert shown == {"capture", "inspect", "train", "swap", "mitsuba", "info", "compare", "explain", "bake", "make",
-                     "tradeoff", "export", "render", "sequence", "view", "cache"}
+    shown = {words[1] for words in COMMANDS if words[0] == "mi-ntf"}
+    assert shown == set(re.findall(r"subcommand\(\"(\w+)\"", Path(cli.__file__).read_text(encoding="utf-8")))
 
 
 def test_readme_is_short():
-    """Two screens."""
+    """One screen and a half."""
     lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
-    assert len(lines) <= 110 and max(map(len, lines)) <= 120
+    assert len(lines) <= 90 and max(map(len, lines)) <= 120
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -140,3 +162,12 @@ def test_links_lead_somewhere(page):
         assert file.is_file(), target
         headings = re.findall(r"^#+ (.*)", file.read_text(encoding="utf-8"), re.M) if heading else []
         assert not heading or heading in [re.sub(r"[^\w -]", "", h).lower().replace(" ", "-") for h in headings], target
+
+
+def test_the_site_has_no_warnings(tmp_path):
+    """Sphinx reads all pages and resolves all links; notebooks are not executed here."""
+    pytest.importorskip("myst_nb")
+    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "dummy", "-D", "nb_execution_mode=off",
+               "-d", str(tmp_path / "trees"), str(ROOT / "docs"), str(tmp_path / "out")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
