@@ -32,7 +32,8 @@ from mi_ntf.data.images import linear
 from mi_ntf.data.readers import load_dataset
 from mi_ntf.data.schema import Split
 from mi_ntf.evaluate import metrics
-from mi_ntf.infer.profile import FOR_NETWORKS, DepthProfile
+from mi_ntf.infer.profile import DepthProfile
+from mi_ntf.infer.tuning import NETWORK_STEP
 
 from . import record, scenes, timing
 
@@ -190,7 +191,7 @@ def query_time(medium: Any, count: int) -> dict[str, float]:
     low, high = medium.field.grid.bounds
     place = (low + rng.uniform(size=(count, 3)) * (high - low)).T
     x, d = (tuple(mi.Float(c.astype(np.float32)) for c in v) for v in (place, direction))
-    profile = DepthProfile(medium.source, dr.opaque(mi.Float, FOR_NETWORKS * 2 / 384))
+    profile = DepthProfile(medium.source, dr.opaque(mi.Float, NETWORK_STEP * 2 / 384))
     times = timing.rounds({"query": lambda: medium.field.network.ray_mixture(x, d, profile)[2]}, 5)
     return record.spread(1e9 * t / count for t in times["query"])
 

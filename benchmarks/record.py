@@ -66,8 +66,9 @@ def about(name: str, seconds: float) -> dict[str, Any]:
             "command": command, "seconds": round(seconds, 1)}
 
 
-def write(name: str, values: dict[str, Any], start: float, folder: Path = RESULTS) -> Path:
+def write(name: str, values: dict[str, Any], start: float, folder: Path | None = None) -> Path:
     """Write a result and return its file. `start`: the value of ``time.perf_counter`` before the measurement."""
+    folder = folder or RESULTS
     path = folder / f"{name}.json"
     files.make_folder(folder)
     if path.is_file():
@@ -80,9 +81,9 @@ def write(name: str, values: dict[str, Any], start: float, folder: Path = RESULT
     return path
 
 
-def read(name: str, folder: Path = RESULTS) -> dict[str, Any]:
+def read(name: str, folder: Path | None = None) -> dict[str, Any]:
     """Return a result with the keys ``about`` and ``values``. Raises MiNtfError where there is none."""
-    path = folder / f"{name}.json"
+    path = (folder or RESULTS) / f"{name}.json"
     if not path.is_file():
         raise MiNtfError(f"{path} does not exist; run `python -m benchmarks.{name}`")
     result: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))

@@ -240,12 +240,12 @@ class Studio:
         integrator = scenes.integrator(visibility=method.visibility, max_depth=DEPTH,
                                        environment_lights=self.sizes.cells, map_resolution=self.sizes.map_resolution,
                                        **method.properties)
-        integrator.patches = self._patches.get(field)  # they depend on the field, not on the light
+        integrator.context.patches = self._patches.get(field)  # they depend on the field, not on the light
         spp, number = self.sizes.spp[light.kind == "environment"], seed
         start = time.perf_counter()
         image = np.array(mi.render(scene, sensor=self.sensor(light), integrator=integrator, spp=spp, seed=number))
         seconds = time.perf_counter() - start
-        self._patches[field] = integrator.patches
+        self._patches[field] = integrator.context.patches
         dr.flush_malloc_cache()  # volumes are gigabytes
         return image, seconds
 

@@ -116,12 +116,12 @@ def measure(sizes: Sizes, say: Callable[[str], None] = lambda text: None) -> Fig
 @contextmanager
 def _atlas(resolution: int) -> Any:
     """Make atlases of maps of `resolution`² texels within the block, unless it is 0."""
-    before = transmittance_atlas.RESOLUTION
-    transmittance_atlas.RESOLUTION = resolution or before
+    before = tuning.ATLAS_RESOLUTION
+    tuning.ATLAS_RESOLUTION = resolution or before
     try:
         yield
     finally:
-        transmittance_atlas.RESOLUTION = before
+        tuning.ATLAS_RESOLUTION = before
 
 
 def network_figures(rows: list[networks.Costs], sizes: Sizes) -> Figures:

@@ -37,8 +37,9 @@ Values = dict[str, Any]
 def table(header: Iterable[str], rows: Iterable[Iterable[str]], text_columns: int = 1) -> str:
     """Return a Markdown table; columns after the first `text_columns` are aligned to the right."""
     cells = list(header)
-    lines = [cells, ["---" if i < text_columns else "---:" for i in range(len(cells))], *map(list, rows)]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    rule = "".join("---|" if i < text_columns else "---:|" for i in range(len(cells)))
+    title, *lines = (f"| {' | '.join(line)} |" for line in (cells, *rows))
+    return "\n".join([title, f"|{rule}", *lines])
 
 
 def number(value: float) -> str:

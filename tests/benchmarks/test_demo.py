@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from skimage import io
 
-from benchmarks import demo, demo_report
+from benchmarks import demo
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.evaluate.curves import COLOURS
 
@@ -40,7 +40,7 @@ def test_render_passes_parameters_and_times_the_process(fake, tmp_path, monkeypa
     monkeypatch.setenv("MI_NTF_CACHE", "on")  # of the user: renders have theirs off
     shot = demo.render(fake, tmp_path / "scene.xml", "env", "raymarch", 3, 64, tmp_path / "o.exr")
     assert (shot.light, shot.visibility, shot.image.shape) == ("env", "raymarch", (4, 6, 4))
-    assert (shot.image == 3).all() and shot.seconds > 0
+    assert (shot.image == 3).all() and [s > 0 for s in shot.seconds] == [True]
 
 
 def test_a_failed_render_shows_its_output(fake, tmp_path):
@@ -82,7 +82,7 @@ def _shots():
     x = np.linspace(0, 1, 64)
     reference = np.ones((64, 64, 4)) * np.stack([x, x**2, 1 - x, 0 * x + 1], -1)
     references = {"point": reference, "env": reference[:, ::-1]}
-    return [demo.Shot(light, v, 2.5, references[light] * [f, f, f, 1]) for light in references
+    return [demo.Shot(light, v, [2.0, 2.5, 3.0], references[light] * [f, f, f, 1]) for light in references
             for v, f in zip(demo.VISIBILITIES, (1.02, 1.1, 0.9), strict=True)], references
 
 
@@ -94,7 +94,7 @@ def test_report_measures_against_reference_and_raymarch(tmp_path):
     assert [m["relative_rmse"] for m in measured[:3]] == pytest.approx([0.02, 0.1, 0.1])
     assert [m["relative_rmse_to_raymarch"] for m in measured[3:]] == pytest.approx([0, 0.08 / 1.02, 0.12 / 1.02])
     assert text == (tmp_path / "table.md").read_text() and text.count("\n| ") == 7
-    assert "| environment map | `transmittance_map` | 2.5 |" in text and "a note" in text
+    assert "| environment map | `transmittance_map` | 2.50 (2.00 to 3.00) |" in text and "a note" in text
     image = io.imread(tmp_path / "comparison.png")
     assert image.shape[0] > 1000 and image[..., :3].std() > 20
     assert sorted(p.name for p in tmp_path.iterdir()) == ["comparison.png", "metrics.json", "table.md"]
@@ -128,10 +128,10 @@ def test_the_picture_gains_the_curves(tmp_path):
     demo.picture(tmp_path / "comparison.png", shots, references, measured, study)
     after = io.imread(tmp_path / "comparison.png")
     added = after.shape[0] - before.shape[0]
-    assert added == pytest.approx(110 * demo_report.CURVE_HEIGHT, abs=2) and after.shape[1] == before.shape[1]
+    assert added == pytest.approx(110 * demo.CURVE_HEIGHT, abs=2) and after.shape[1] == before.shape[1]
     assert after[-added:, :, :3].std() > 20 and np.abs(after[:-added] - before.astype(float)).mean() < 12
     part = Figure(figsize=(12.4, 4.8), layout="constrained")
-    demo_report.curves(part, study)
+    demo.curves(part, study)
     axes = part.axes[0]
     assert axes.get_title() == ("environment map: what accuracy costs, 4 ways to render 64×64 pixels, held against the "
                                 "converged field. The machine was noisy")
@@ -149,13 +149,13 @@ def test_a_study_without_a_way_says_so_in_the_picture():
     from matplotlib.figure import Figure
 
     part = Figure()
-    demo_report.curves(part, _found())
+    demo.curves(part, _found())
     assert part.axes[0].texts[0].get_text() == "no way was measured: a larger --budget measures some"
 
 
 def test_a_failing_study_leaves_table_and_picture(tmp_path, monkeypatch, capsys):
-    def rendered(command, scene, light, visibility, spp, size, out):
-        return demo.Shot(light, visibility, 1.0, demo._reference(scene.parent, light, size))
+    def rendered(command, scene, light, visibility, spp, size, out, repeats):
+        return demo.Shot(light, visibility, [1.0], demo._reference(scene.parent, light, size))
 
     def failing(*arguments):
         raise MiNtfError("no light")
@@ -167,7 +167,7 @@ def test_a_failing_study_leaves_table_and_picture(tmp_path, monkeypatch, capsys)
     printed = capsys.readouterr()
     assert "demo: the study failed; table and picture of the renders are in" in printed.err
     assert printed.err.endswith("without its curves\nno light\n")
-    assert "| point light | `raymarch` | 1.0 |" in printed.out
+    assert "| point light | `raymarch` | 1.00 |" in printed.out
     assert sorted(p.name for p in tmp_path.iterdir()) == ["comparison.png", "metrics.json", "table.md"]
 
 

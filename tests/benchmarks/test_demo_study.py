@@ -1,4 +1,4 @@
-"""The study at the end of `make demo`, as a process of its own: what it is given, what it leaves, how it fails."""
+"""The study at the end of `make demo`, as a process of its own: its arguments, its files, and its failures."""
 
 import json
 import sys
@@ -36,16 +36,16 @@ def _study(tmp_path, monkeypatch, result):
 def test_a_study_takes_up_nothing_that_an_earlier_one_left(tmp_path, monkeypatch, capsys):
     for name in (kept.NAME, *demo.REPORT, "notes.txt"):
         (tmp_path / name).write_text("of yesterday")
-    found = _study(tmp_path, monkeypatch, {"ways": []})
-    assert found == {"ways": [], "left": ["notes.txt"]}
-    assert f"{tmp_path}: what an earlier study measured there is dropped" in capsys.readouterr().err
+    result = _study(tmp_path, monkeypatch, {"ways": []})
+    assert result == {"ways": [], "left": ["notes.txt"]}
+    assert f"{tmp_path}: the findings of an earlier study are removed" in capsys.readouterr().err
     assert _study(tmp_path, monkeypatch, {"ways": []})["left"] == ["notes.txt"]
     assert capsys.readouterr().err == ""  # nothing was dropped
 
 
 def test_a_study_that_fails_or_measures_failures_alone_is_an_error(tmp_path, monkeypatch):
     (tmp_path / "tradeoff.json").write_text("{}")
-    with pytest.raises(MiNtfError, match=r"(?s)tradeoff scene\.xml.*failed with exit code 1; what it said stands"):
+    with pytest.raises(MiNtfError, match=r"(?s)tradeoff scene\.xml.*failed with exit code 1; its messages are above"):
         _study(tmp_path, monkeypatch, None)
     with pytest.raises(MiNtfError, match="every way of the study failed, the first one since no light"):
         _study(tmp_path, monkeypatch, {"ways": [{"reason": "no light", "points": []},

@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 from helpers import fields, scenes, ztest
 
-from benchmarks import dial
+from benchmarks import scenes as shipped
 from mi_ntf.core import field_file, microfacet, ops
 from mi_ntf.core.architecture import Similarity
+from mi_ntf.evaluate.metrics import relative_rmse
 from mi_ntf.render.lights import scene_lights
 from mi_ntf.render.scene.media import find_media
 from mi_ntf.render.scene.settings import Settings
@@ -221,24 +222,24 @@ def test_a_bound_that_is_a_surface_is_refused(blobs, bsdf):
 def test_a_sun_among_many_lights_is_marched_to(monkeypatch):
     """Under a sky whose sun is most of its light, a picture by the atlas is the march's: 0.2 % off, without that 3 %,
     all of it around the sun's shadow. A sun that dim lights are left out beside is one still."""
-    loaded = dial.scene("statue", "sky", 48, 4)
+    loaded = shipped.scene("statue", "sky", 48, 4)
 
     def picture(visibility):
-        return dial.picture(loaded, dial.integrator(visibility=visibility, environment_lights=128))[0]
+        return shipped.picture(loaded, shipped.integrator(visibility=visibility, environment_lights=128))[0]
 
     truth = picture("raymarch")
-    assert dial.relative(picture("transmittance_atlas"), truth) < 0.004
+    assert relative_rmse(picture("transmittance_atlas"), truth) < 0.004
     light = scene_lights.Lights(loaded, find_media(loaded), brightest=300)
     assert light.suns().sum() == 1 and len(light.suns()) == len(light.rows.power) == 300  # of 470
     assert light.rows.power[light.suns()].sum() > 0.5 * light.rows.power.sum()
     monkeypatch.setattr(scene_lights.Lights, "suns", lambda self: np.zeros(1, bool))
-    assert dial.relative(picture("transmittance_atlas"), truth) > 0.015
+    assert relative_rmse(picture("transmittance_atlas"), truth) > 0.015
 
 
 def test_parts_of_the_lights_know_their_own_suns():
     """Each part those among its own rows, those that bounced light asks for among all."""
-    loaded = dial.scene("statue", "sky", 16, 1)
-    settings = Settings.of(dial.integrator(visibility="transmittance_atlas"))
+    loaded = shipped.scene("statue", "sky", 16, 1)
+    settings = Settings.of(shipped.integrator(visibility="transmittance_atlas"))
     whole = composition.Composition(loaded, settings, loaded.sensors()[0], 1)
     expected, found = whole.lights.suns(), []
     assert expected.any()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers import scenes
 
-from benchmarks import dial
+from benchmarks import scenes as shipped
 from mi_ntf.render.scene.settings import Limits
 from mi_ntf.render.transport import passes
 
@@ -98,16 +98,16 @@ def test_noise_threshold_is_reached(blobs):
 @functools.cache
 def smoke():
     """A scene and its picture of 128 samples, noise 0.006."""
-    loaded = dial.scene("cloud", "point", 48, 4)
-    return loaded, dial.picture(loaded, dial.integrator(visibility="raymarch"), 100, 128)[0]
+    loaded = shipped.scene("cloud", "point", 48, 4)
+    return loaded, shipped.picture(loaded, shipped.integrator(visibility="raymarch"), 100, 128)[0]
 
 
 @pytest.mark.parametrize(("threshold", "samples"), [(0.1, (2, 2)), (0.03, (4, 16))])
 def test_noise_of_smoke_is_reached(threshold, samples):
     """Within 1.3 of what is asked for, or with the two samples that tell noise at all."""
     loaded, truth = smoke()
-    nrf = dial.integrator(visibility="raymarch", noise_threshold=threshold)
-    image = dial.picture(loaded, nrf, 1)[0]
+    nrf = shipped.integrator(visibility="raymarch", noise_threshold=threshold)
+    image = shipped.picture(loaded, nrf, 1)[0]
     assert samples[0] <= nrf.achieved["spp"] <= samples[1]
     np.testing.assert_array_equal(loaded.sensors()[0].film().develop().numpy()[..., :3], image.astype(np.float32))
     off = np.abs(image - truth).sum() / np.sqrt(np.maximum(truth.sum(-1), 0)).sum()
