@@ -208,7 +208,8 @@ def main() -> None:
         ("--lights", {"nargs": "+", "choices": LIGHTS}), ("--size", {"type": int, "default": 128}),
         ("--spp", {"type": int, "default": 4}))
     record.prepare("memory")
-    start, values = time.perf_counter(), {}
+    start = time.perf_counter()
+    values: dict[str, Rows] = {}
     for case in options.cases or CASES:
         names, lights = PLAN[case]
         pairs = list(itertools.product(options.scenes or names, options.lights or lights))

@@ -137,8 +137,8 @@ def photographs(field: Path, dataset: Path, mesh: Path | None = None, spp: int =
         if originals is not None:
             filled = (image[..., 7] > FILLED) & (photograph[..., 3] > 0.999)
             angles.append(_angles(image[..., 4:7], _normals(originals, view, spp))[filled])
-    result = {"psnr": record.spread(psnr), "ssim": record.spread(ssim)}
-    result |= {"mean_psnr": float(np.mean(psnr)), "mean_ssim": float(np.mean(ssim))}
+    result: dict[str, Any] = {"psnr": record.spread(psnr), "ssim": record.spread(ssim),
+                              "mean_psnr": float(np.mean(psnr)), "mean_ssim": float(np.mean(ssim))}
     return result | ({"normal_error": float(np.nanmean(np.concatenate(angles)))} if angles else {})
 
 
@@ -220,7 +220,8 @@ def main() -> None:
         __doc__, ("studies", {"nargs": "*", "metavar": "STUDY"}), ("--scenes", {"nargs": "+", "default": NAMES}),
         ("--photographs", {"type": Path}), ("--depth", {"type": int, "default": 2}))
     record.prepare("memory")
-    start, values, sizes = time.perf_counter(), {}, QUICK if options.quick else FULL
+    start, sizes = time.perf_counter(), QUICK if options.quick else FULL
+    values: dict[str, dict[str, Any]] = {}
     for name in options.studies or STUDIES:
         values[name] = {}
         for scene in options.scenes[:1] if options.quick else options.scenes:

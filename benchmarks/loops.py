@@ -83,13 +83,17 @@ def _towards_random(method: Any, x: Any, lights: int) -> Any:
     n, count = dr.width(x[0]), dr.opaque(mi.UInt32, lights)
 
     def body(i: Any, total: Any) -> Any:
-        bits = mi.sample_tea_32(dr.arange(mi.UInt32, n), i)
+        lane: Any = dr.arange(mi.UInt32, n)
+        bits = mi.sample_tea_32(lane, i)
         u = mi.Point2f(*(mi.Float(b >> 8) * 2**-24 for b in bits))
         wi = tuple(mi.warp.square_to_uniform_sphere(u))
         return i + 1, total + method.tau(x, wi, mi.Float(dr.inf), i, mi.Bool(True))
 
+    def more(i: Any, total: Any) -> Any:
+        return i < count
+
     state: Any = (dr.zeros(mi.UInt32, n), dr.zeros(mi.Float, n))
-    return dr.while_loop(state=state, cond=lambda i, total: i < count, body=body, label="random directions")[1]
+    return dr.while_loop(state=state, cond=more, body=body, label="random directions")[1]
 
 
 def _pictures(loaded: dict[str, Any], integrators: dict[str, Any], repeats: int, spp: int = 0, anew: bool = False

@@ -233,13 +233,15 @@ def _camera_times(sensor: Any, medium: Any, paper: PaperField, sizes: Sizes) -> 
     """Return the seconds of ``camera`` and ``shade/…`` by round, and the number of shading points."""
     o, d, far = view_rays(sensor, medium.frame, sizes.pixels)
     middle = dr.full(mi.Float, 0.5, dr.width(far))
-    strand = Strand(paper, o, d, dr.opaque(mi.Float, 2 / IMAGE_SAMPLES))
+    field: Any = paper
+    strand = Strand(field, o, d, dr.opaque(mi.Float, 2 / IMAGE_SAMPLES))
     last: list[shade.Points] = []
 
     def view() -> list[Any]:
         samples = march.camera_samples([strand], far, middle, middle)
         x, along = samples.place(0, samples.ray, samples.t)
-        matter = shade.Reflectance(*paper.reflectance(x), medium.field.softness(x))
+        normal, albedo, roughness, specular = paper.reflectance(x)
+        matter = shade.Reflectance(normal, albedo, roughness, specular, medium.field.softness(x))
         p = shade.Points(x, tuple(-c for c in along), matter)
         last[:] = [p]
         return [*p.x, *p.wo, *p.normal, *p.albedo, p.roughness, p.specular]

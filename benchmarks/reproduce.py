@@ -241,7 +241,8 @@ class Studio:
                                        environment_lights=self.sizes.cells, map_resolution=self.sizes.map_resolution,
                                        **method.properties)
         integrator.context.patches = self._patches.get(field)  # they depend on the field, not on the light
-        spp, number = self.sizes.spp[light.kind == "environment"], seed
+        spp = self.sizes.spp[light.kind == "environment"]
+        number: Any = seed
         start = time.perf_counter()
         image = np.array(mi.render(scene, sensor=self.sensor(light), integrator=integrator, spp=spp, seed=number))
         seconds = time.perf_counter() - start
@@ -398,7 +399,8 @@ class Reproduction:
 
     def run(self) -> dict[str, Any]:
         """Do all jobs that are not finished, and return the values for the tables."""
-        s, values = self.sizes, {}
+        s = self.sizes
+        values: dict[str, Any] = {}
         for scene in self.scenes:
             for network in self.needed:
                 self._train(scene, network)

@@ -25,10 +25,9 @@ import numpy as np
 
 from mi_ntf.core import files, spheres
 from mi_ntf.evaluate.metrics import relative_rmse
-from mi_ntf.infer import march, shade
+from mi_ntf.infer import march, shade, tuning
 from mi_ntf.infer.bundle import Strand
 from mi_ntf.infer.grid import NetworkVolume
-from mi_ntf.infer.visibility import transmittance_atlas
 from mi_ntf.render.maps import building
 
 from . import networks, one_image, record, scenes, timing
@@ -207,7 +206,8 @@ class Gathers:
         u = mi.UInt32(dr.clip((0.5 * (x[0] * wi[1] - x[1] * wi[0]) + 0.5) * last, 0, last))
         v = mi.UInt32(dr.clip((0.5 * x[2] + 0.5) * last, 0, last))
         first = (mi.UInt32(index) * self.m + v) * self.m + u
-        pairs = [dr.gather(mi.Array2f, self.values, first + k, active) for k in (0, 1, self.m, self.m + 1)]
+        pair: Any = mi.Array2f
+        pairs = [dr.gather(pair, self.values, first + k, active) for k in (0, 1, self.m, self.m + 1)]
         return 0.125 * sum(p[0] + p[1] for p in pairs)
 
 
@@ -332,7 +332,8 @@ def setting_figures(medium: Any, sizes: Sizes) -> Figures:
     table = table_of(spheres.fibonacci(sizes.slow_lights))
     figures: Figures = {}
     for key, (field, count, words) in settings.items():
-        x, making, work = _seen(medium, count), {}, {}
+        x, making = _seen(medium, count), {}
+        work: dict[str, Callable[[], Any]] = {}
         names = ["raymarch", "ray_network"]
         if key != "paper":  # its map would take millions of queries, and a lookup costs the same as the others
             names += ["neural_transmittance", "transmittance_map"]

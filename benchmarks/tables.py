@@ -20,6 +20,7 @@ A table or value whose JSON file does not exist stays as it is, and a note says 
 import re
 import sys
 from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -252,7 +253,7 @@ def different(write: bool = False) -> list[str]:
     names = []
     for path in pages():
         text = path.read_text(encoding="utf-8")
-        new = rendered(text, lambda note, path=path: print(f"{path.name}: {note}", file=sys.stderr))
+        new = rendered(text, partial(print, f"{path.name}:", file=sys.stderr))
         if new != text:
             names.append(str(path.relative_to(ROOT)))
             if write:

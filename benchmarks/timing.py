@@ -1,7 +1,7 @@
 """Loops over shading points and lights, and the clock that compares them."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import drjit as dr
@@ -23,7 +23,7 @@ def table_of(where: np.ndarray, is_point: bool = False) -> LightTable:
     return LightTable(where, np.ones((len(where), 3)), np.full(len(where), is_point), 1.0, mi)
 
 
-def rounds(work: dict[str, Callable[[], Any]], repeats: int) -> dict[str, list[float]]:
+def rounds(work: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, list[float]]:
     """Return the wall seconds of each function in each of so many rounds, after a first one that compiles.
 
     Every round calls every function, so that other work on the machine slows all of them down alike. A function returns
@@ -84,5 +84,8 @@ def look_up(method: Any, table: LightTable, x: Any) -> Any:
         light = table.sample(i, x, True)
         return i + 1, total + method.tau(x, light.wi, light.distance, i, mi.Bool(True))
 
+    def more(i: Any, total: Any) -> Any:
+        return i < count
+
     state = (dr.zeros(uint, dr.width(x)), dr.zeros(mi.Float, dr.width(x)))
-    return dr.while_loop(state=state, cond=lambda i, total: i < count, body=body, label="all lights")[1]
+    return dr.while_loop(state=state, cond=more, body=body, label="all lights")[1]
