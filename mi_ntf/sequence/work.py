@@ -150,12 +150,12 @@ def _render(scene: mi.Scene, path: str, precision: DTypeLike) -> dict[str, np.nd
     integrator, sensors = scene.integrator(), scene.sensors()
     if integrator is None or not sensors:
         raise MiNtfError(f"{path} needs an integrator and a sensor")
-    ours = hasattr(integrator, "patches")
-    if ours:
-        integrator.patches = _kept.get("patches")
+    context = getattr(integrator, "context", None)  # of an nrf integrator
+    if context:
+        context.patches = _kept.get("patches")
     scene_file.render_to_film(scene, sensors[0])
-    if ours:
-        _kept["patches"] = integrator.patches
+    if context:
+        _kept["patches"] = context.patches
     bitmap = sensors[0].film().bitmap()
     pixels = np.array(bitmap)
     pixels = pixels.reshape(*pixels.shape[:2], -1)

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields
-from typing import Any, TypeAlias
+from dataclasses import replace
+from typing import TypeAlias
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_ntf.render.scene.settings import Limits, Settings
+from mi_ntf.render.scene.settings import Settings
 from mi_ntf.render.transport import rendering
-from mi_ntf.render.transport.seen import Seen
+from mi_ntf.render.transport.camera_light import SampleCache
+from mi_ntf.render.transport.context import RenderContext
 
 Group: TypeAlias = tuple[int, ...] | None
 """Numbers of the emitters of a layer. None stands for all."""
@@ -23,28 +24,20 @@ class Interrupted(Exception):
 
 
 class Picture:
-    """Renderer of `scene` by `settings`, which has the attributes of an ``nrf`` integrator.
+    """Renderer of `scene` by `settings`, without an ``nrf`` integrator.
 
     `groups` has the emitters of each layer; None makes one layer of all. Layers of unchanged lights are stored, and so
-    are the intersections of the camera's rays (`seen`).
+    are the samples of the camera's rays, in the `context`.
     """
 
     def __init__(self, scene: mi.Scene, settings: Settings, groups: list[tuple[int, ...]] | None = None) -> None:
         self.scene, self.settings = scene, settings
         self.groups: list[Group] = list(groups) if groups else [None]
-        self.limits, self.timeout, self.chunk = Limits(), -1.0, rendering.CHUNK
-        self.patches: Any = None
-        self.chosen: Any = None
-        self.achieved: dict[str, object] = {}
-        self.aovs: tuple[str, ...] = ()
-        self.lights_seen = 0
-        self.seen: Seen | None = None
+        self.context = RenderContext(settings)
         self.stop: Callable[[], bool] = lambda: False
         self._layers: dict[Group, tuple[tuple[object, ...], np.ndarray]] = {}
         self._samples: tuple[object, ...] = ()
         self.rendered: list[Group] = []
-        for each in fields(settings):
-            setattr(self, each.name, getattr(settings, each.name))
 
     def should_stop(self) -> bool:
         """Raise Interrupted if something moved. The renderer asks for each chunk of pixels."""
@@ -70,10 +63,10 @@ class Picture:
             False to store nothing.
         """
         if not keep:
-            self.seen = None
+            self.context.sample_cache = None
             return self._sum([self._render(sensor, group, seed, spp) for group in self.groups])
         if self._samples != (rays, seed, spp):
-            self._samples, self.seen, self._layers = (rays, seed, spp), Seen(), {}
+            self._samples, self.context.sample_cache, self._layers = (rays, seed, spp), SampleCache(), {}
         layers = []
         for group in self.groups:
             version: tuple[object, ...] = (
@@ -85,10 +78,10 @@ class Picture:
         return self._sum(layers)
 
     def _render(self, sensor: mi.Sensor, group: Group, seed: int, spp: int) -> np.ndarray:
-        self.only = group
+        self.context.settings = replace(self.settings, only_emitters=group)
         self.rendered.append(group)
         with dr.suspend_grad():  # type: ignore[no-untyped-call]
-            return np.array(rendering.render(self, self.scene, sensor, seed, spp, True))
+            return np.array(rendering.render(self.context, self.scene, sensor, seed, spp, True, self.should_stop))
 
     @staticmethod
     def _sum(layers: list[np.ndarray]) -> np.ndarray:

@@ -70,7 +70,7 @@ class Session:
         self.center = np.mean([m.frame.origin for m in self.media], axis=0)
         self.pose = self.initial_pose = camera.pose_of(self.sensor, self.parameters, self.center)
         self.lights = lights_of(self.scene, self.parameters, np.array(self.pose.up))
-        self.settings = self.initial_settings = replace(Settings.of(self.scene.integrator()), frames=FRAMES)
+        self.settings = self.initial_settings = replace(self.scene.integrator().context.settings, frames=FRAMES)
         self._common = [light.number for light in self.lights[MAX_LAYERS:]]
         width, height = (int(n) for n in self.sensor.film().crop_size())
         self.resize(size, width / height)
@@ -217,7 +217,7 @@ class Session:
 
     def _picture(self, settings: Settings, visibility: str | None, groups: list[tuple[int, ...]] | None) -> Picture:
         picture = Picture(self.scene, replace(settings, visibility=visibility or settings.visibility), groups)
-        picture.aovs = (self.aov,) if self.aov else ()
+        picture.context.aovs = (self.aov,) if self.aov else ()
         return picture
 
     def _by_methods(self, make: Callable[[str | None], Picture]) -> list[Picture]:
@@ -227,7 +227,7 @@ class Session:
         """Make pictures by the present settings."""
         self._previews, self._finals = self._by_methods(self._preview), self._by_methods(self._final)
         for picture in self._finals:
-            picture.chunk = REST_CHUNK
+            picture.context.rays_in_flight = REST_CHUNK
         self._restart()
 
     def _restart(self) -> None:

@@ -53,7 +53,7 @@ def counted(monkeypatch):
     calls, once = [], measure.once
 
     def count(scene, integrator, *rest):
-        calls.append(getattr(integrator, "visibility", "stock"))
+        calls.append(integrator.context.settings.visibility if hasattr(integrator, "context") else "stock")
         return once(scene, integrator, *rest)
 
     monkeypatch.setattr(measure, "once", count)
@@ -253,7 +253,7 @@ def test_a_way_that_fails_is_a_row_that_says_why(folder, tmp_path, monkeypatch):
     once = measure.once
 
     def failing(scene, integrator, *rest):
-        if getattr(integrator, "visibility", "") == "transmittance_map":
+        if hasattr(integrator, "context") and integrator.context.settings.visibility == "transmittance_map":
             raise MiNtfError("no room for maps")
         return once(scene, integrator, *rest)
 

@@ -194,7 +194,7 @@ def test_a_pass_ends_when_something_moves_and_leaves_nothing_behind(scene, monke
     view = session(scene(POINT))
     truth = view.refine(1).image.copy()
     view.look(view.pose)
-    view._finals[0].chunk = 512  # two chunks
+    view._finals[0].context.rays_in_flight = 512  # two chunks
     asked = []
     view.stop = lambda: asked.append(1) or len(asked) > 1
     with pytest.raises(Interrupted):

@@ -68,7 +68,7 @@ def converge(render: Renderer, pixels: int, seconds: float, tell: Callable[[str]
         spent = time.perf_counter() - start
         variance = max(float(np.mean(squares / count - (total / count) ** 2)), 0.0) / max(count - 1, 1)
         truth = Truth((total / count).astype(np.float32), variance,
-                      f"raymarch with {render.integrator.samples} steps and {count * spp} samples a pixel")
+                      f"raymarch with {render.integrator.context.settings.samples} steps and {count * spp} samples a pixel")
         tell(f"reference: {count * spp} samples a pixel")
         if count >= 4 and truth.noise <= ERRORS[-1] / 4:
             break

@@ -53,11 +53,11 @@ class Subject:
         if not self.path.is_file():
             raise MiNtfError(f"scene {path} does not exist; give the XML file of a scene with an nrf medium")
         scene = load_scene(self.path, self.parameters)
-        integrator = scene.integrator()
+        settings = scene.integrator().context.settings
         self.media = find_media(scene)
         self.size = tuple(int(n) for n in scene.sensors()[0].film().crop_size())
-        self.properties: dict[str, Any] = {name: getattr(integrator, name) for name in PROPERTIES}
-        light = scene_lights.Lights(scene, self.media, 0, integrator.environment_lights)
+        self.properties: dict[str, Any] = {name: getattr(settings, name) for name in PROPERTIES}
+        light = scene_lights.Lights(scene, self.media, 0, settings.environment_lights)
         self.environment = any(d.cells for d in light.discrete)
         self.lights = len(light.rows.power) + len(light.sampled)
         self.serves = [name for name, method in REGISTRY.items() if all(map(method.needs, self.media))]
@@ -121,7 +121,7 @@ class Way:
         values = subject.properties
         if self.plugin != "nrf":
             return {name: values[name] for name in ("max_depth", "hide_emitters")}
-        all_lights = {"light_samples": 0} if REGISTRY[self.method].drawn else {}  # its maps are of all lights
+        all_lights = {"light_samples": 0} if REGISTRY[self.method].sampled else {}  # its maps are of all lights
         return {"visibility": self.method} | values | all_lights | dict(self.changes)
 
 
@@ -139,7 +139,7 @@ def plan(subject: Subject, mesh: bool) -> list[Way]:
 def finer(subject: Subject, methods: list[str]) -> list[Way]:
     """Return `methods` with one other dial each, of one kind of dial after the other."""
     values, methods = subject.properties, [name for name in methods if name != BOUND]
-    summed = [name for name in methods if not REGISTRY[name].drawn]
+    summed = [name for name in methods if not REGISTRY[name].sampled]
     dials: list[tuple[str, str, Any]] = []
     if subject.lights > DRAWN and not values["light_samples"]:
         dials += [(name, "light_samples", DRAWN) for name in summed]

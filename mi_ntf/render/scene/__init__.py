@@ -1,0 +1,1 @@
+"""Contents of a scene file: camera, fields, shapes, settings, and the effects that they need."""

@@ -1,28 +1,55 @@
-"""From a sensor's samples to its film: camera rays a chunk of pixels at a time, and pixels that sum their samples."""
+"""Camera rays for a chunk of pixels, and the reconstruction of pixels from their samples."""
+
+from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 
 from ...core.errors import MiNtfError
+from ...infer.types import Array, Color3, Float, Ray, UInt32, Vector3
 
 LATTICE = 3242174889, 2447445414
-"""2³² over ρ and ρ², ρ³ = ρ + 1: steps of a sequence that fills a square evenly however many of its points are taken
-(Roberts 2018, the R₂ sequence)."""
+"""2³² over ρ and ρ², ρ³ = ρ + 1: steps of a sequence that fills the unit square evenly (Roberts 2018, R₂)."""
 CHANNELS = 8
-"""Channels that one kernel sums: each is a register of its loop."""
+"""Channels that one kernel sums, each in a register of its loop."""
+
+
+class CameraRays(NamedTuple):
+    """Camera rays, the samples of one pixel side by side; `position` is on the film, in pixels."""
+
+    ray: Ray
+    weight: Color3
+    position: Vector3
+
+
+class Quadrature(NamedTuple):
+    """Numbers in [0, 1) for each camera ray that place its samples (:func:`mi_ntf.infer.march.camera_samples`).
+
+    cell_offset  start of the ray's lattice of cells
+    light_share  position of the samples within the shares of the light that the ray loses
+    """
+
+    cell_offset: Float
+    light_share: Float
+
+    def take(self, index: UInt32) -> Quadrature:
+        """Return the numbers of the given rays."""
+        return Quadrature(*(dr.gather(mi.Float, number, index) for number in self))
 
 
 class Camera:
-    """The samples of one render: `count` source pixels, those of the film's border included if it is sampled, `spp`
-    samples each.
+    """Source pixels and samples of one render.
 
-    spp  samples a pixel; 0: the sampler's own number, which samplers that need a square or a power of two round up
+    The film's border has source pixels, too, if it is sampled. There are `count` source pixels with `spp` samples each.
+
+    spp  samples a pixel, which samplers that need a square or a power of two round up; 0: the sampler's own number
     """
 
-    def __init__(self, sensor, spp: int):
+    def __init__(self, sensor: mi.Sensor, spp: int) -> None:
         self.sensor, self.film = sensor, sensor.film()
         self.sampler = sensor.sampler().clone()
         if spp:
@@ -35,31 +62,33 @@ class Camera:
         width, height = (int(n) + 2 * self.border for n in self.film.crop_size())
         self.width, self.count = width, width * height
 
-    def rays(self, first: int, count: int, stream):
-        """Rays of `count` source pixels from `first` on, `spp` consecutive ones each: ``(ray, weight, position)``,
-        `position` on the film. `stream`: opaque seed."""
+    def rays(self, first: int, count: int, stream: UInt32) -> CameraRays:
+        """Return `spp` rays for each of `count` source pixels from `first` on; `stream`: opaque seed."""
         n = count * self.spp
         self.sampler.seed(stream, n)
         pixel = dr.arange(mi.UInt32, n) // dr.opaque(mi.UInt32, self.spp) + dr.opaque(mi.UInt32, first)
         y = pixel // dr.opaque(mi.UInt32, self.width)
-        corner = mi.Vector2f(mi.Float(pixel - y * self.width), mi.Float(y)) - self.border
+        corner: Vector3 = mi.Vector2f(mi.Float(pixel - y * self.width), mi.Float(y)) - self.border
         inside = corner + self.sampler.next_2d()
         aperture = self.sampler.next_2d() if self.sensor.needs_aperture_sample() else mi.Point2f(0.5)
-        moment = mi.Float(self.sensor.shutter_open())
+        moment: Float = mi.Float(self.sensor.shutter_open())
+        wavelength: Float = 0.0
         if self.sensor.shutter_open_time() > 0:
             moment += self.sampler.next_1d() * self.sensor.shutter_open_time()
         scaled = mi.Point2f(inside / mi.Vector2f(self.film.crop_size()))
-        # The one of Mitsuba's two calls that every sensor answers.
-        ray, weight = self.sensor.sample_ray_differential(moment, 0.0, scaled, aperture)
-        ray = mi.Ray3f(ray)
+        # Every sensor implements this one of Mitsuba's two calls.
+        differential, weight = self.sensor.sample_ray_differential(moment, wavelength, scaled, aperture)
+        ray = mi.Ray3f(differential)
         if dr.width(ray) < n:  # a sensor whose rays are all the same
             ray = dr.gather(mi.Ray3f, ray, dr.zeros(mi.UInt32, n))
-        return ray, weight, inside + mi.Vector2f(self.film.crop_offset())
+        return CameraRays(ray, weight, inside + mi.Vector2f(self.film.crop_offset()))
 
-    def quadrature(self, count: int):
-        """Two numbers in [0, 1) for each ray of the last :meth:`rays`, those of `count` source pixels: uniform ones,
-        and evenly spread over the samples of a pixel, whatever the sampler, which gives the first sample's. Where in
-        its skin a ray's samples lie decides half of their light."""
+    def quadrature(self, count: int) -> Quadrature:
+        """Return the numbers that place the samples of the last :meth:`rays`, those of `count` source pixels.
+
+        The sampler gives those of a pixel's first sample; the lattice spreads the others evenly. Much of the noise
+        depends on where in the skin the samples of a ray lie.
+        """
         spp = dr.opaque(mi.UInt32, self.spp)
         index = dr.arange(mi.UInt32, count * self.spp)
         first = index // spp * spp
@@ -68,26 +97,27 @@ class Camera:
             start = mi.UInt32(dr.gather(mi.Float, self.sampler.next_1d(), first) * 2**24) << 8
             # Integers wrap around; the upper 24 bits are a float's.
             numbers.append(mi.Float((start + (index - first) * step) >> 8) * 2**-24)
-        return tuple(numbers)
+        return Quadrature(*numbers)
 
 
 class Reconstruction:
-    """The pixels of an image block, each the sum of the samples around it by the film's reconstruction filter.
+    """Pixels of an image block, each the sum of the samples around it, weighted by the film's reconstruction filter.
 
-    Mitsuba's ``ImageBlock.put`` adds every sample to its pixels atomically, in whatever order threads come along, and
-    float32 sums differ in their last bits from run to run. Here pixels fetch their samples, in one order: same seed,
-    same bits.
+    Mitsuba's ``ImageBlock.put`` adds samples to pixels atomically, so that float32 sums differ in their last bits from
+    run to run. Here pixels gather their samples in a fixed order: the same seed gives the same bits.
     """
 
-    def __init__(self, block, camera: Camera):
+    def __init__(self, block: mi.ImageBlock, camera: Camera) -> None:
         self.block, self.camera = block, camera
         self._filter = camera.film.rfilter()
-        # Source pixels on each side whose samples may count.
+        # Source pixels on each side whose samples the filter may weight.
         self._reach = 0 if self._filter.is_box_filter() else math.ceil(self._filter.radius() - 0.5)
 
-    def add(self, first: int, position, values: list) -> None:
-        """Add samples as :meth:`Camera.rays` orders them, from source pixel `first` on: at each film `position` one of
-        `values` a channel; None adds nothing to its channel."""
+    def add(self, first: int, position: Vector3, values: Sequence[Float | None]) -> None:
+        """Add samples in the order of :meth:`Camera.rays`, from source pixel `first` on.
+
+        `values`: an array for each channel, with a number for each `position` on the film; None adds nothing.
+        """
         camera, reach = self.camera, self._reach
         height, width, channels = self.block.tensor().shape
         last = first + dr.width(position) // camera.spp
@@ -109,55 +139,60 @@ class Reconstruction:
                 )  # fmt: skip
         dr.eval(self.block.tensor())
 
-    def _sums(self, pixel, width: int, first: int, last: int, position, values: list) -> list:
-        """Of the samples around the block's pixels `pixel`, each of `values` by the filter's weights. What rounding
-        takes off a sum is added with the next sample (Kahan): 10⁶ samples would lose five of float32's seven digits."""
+    def _sums(self, pixel: UInt32, width: int, first: int, last: int, position: Vector3,
+              values: list[Float]) -> list[Float]:
+        """Return the weighted sums of `values` over the samples around the block's pixels `pixel`.
+
+        The rounding error of a sum is added with the next sample (Kahan 1965), since 10⁶ samples would lose five of
+        float32's seven digits.
+        """
         spp, columns, count = (dr.opaque(mi.UInt32, n) for n in (self.camera.spp, self.camera.width, last - first))
         begin = dr.opaque(mi.UInt32, first)
         y = pixel // dr.opaque(mi.UInt32, width)
         x = pixel - y * dr.opaque(mi.UInt32, width)
-        corner: Any = mi.Point2f(mi.Float(x), mi.Float(y))
+        corner: Vector3 = mi.Point2f(mi.Float(x), mi.Float(y))
         centre = corner + 0.5 + mi.Vector2f(self.block.offset())
         side = dr.opaque(mi.UInt32, 2 * self._reach + 1)
-        # Wraps around below 0, which is then no column and no source pixel.
+        # Below 0 it wraps around to a number that is no column and no source pixel.
         shift = dr.opaque(mi.UInt32, (self.camera.border - self._reach) % 2**32)
         one = mi.Float(1)
 
-        def more_rows(i, j, k, sums, lost):
+        def more_rows(i: UInt32, j: UInt32, k: UInt32, sums: list[Float], rounding: list[Float]) -> Array:
             return j < side
 
-        def body(i, j, k, sums, lost):
+        def body(i: UInt32, j: UInt32, k: UInt32, sums: list[Float], rounding: list[Float]) -> Array:
             column = x + shift + i
             source = (y + shift + j) * columns + column - begin
             active = (column < columns) & (source < count)
             index = source * spp + k
-            weight = one
+            weight: Float = one
             if self._reach:
                 place = dr.gather(type(position), position, index, active)
                 weight = self._filter.eval(place.x - centre.x) * self._filter.eval(place.y - centre.y)
-            more = [weight * dr.gather(mi.Float, v, index, active) + r for v, r in zip(values, lost, strict=True)]
+            more = [weight * dr.gather(mi.Float, v, index, active) + r for v, r in zip(values, rounding, strict=True)]
             before = dr.detach(sums)
             sums = [s + m for s, m in zip(sums, more, strict=True)]
-            lost = [dr.detach(m - (s - b)) for m, s, b in zip(more, sums, before, strict=True)]
+            rounding = [dr.detach(m - (s - b)) for m, s, b in zip(more, sums, before, strict=True)]
             k = k + 1
             i = dr.select(k == spp, i + 1, i)
             k = dr.select(k == spp, 0, k)
             j = dr.select(i == side, j + 1, j)
-            return dr.select(i == side, 0, i), j, k, sums, lost
+            return dr.select(i == side, 0, i), j, k, sums, rounding
 
         n = dr.width(pixel)
         zeros = [dr.zeros(mi.UInt32, n) for _ in range(3)]
-        state: Any = (*zeros, *([dr.zeros(mi.Float, n) for _ in values] for _ in range(2)))
-        return dr.while_loop(
+        state: Array = (*zeros, *([dr.zeros(mi.Float, n) for _ in values] for _ in range(2)))
+        sums: list[Float] = dr.while_loop(
             state=state,
             cond=more_rows,
             body=body,
             label="reconstruction",
             max_iterations=-1 if dr.grad_enabled(values) else None,  # a sum
         )[3]
+        return sums
 
-    def keep(self, done: int) -> None:
-        """Set to 0 the pixels that samples of source pixels from `done` on would reach."""
+    def clear_unfinished(self, first: int) -> None:
+        """Set the pixels to 0 that samples of source pixels from `first` on would reach."""
         tensor, reach, border = self.block.tensor(), self._reach, self.camera.border
         height, width, channels = tensor.shape
         entry = dr.arange(mi.UInt32, height * width * channels)
@@ -167,4 +202,4 @@ class Reconstruction:
         size = self.camera.count // self.camera.width
         last = dr.minimum(y + border + reach, size - 1) * self.camera.width
         last += dr.minimum(x + border + reach, self.camera.width - 1)
-        dr.scatter(tensor.array, mi.Float(0), entry, last >= done)
+        dr.scatter(tensor.array, mi.Float(0), entry, last >= first)

@@ -1,18 +1,25 @@
 """Scenes that differ from their XML file: parsed, changed, then instantiated."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TypeAlias
 
 import mitsuba as mi
 
 from ...core.errors import MiNtfError
 
+Node: TypeAlias = "mi.parser.SceneNode"
+ParsedScene: TypeAlias = "mi.parser.ParserState"
 
-def load(path: Path, parameters: dict[str, str], change: Callable[[Any], None], strict: bool = True):
-    """The scene of an XML file after `change` has seen every node of it, each with a ``type`` and ``props``. `strict`:
-    values for names that the file lacks are an error."""
+
+def load(path: Path, parameters: dict[str, str], change: Callable[[Node], None], strict: bool = True) -> mi.Scene:
+    """Return the scene of an XML file after a call of `change` for each node, which has a ``type`` and ``props``.
+
+    `strict`: values for $names that the file does not contain are an error.
+    """
     with beside(path):
         state = parsed(path, parameters, strict)
         for node in state.nodes:
@@ -20,28 +27,28 @@ def load(path: Path, parameters: dict[str, str], change: Callable[[Any], None], 
         return instantiated(path, state, strict)
 
 
-def shrink_film(props, shrink: int) -> None:
-    """Make a film RGBA, with one pixel for `shrink` along each side of it and of its crop; `props`: its properties."""
+def shrink_film(props: mi.Properties, shrink: int) -> None:
+    """Divide the sides of a film and of its crop by `shrink`, and make it RGBA; `props`: the film's properties."""
     for name, default in (("width", 768), ("height", 576)):
-        props[name] = max(1, int(props.get(name, default)) // shrink)
+        props[name] = max(1, int(str(props.get(name, default))) // shrink)
     for name in ("crop_offset_x", "crop_offset_y", "crop_width", "crop_height"):
         if name in props:
-            props[name] = int(props[name]) // shrink
+            props[name] = int(str(props[name])) // shrink
     props["pixel_format"] = "rgba"
 
 
-def parsed(path: Path, parameters: dict[str, str], strict: bool = True):
-    """Return the parsed XML file, `parameters` for its $names: ``nodes``, each with a ``type`` and ``props``."""
+def parsed(path: Path, parameters: dict[str, str], strict: bool = True) -> ParsedScene:
+    """Return the parsed XML file, with `parameters` for its $names."""
     with beside(path):
         return mi.parser.parse_file(_config(strict), str(path), **parameters)
 
 
-def instantiated(path: Path, state, strict: bool = True):
-    """The scene of what was :func:`parsed` from `path`, with all changes since."""
+def instantiated(path: Path, state: ParsedScene, strict: bool = True) -> mi.Scene:
+    """Return the scene of a state :func:`parsed` from `path`, with all changes made since."""
     with beside(path):
         mi.parser.transform_all(_config(strict), state)
-        found = mi.parser.instantiate(_config(strict), state)
-    scene = found[0] if isinstance(found, list) else found
+        objects = mi.parser.instantiate(_config(strict), state)
+    scene = objects[0] if isinstance(objects, list) else objects
     if not isinstance(scene, mi.Scene):
         raise MiNtfError(f"{path}: the root element must be a <scene>")
     return scene
@@ -49,19 +56,18 @@ def instantiated(path: Path, state, strict: bool = True):
 
 @contextmanager
 def beside(path: Path) -> Iterator[None]:
-    """Within, files are looked for beside `path` first, as where Mitsuba loads a file by itself."""
-    before = mi.file_resolver()  # type: ignore[operator]  # an object in the stub
+    """Within the block, search files beside `path` first, as Mitsuba does when it loads a file by itself."""
+    before = mi.file_resolver()  # type: ignore[operator]  # Mitsuba's stubs leave both out
     within = mi.FileResolver(before)
     within.prepend(str(Path(path).parent))
-    put: Any = mi.set_file_resolver
-    put(within)
+    mi.set_file_resolver(within)  # type: ignore[operator]
     try:
         yield
     finally:
-        put(before)
+        mi.set_file_resolver(before)  # type: ignore[operator]
 
 
-def _config(strict: bool):
+def _config(strict: bool) -> mi.parser.ParserConfig:
     config = mi.parser.ParserConfig(str(mi.variant()))
     if not strict:
         config.unused_parameters = mi.LogLevel.Debug

@@ -1,42 +1,90 @@
-"""Effects that a scene calls for, as a frozen description that the later code branches on."""
+"""Effects that a scene needs, as a frozen description on which the later code branches."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ...core.errors import MiNtfError
+from ...infer.types import Float
 from ...infer.visibility import REGISTRY
 from . import gradient_checks
-from .media import lets_light_through, ordinary_shapes
+from .frame import Frame
+from .gradient_checks import DiscreteEmitter
+from .media import NRFMedium, lets_light_through, ordinary_shapes
 from .settings import Settings
 
 PINHOLES = ("PerspectiveCamera",)
-"""Cameras whose rays all pass one point: light from there goes the way of the view."""
+"""Cameras whose rays all start at one point; light from there has the transmittance of the view."""
 MIN_GLOSS = 0.01
-"""Specular lobes that stay below this share of a white diffuse surface (:class:`mi_ntf.infer.grid.GridField`, `gloss`)
-are left out."""
+"""Least weight of a specular lobe that is evaluated, relative to a white diffuse surface
+(:class:`mi_ntf.infer.grid.GridField`, `gloss`)."""
 NEAR = 1e-3
-"""A light counts as at the camera within this share of the distance to the nearest field's sphere."""
+"""Largest distance of a light at the camera, relative to the distance of the nearest field's sphere."""
+
+
+class LightRows(Protocol):
+    """Lights of a scene's table (:class:`mi_ntf.render.lights.light_rows.Rows`), in scene coordinates."""
+
+    @property
+    def where(self) -> np.ndarray:
+        """Positions and directions, (n, 3)."""
+
+    @property
+    def power(self) -> np.ndarray:
+        """Intensities and irradiances, (n, 3)."""
+
+    @property
+    def is_point(self) -> np.ndarray:
+        """True for point lights, (n,)."""
+
+
+class SceneLights(Protocol):
+    """Lights of a scene (:class:`mi_ntf.render.lights.scene_lights.Lights`)."""
+
+    @property
+    def kinds(self) -> Sequence[str]:
+        """Plugin name of each emitter."""
+
+    @property
+    def background(self) -> bool:
+        """True if an environment is visible behind everything else."""
+
+    @property
+    def sampled(self) -> Sequence[mi.Emitter]:
+        """Emitters that are sampled at random."""
+
+    @property
+    def discrete(self) -> Sequence[DiscreteEmitter]:
+        """Emitters whose lights are `rows`."""
+
+    @property
+    def rows(self) -> LightRows:
+        """Lights of the table."""
 
 
 @dataclass(frozen=True)
 class Effects:
     """Effects of a render. An effect that is absent is neither traced into a kernel nor built.
 
-    emitters    their kinds
+    emitters    plugin names of the emitters
     lit         a light has power, and `max_depth` lets it scatter
-    background  the environment is seen directly
-    exhaustive  every light at every shading point, rather than random ones
-    visibility  the method that runs, never ``auto``; `reason`: why that one
-    collocated  all light comes from the camera: the view transmittance is the light's too
-    in_view     of each medium, whether the camera may see matter of it
+    background  the environment is directly visible
+    exhaustive  every light is summed at every shading point, rather than random ones
+    visibility  visibility method, never ``auto``
+    reason      reason for this method
+    collocated  all light comes from the camera, so that it has the transmittance of the view
+    in_view     for each medium: the camera may see it
     surfaces    there are shapes other than the media's bounds
     specular    a field has a specular lobe
-    fresnel     one whose weight grows towards grazing angles
-    bounces     how light that scatters more than once is found, ``paths`` or ``radiosity``; "": it is not looked for
-    gradients   a scene parameter is attached
+    fresnel     a field has a specular lobe whose weight grows towards grazing angles
+    bounces     method for multiple scattering, ``paths`` or ``radiosity``; "": there is none
+    gradients   a scene parameter carries gradients
     """
 
     emitters: tuple[str, ...]
@@ -59,29 +107,28 @@ class Effects:
         return self.lit and (not self.collocated or self.surfaces or bool(self.bounces))
 
 
-def describe(scene, settings: Settings, sensor, spp: int, media: list, light) -> Effects:
-    """The effects of rendering `scene`, with its `media` and `light`
-    (:class:`mi_ntf.render.lights.scene_lights.Lights`), by an ``nrf`` integrator of `settings` with `spp` camera rays a
-    pixel."""
+def describe(scene: mi.Scene, settings: Settings, sensor: mi.Sensor, spp: int, media: Sequence[NRFMedium],
+             lights: SceneLights) -> Effects:
+    """Return the effects of rendering `scene`, with its `media` and `lights`, by `spp` camera rays a pixel."""
     depth = settings.max_depth
-    lit = bool(light.rows.power.size or light.sampled) and not 0 <= depth < 2
+    lit = bool(lights.rows.power.size or lights.sampled) and not 0 <= depth < 2
     exhaustive = settings.light_samples == 0
-    gradients = gradient_checks.check(scene, light)
+    gradients = gradient_checks.check(scene, lights.discrete)
     surfaces = len(ordinary_shapes(scene)) > 0
-    # Derivatives by a light's place need the light's own transmittance. A camera ray either crosses a surface or ends
-    # there, at random, while a shadow ray is dimmed.
-    collocated = (lit and not gradients and settings.visibility != "none" and _at_camera(light, sensor, media)
+    # Derivatives by a light's position need the light's own transmittance. A camera ray crosses a surface or ends there
+    # at random, while a shadow ray is attenuated.
+    collocated = (lit and not gradients and settings.visibility != "none" and _at_camera(lights, sensor, media)
                   and not lets_light_through(scene))
     width, height = sensor.film().crop_size()
     bounces = _bounces(settings, media, surfaces, gradients) if lit and not 0 <= depth <= 2 else ""
-    method, reason = _method(settings, width * height * spp, light)
+    method, reason = _method(settings, width * height * spp, lights)
     if collocated:
         reason += "; not needed where the camera's own transmittance is the light's"
     rims = [m.field.header.architecture.fresnel for m in media]
     return Effects(
-        emitters=tuple(light.kinds),
+        emitters=tuple(lights.kinds),
         lit=lit,
-        background=light.background and not settings.hide_emitters and depth != 0,
+        background=lights.background and not settings.hide_emitters and depth != 0,
         exhaustive=exhaustive,
         visibility=method,
         reason=reason,
@@ -95,98 +142,102 @@ def describe(scene, settings: Settings, sensor, spp: int, media: list, light) ->
     )
 
 
-def _bounces(integrator, media: list, surfaces: bool, gradients: bool) -> str:
-    """Return the way of further bounces: the chosen one, or with ``auto`` radiosity where it covers the whole scene."""
-    name = integrator.bounces
-    unknown = [what for what, there in (
-        ("surfaces", surfaces), ("derivatives", gradients), ("visibility=none", integrator.visibility == "none"),
-        ("smoke", any(not m.field.softness.opaque for m in media if m.field.grid.majorant > 0))) if there]
-    if name == "radiosity" and unknown:
+def _bounces(settings: Settings, media: Sequence[NRFMedium], surfaces: bool, gradients: bool) -> str:
+    """Return the method for multiple scattering; ``auto`` is radiosity if that covers the whole scene."""
+    conditions = {
+        "surfaces": surfaces, "derivatives": gradients, "visibility=none": settings.visibility == "none",
+        "smoke": any(not m.field.softness.opaque for m in media if m.field.grid.majorant > 0)}
+    unsupported, name = [text for text, holds in conditions.items() if holds], settings.bounces
+    if name == "radiosity" and unsupported:
         raise MiNtfError(
             f"nrf integrator: bounces=radiosity is light between the opaque skins of fields, but here are "
-            f"{' and '.join(unknown)}; choose bounces=paths"
+            f"{' and '.join(unsupported)}; choose bounces=paths"
         )
-    return name if name != "auto" else "paths" if unknown else "radiosity"
+    return name if name != "auto" else "paths" if unsupported else "radiosity"
 
 
-def drawn(integrator, light) -> int:
-    """Lights that are drawn for each point."""
-    return integrator.light_samples or 2 * len(light.sampled)
+def sampled_light_count(settings: Settings, lights: SceneLights) -> int:
+    """Return the number of lights that are sampled at random for each shading point."""
+    return settings.light_samples or 2 * len(lights.sampled)
 
 
-def _method(settings, rays: int, light) -> tuple[str, str]:
-    """Return the visibility method that runs, and why."""
+def lights_per_point(settings: Settings, lights: SceneLights) -> int:
+    """Return the number of lights for each shading point, those of the table and sampled ones."""
+    return len(lights.rows.power) + sampled_light_count(settings, lights)
+
+
+def _method(settings: Settings, rays: int, lights: SceneLights) -> tuple[str, str]:
+    """Return the visibility method and the reason for it; `rays`: number of camera rays."""
     method = settings.visibility
     if method != "auto":
-        if REGISTRY[method].drawn and settings.light_samples:
+        if REGISTRY[method].sampled and settings.light_samples:
             raise MiNtfError(
                 f"light_samples is {settings.light_samples}, but visibility={method} holds one map or volume for "
                 "every light and sums all of them; remove light_samples or choose raymarch or transmittance_atlas"
             )
         return method, "chosen by name"
-    marched = rays * settings.frames * shadow_rays(settings, light)
-    filled = REGISTRY["transmittance_atlas"].rays(0, 0)
-    fewer = marched <= filled
+    shadow_rays = rays * settings.frames * lights_per_point(settings, lights)
+    atlas_rays = REGISTRY["transmittance_atlas"].rays(0, 0)
+    fewer = shadow_rays <= atlas_rays
     return ("raymarch" if fewer else "transmittance_atlas",
-            f"camera rays times lights are {count(marched)}, {'no more' if fewer else 'more'} than the {count(filled)} "
-            "rays that fill an atlas")
+            f"camera rays times lights are {_rounded(shadow_rays)}, {'no more' if fewer else 'more'} than the "
+            f"{_rounded(atlas_rays)} rays that fill an atlas")
 
 
-def shadow_rays(settings, light) -> int:
-    """Return the number of lights that a shading point asks for, all of the table and those drawn at random."""
-    return len(light.rows.power) + drawn(settings, light)
-
-
-def count(number: float) -> str:
-    """Return a large number in words of two digits."""
+def _rounded(number: float) -> str:
+    """Return a number in two digits and words."""
     for size, word in ((1e9, " billion"), (1e6, " million"), (1e3, " thousand")):
         if number >= size:
             return f"{float(f'{number / size:.2g}'):g}{word}"
     return f"{number:g}"
 
 
-def _at_camera(light, sensor, media) -> bool:
+def _at_camera(lights: SceneLights, sensor: mi.Sensor, media: Sequence[NRFMedium]) -> bool:
     """Return True if all lights are points at the pinhole of the camera."""
-    if light.sampled or sensor.class_name() not in PINHOLES or not light.rows.is_point.all():
+    if lights.sampled or sensor.class_name() not in PINHOLES or not lights.rows.is_point.all():
         return False
     eye = _eye(sensor)
     to_field = min(abs(np.linalg.norm(m.frame.origin - eye) - m.frame.length) for m in media)
-    return bool((np.linalg.norm(light.rows.where - eye, axis=1) <= NEAR * to_field).all())
+    return bool((np.linalg.norm(lights.rows.where - eye, axis=1) <= NEAR * to_field).all())
 
 
-def _in_view(sensor, media) -> tuple[bool, ...]:
-    """Return for each medium if its sphere reaches into the pinhole camera's pyramid and holds matter."""
-    held = [m.field.grid.majorant > 0 for m in media]
+def _in_view(sensor: mi.Sensor, media: Sequence[NRFMedium]) -> tuple[bool, ...]:
+    """Return True for each medium that has matter and whose sphere intersects the pyramid of a pinhole camera."""
+    has_matter = [m.field.grid.majorant > 0 for m in media]
     if sensor.class_name() not in PINHOLES:
-        return tuple(held)
+        return tuple(has_matter)
     film = sensor.film()
     margin = film.rfilter().radius() + 1 if film.sample_border() else 0
     (u0, u1), (v0, v1) = ((-margin / n, 1 + margin / n) for n in film.crop_size())
-    rays, _ = sensor.sample_ray(0.0, 0.0, mi.Point2f([u0, u1, u1, u0], [v0, v0, v1, v1]), mi.Point2f(0.5))
+    zero: Float = 0.0
+    rays, _ = sensor.sample_ray(zero, zero, mi.Point2f([u0, u1, u1, u0], [v0, v0, v1, v1]), mi.Point2f(0.5))
     corners = np.array(rays.d, np.float64).T
     sides = np.cross(corners, np.roll(corners, -1, axis=0))
     sides *= np.sign(sides @ corners.sum(0))[:, None] / np.linalg.norm(sides, axis=1, keepdims=True)
     eye = _eye(sensor)
     return tuple(
-        h and bool((sides @ (m.frame.origin - eye) > -m.frame.length).all()) for h, m in zip(held, media, strict=True)
+        matter and bool((sides @ (m.frame.origin - eye) > -m.frame.length).all())
+        for matter, m in zip(has_matter, media, strict=True)
     )
 
 
-def on_film(sensor, frame):
-    """Corners (low, high) of the part of the picture, a unit square, that the sphere of `frame` may take; None where
-    the camera is no pinhole or the sphere reaches behind it."""
+def on_film(sensor: mi.Sensor, frame: Frame) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the corners (low, high) of a box around the sphere of `frame` on the picture, a unit square.
+
+    Returns None if the camera is no pinhole or the sphere reaches behind it.
+    """
     if sensor.class_name() not in PINHOLES:
         return None
     corners = frame.origin[:, None] + frame.length * (2 * np.indices((2, 2, 2)).reshape(3, 8) - 1)
-    at = dr.zeros(mi.Interaction3f, 8)
-    at.p = mi.Point3f(*(mi.Float(c) for c in corners))
-    if (np.array(sensor.world_transform().inverse() @ at.p)[2] <= 0).any():
+    interaction = dr.zeros(mi.Interaction3f, 8)
+    interaction.p = mi.Point3f(*(mi.Float(c) for c in corners))
+    if (np.array(sensor.world_transform().inverse() @ interaction.p)[2] <= 0).any():
         return None
-    seen, _ = sensor.sample_direction(at, mi.Point2f(0.5))
-    place = np.array(seen.uv, np.float64) / np.array(sensor.film().crop_size(), np.float64)[:, None]
+    projection, _ = sensor.sample_direction(interaction, mi.Point2f(0.5))
+    place = np.array(projection.uv, np.float64) / np.array(sensor.film().crop_size(), np.float64)[:, None]
     return np.clip(place.min(1), 0, 1), np.clip(place.max(1), 0, 1)
 
 
-def _eye(sensor) -> np.ndarray:
-    """Position of a camera's pinhole."""
+def _eye(sensor: mi.Sensor) -> np.ndarray:
+    """Return the position of a camera's pinhole."""
     return np.array(sensor.world_transform().translation(), np.float64).ravel()

@@ -1,44 +1,46 @@
-"""The environment of a scene file, swapped, turned and scaled from the command line: ``--env FILE --env-rotate DEG
---env-scale S``.
+"""Changes of a scene's environment from the command line: ``--env FILE --env-rotate DEG --env-scale S``.
 
-It is done between parsing and making the scene, wherever the emitter stands: at the top, in an include, inside of an
-``ntf`` emitter.
+They are made between parsing and instantiation, so that they reach an emitter at the top of the scene, in an include or
+inside an ``ntf`` emitter.
 """
+
+from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
 from ...core.errors import MiNtfError
+from ...infer.types import Array
+from .changed import Node, ParsedScene
 
 KINDS = ("envmap", "constant", "sunsky", "timed_sunsky")
-"""Plugins that are a scene's environment."""
+"""Plugins of environment emitters."""
 SKIES = ("sunsky", "timed_sunsky")
-"""Those whose own up axis is z; the others' is y."""
+"""Plugins whose up axis is z; that of the others is y."""
 SKY_TO_MAP = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-"""Columns are the axes of a map, y up, in those of a sky, z up."""
+"""Rotation from an environment map, whose up axis is y, to a sky, whose up axis is z."""
 
 
 @dataclass(frozen=True)
 class Environment:
-    """What is to become of a scene's environment.
+    """Changes of a scene's environment.
 
-    file    a latitude-longitude image that takes its place and keeps its placement and scale; None: it stays
-    rotate  degrees about the world's up axis, counter-clockwise seen from above, on top of the scene's own rotation
-    scale   factor of its radiance, on top of the scene's own
+    file    latitude-longitude image that replaces the environment, with the same placement and scale; None: no change
+    rotate  degrees about the world's up axis, counter-clockwise seen from above, added to the scene's own rotation
+    scale   factor by which the scene's own radiance is multiplied
 
-    Raises MiNtfError where the file is missing or no image, or a number is none.
+    Raises MiNtfError if the file is missing or no image, or if a number is not finite.
     """
 
     file: Path | None = None
     rotate: float = 0.0
     scale: float = 1.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if not math.isfinite(self.rotate):
             raise MiNtfError(f"--env-rotate is {self.rotate}, expected a finite number of degrees")
         if not (math.isfinite(self.scale) and self.scale >= 0):
@@ -53,10 +55,11 @@ class Environment:
         return self != Environment()
 
 
-def apply(environment: Environment, state, path: Path) -> None:
+def apply(environment: Environment, state: ParsedScene, path: Path) -> None:
     """Change the environment in the parsed scene `state` of the file `path`, before references are resolved.
 
-    A scene without one gets `environment.file` with y up. Raises MiNtfError where there is nothing to turn or scale.
+    A scene without an environment gets `environment.file` with y up. Raises MiNtfError if there is no environment to
+    rotate or scale.
     """
     if not environment:
         return
@@ -70,20 +73,24 @@ def apply(environment: Environment, state, path: Path) -> None:
 
 
 def turned(to_world: np.ndarray, degrees: float, up: str = "y") -> np.ndarray:
-    """(4, 4) `to_world` of an environment, turned by `degrees` about the world's up axis: the coordinate axis that is
-    nearest to the environment's own, `up`. Scenes whose z is up turn their maps upright, so it is theirs, too."""
-    away = to_world[:3, 1 if up == "y" else 2]
-    at = int(np.abs(away).argmax())
-    angle = math.radians(degrees) * (1 if away[at] >= 0 else -1)
-    first, second = (at + 1) % 3, (at + 2) % 3
+    """Return the (4, 4) `to_world` of an environment, rotated by `degrees` about the world's up axis.
+
+    `up`: the environment's own up axis, ``y`` or ``z``. The world's up axis is the coordinate axis nearest to it, since
+    scenes with z up turn their maps upright.
+    """
+    direction = to_world[:3, 1 if up == "y" else 2]
+    axis = int(np.abs(direction).argmax())
+    angle = math.radians(degrees) * (1 if direction[axis] >= 0 else -1)
+    first, second = (axis + 1) % 3, (axis + 2) % 3
     rotation = np.eye(4)
     rotation[[first, second], [first, second]] = math.cos(angle)
     rotation[second, first], rotation[first, second] = math.sin(angle), -math.sin(angle)
-    return rotation @ to_world
+    result: np.ndarray = rotation @ to_world
+    return result
 
 
-def _add(state):
-    """A new ``envmap`` at the top of the scene, yet without a file."""
+def _add(state: ParsedScene) -> Node:
+    """Add an ``envmap`` without a file at the top of the scene, and return it."""
     node = mi.parser.SceneNode()
     node.type, node.props = mi.ObjectType.Emitter, mi.Properties("envmap")
     state.nodes.append(node)
@@ -91,7 +98,7 @@ def _add(state):
     return state.nodes[len(state.nodes) - 1]
 
 
-def _change(node, environment: Environment) -> None:
+def _change(node: Node, environment: Environment) -> None:
     kind = node.props.plugin_name()
     up = "z" if kind in SKIES else "y"
     old = _matrix(node.props)
@@ -100,7 +107,7 @@ def _change(node, environment: Environment) -> None:
         _scale_radiance(node, environment.scale)
         return
     if environment.file is not None:
-        _take_file(node, environment.file.resolve())
+        _replace(node, environment.file.resolve())
         new = new @ SKY_TO_MAP if up == "z" else new
         kind = "envmap"
     node.props["to_world"] = mi.ScalarTransform4f(new)
@@ -111,13 +118,14 @@ def _change(node, environment: Environment) -> None:
         node.props["sun_direction"] = ((new @ np.linalg.inv(old))[:3, :3] @ sun).tolist()
 
 
-def _matrix(props) -> np.ndarray:
-    """(4, 4) float64 of its ``to_world``."""
-    return np.array(props["to_world"].matrix, np.float64).reshape(4, 4) if "to_world" in props else np.eye(4)
+def _matrix(props: mi.Properties) -> np.ndarray:
+    """Return the ``to_world`` of an emitter as (4, 4) float64."""
+    transform: Array = props["to_world"] if "to_world" in props else mi.ScalarTransform4f()
+    return np.array(transform.matrix, np.float64).reshape(4, 4)
 
 
-def _take_file(node, file: Path) -> None:
-    """Make `node` an ``envmap`` of `file`; of an ``envmap`` all else stays."""
+def _replace(node: Node, file: Path) -> None:
+    """Make `node` an ``envmap`` of `file`; an ``envmap`` keeps its other properties."""
     if node.props.plugin_name() != "envmap":
         props = mi.Properties("envmap")
         props.set_id(node.props.id())
@@ -127,18 +135,20 @@ def _take_file(node, file: Path) -> None:
     node.props["filename"] = str(file)
 
 
-def _scale_radiance(node, scale: float) -> None:
-    """Of a ``constant`` emitter, which has no scale of its own."""
+def _scale_radiance(node: Node, scale: float) -> None:
+    """Scale the radiance of a ``constant`` emitter, which has no property `scale`."""
     props = node.props
     kind = props.type("radiance").name if "radiance" in props else ""
-    found: Any = props["radiance"] if kind else 1.0
+    radiance: Array = props["radiance"] if kind else 1.0
     if kind == "Spectrum":
-        values = [scale * value for value in found.values]
-        props["radiance"] = type(found)(values[0]) if found.is_uniform() else type(found)(found.wavelengths, values)
+        values = [scale * value for value in radiance.values]
+        spectrum = type(radiance)
+        props["radiance"] = (spectrum(values[0]) if radiance.is_uniform()
+                             else spectrum(radiance.wavelengths, values))
     elif kind in ("", "Float", "Integer"):
-        props["radiance"] = scale * found
+        props["radiance"] = scale * radiance
     elif kind == "Color":
-        props["radiance"] = mi.ScalarColor3d((scale * np.array(found, np.float64)).tolist())
+        props["radiance"] = mi.ScalarColor3d((scale * np.array(radiance, np.float64)).tolist())
     else:
         raise MiNtfError(f"--env-scale: the radiance of the scene's constant emitter is a nested {kind.lower()}; scale "
                          "it in the XML")

@@ -1,27 +1,32 @@
 """The similarity between scene and field coordinates."""
 
+from __future__ import annotations
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ...core.architecture import Similarity
 from ...core.errors import MiNtfError
+from ...infer.types import Vector, Vector3
 
 SCALES = (1e-12, 1e12)
 """Scene units per capture unit."""
 LENGTHS = (1e-12, 1e12)
-"""Scene units per field unit: cubes of it are still numbers in single precision."""
+"""Scene units per field unit, whose cubes single precision still represents."""
 
 
 class Frame:
-    """world = to_world · scale · (center + radius · field).
+    """Placement of a field in the scene: world = to_world · scale · (center + radius · field).
 
     length   scene units per field unit
-    origin   the unit sphere's centre in the scene
-    Arrays go into kernels as opaque values: another placement compiles nothing anew.
+    origin   centre of the unit sphere in the scene
+
+    Its numbers are opaque to kernels, so that another placement compiles nothing. Raises MiNtfError if `to_world` is no
+    similarity or the result exceeds single precision.
     """
 
-    def __init__(self, similarity: Similarity, to_world: np.ndarray, scale: float):
+    def __init__(self, similarity: Similarity, to_world: np.ndarray, scale: float) -> None:
         linear = np.asarray(to_world, np.float64)[:3, :3] * scale
         gram = linear.T @ linear
         size = np.sqrt(np.trace(gram) / 3)
@@ -38,41 +43,43 @@ class Frame:
                 f"single precision reckons with radii from {LENGTHS[0]:g} and places up to {LENGTHS[1]:g}; change "
                 "scale or to_world"
             )
-        self._matrix = linear / size
+        self._matrix: np.ndarray = linear / size
         self._rotation = mi.Matrix3f(self._matrix.tolist())
-        self._back = mi.Matrix3f(self._matrix.T.tolist())
-        self._origin = mi.Point3f(self.origin.tolist())
-        self._inverse = mi.Float(1 / self.length)
-        dr.make_opaque(self._rotation, self._back, self._origin, self._inverse)
+        self._inverse_rotation = mi.Matrix3f(self._matrix.T.tolist())
+        self._origin: Vector3 = mi.Point3f(self.origin.tolist())
+        self._inverse_length = mi.Float(1 / self.length)
+        dr.make_opaque(self._rotation, self._inverse_rotation, self._origin, self._inverse_length)
 
-    def point_to_field(self, p):
-        """Scene point → 3-tuple of field coordinates."""
-        return tuple(self._back @ mi.Vector3f(p - self._origin) * self._inverse)
+    def point_to_field(self, p: Vector3) -> Vector:
+        """Convert scene points to field coordinates."""
+        x, y, z = self._inverse_rotation @ mi.Vector3f(p - self._origin) * self._inverse_length
+        return x, y, z
 
-    def direction_to_field(self, d):
-        """Unit vector of the scene → unit 3-tuple."""
-        return tuple(self._back @ mi.Vector3f(d))
+    def direction_to_field(self, d: Vector3) -> Vector:
+        """Convert unit vectors of the scene to unit vectors of the field."""
+        x, y, z = self._inverse_rotation @ mi.Vector3f(d)
+        return x, y, z
 
-    def point_to_world(self, p):
-        """3-tuple of field coordinates → scene point."""
+    def point_to_world(self, p: Vector | Vector3) -> Vector3:
+        """Convert field points to scene coordinates."""
         return mi.Point3f(self._rotation @ mi.Vector3f(*p) * self.length + self._origin)
 
-    def direction_to_world(self, d):
-        """Unit 3-tuple → unit vector of the scene."""
+    def direction_to_world(self, d: Vector | Vector3) -> Vector3:
+        """Convert unit vectors of the field to unit vectors of the scene."""
         return mi.Vector3f(self._rotation @ mi.Vector3f(*d))
 
-    def placement(self) -> tuple:
-        """Numbers that tell frames apart."""
+    def placement(self) -> tuple[bytes, bytes, float]:
+        """Return a key that differs between different placements."""
         return self._matrix.tobytes(), self.origin.tobytes(), self.length
 
     def of_capture(self, similarity: Similarity) -> np.ndarray:
-        """Return the (4, 4) matrix that takes coordinates of the capture, whose sphere is `similarity`, to the scene's.
-        """
+        """Return the (4, 4) matrix from capture coordinates, whose sphere is `similarity`, to scene coordinates."""
         matrix = np.eye(4)
         matrix[:3, :3] = self._matrix * (self.length / similarity.radius)
         matrix[:3, 3] = self.origin - matrix[:3, :3] @ np.asarray(similarity.center)
         return matrix
 
     def world_to_field_numpy(self, p: np.ndarray, direction: bool = False) -> np.ndarray:
-        """(n, 3) scene points (or directions) → field, in float64 on the host."""
-        return p @ self._matrix if direction else (p - self.origin) @ self._matrix / self.length
+        """Convert (n, 3) scene points, or directions, to field coordinates in float64 on the host."""
+        field: np.ndarray = p @ self._matrix if direction else (p - self.origin) @ self._matrix / self.length
+        return field

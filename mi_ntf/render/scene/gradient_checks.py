@@ -1,4 +1,9 @@
-"""Checks of the scene parameters that carry gradients. Those that derivatives leave out are refused."""
+"""Checks of the scene parameters that carry gradients; parameters without derivatives are refused."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -16,20 +21,28 @@ POWERS = {
     "Projector": ("irradiance", "scale"),
     "SmoothDiffuse": ("reflectance",),
 }
-"""Mitsuba's class name → parameters that the light on its way is linear in."""
+"""Mitsuba's class name → parameters in which radiance is linear."""
 PLACES = {"PointLight": ("position",), "SpotLight": ("to_world",), "DirectionalEmitter": ("to_world",)}
-"""Those that move a light, where it is a row of the table, whose shadows move with it."""
+"""Mitsuba's class name → parameters that move a light of the table, and its shadows."""
 
 
-def check(scene, light) -> bool:
+class DiscreteEmitter(Protocol):
+    """An emitter whose lights are rows of the light table."""
+
+    @property
+    def emitter(self) -> mi.Emitter:
+        """The emitter itself."""
+
+
+def check(scene: mi.Scene, discrete: Sequence[DiscreteEmitter]) -> bool:
     """Return True if a parameter of `scene` carries gradients.
 
-    `light`: the scene's :class:`mi_ntf.render.lights.scene_lights.Lights`. Raises MiNtfError if derivatives of the
-    picture leave the parameter out."""
+    `discrete`: the emitters in the light table. Raises MiNtfError if derivatives by the parameter are not supported.
+    """
     parameters = mi.traverse(scene)
     attached = [key for key, value in parameters if dr.grad_enabled(value)]
     for key in attached:
-        if not _supported(parameters, key, light):
+        if not _supported(parameters, key, discrete):
             raise MiNtfError(
                 f"gradients by {key}: not supported; detach it. Supported are what lights emit (intensity, irradiance, "
                 "radiance, texture of a spot, data and scale of an envmap), the reflectance of diffuse BSDFs and, of "
@@ -42,13 +55,13 @@ def check(scene, light) -> bool:
     return bool(attached)
 
 
-def _supported(parameters, key: str, light) -> bool:
+def _supported(parameters: mi.SceneParameters, key: str, discrete: Sequence[DiscreteEmitter]) -> bool:
     node, words = parameters.properties[key][2], 1
     while node is not None:
         of_owner, kind = ".".join(key.split(".")[-words:]), node.class_name()
         if of_owner.startswith(POWERS.get(kind, ())):
             return True
         if of_owner in PLACES.get(kind, ()):
-            return any(node is d.emitter for d in light.discrete)
+            return any(node is d.emitter for d in discrete)
         node, words = parameters.hierarchy[node][0], words + 1
     return False

@@ -92,7 +92,7 @@ def _load(path: str, _identity: tuple[int, int, int] | None, resolution: int | N
                 return LoadedField(header, network, GridField(stored, network, dj), Softness(stored, dj), digest)
             except (KeyError, ValueError):
                 log.info(f"nrf medium: the voxels in {path} are damaged")
-        arrays = user_cache.kept("fields", user_cache.key(digest, n), lambda: _baked(path, network, n, dj))
+        arrays = user_cache.cached("fields", user_cache.key(digest, n), lambda: _baked(path, network, n, dj))
         return LoadedField(header, network, GridField(arrays, network, dj), Softness(arrays, dj), digest)
 
 

@@ -1,15 +1,44 @@
-"""The ``nrf`` media of a scene, the shapes that bound them, and all others."""
+"""The ``nrf`` media of a scene, the shapes that bound them, and the scene's ordinary shapes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol, cast
 
 import mitsuba as mi
 import numpy as np
 
 from ...core.errors import MiNtfError
+from ...infer.grid import Density
+from ...infer.shade import Reflectance
+from ...infer.types import Vector
+from .frame import Frame
+from .loaded import LoadedField
 
 
-def find_media(scene) -> list:
-    """The scene's ``nrf`` media. Raises MiNtfError where there is none, or a bounding shape is wrong or in a group."""
-    media: list = []
-    bounds: list[list] = []
+class NRFMedium(Protocol):
+    """Attributes of the ``nrf`` medium plugin, whose class exists once a variant is set.
+
+    `source`: density, of the baked voxels or of the networks, as `representation` says; `path`: the field file.
+    """
+
+    field: LoadedField
+    frame: Frame
+    source: Density
+    representation: str
+    path: str
+
+    def reflectance(self, x: Vector) -> Reflectance:
+        """Return the reflectance at field points."""
+
+
+def find_media(scene: mi.Scene) -> list[NRFMedium]:
+    """Return the scene's ``nrf`` media.
+
+    Raises MiNtfError if there is none, or if a bounding shape is wrong or belongs to a shape group.
+    """
+    media: list[NRFMedium] = []
+    bounds: list[list[mi.Shape]] = []
     for shape in scene.shapes():
         medium = _nrf_medium(shape)
         if medium is None:
@@ -21,7 +50,7 @@ def find_media(scene) -> list:
     for shape in _grouped(scene):
         if _nrf_medium(shape) is not None:
             raise MiNtfError(
-                f"nrf integrator: {_called(shape)} bounds an nrf medium inside a shapegroup, but fields cannot be "
+                f"nrf integrator: {_label(shape)} bounds an nrf medium inside a shapegroup, but fields cannot be "
                 "instanced; take the shape out of the group, and give each other place a shape and a medium of its own"
             )
     if not media:
@@ -35,57 +64,60 @@ def find_media(scene) -> list:
     return media
 
 
-def ordinary_shapes(scene) -> list:
-    """Return the shapes that rays can meet: all but the bounds of ``nrf`` media and those of a ``null`` BSDF that do
-    not shine. Raises MiNtfError where one holds another medium."""
+def ordinary_shapes(scene: mi.Scene) -> list[mi.Shape]:
+    """Return the shapes that rays can meet.
+
+    Bounds of ``nrf`` media and shapes with a ``null`` BSDF that emit nothing are left out. Raises MiNtfError if a shape
+    bounds another medium.
+    """
     shapes = [s for s in scene.shapes() if _nrf_medium(s) is None and not _is_absent(s)]
     for shape in shapes + _grouped(scene):
         if shape.is_medium_transition():
             raise MiNtfError(
-                f"nrf integrator: {_called(shape)} bounds a medium that is no nrf medium, which this integrator does "
+                f"nrf integrator: {_label(shape)} bounds a medium that is no nrf medium, which this integrator does "
                 "not see; remove the medium, or render the scene with volpath"
             )
     return shapes
 
 
-def shape_groups(scene) -> list:
-    """Return the ``shapegroup`` objects of `scene`, which its list of shapes leaves out."""
+def shape_groups(scene: mi.Scene) -> list[mi.Shape]:
+    """Return the ``shapegroup`` objects of `scene`, which its list of shapes does not contain."""
     return [node for node in mi.traverse(scene).hierarchy if node.class_name() == "ShapeGroupPlugin"]
 
 
-def lets_light_through(scene) -> bool:
-    """Return True if light may cross an ordinary shape of `scene` at the null component of its BSDF."""
+def lets_light_through(scene: mi.Scene) -> bool:
+    """Return True if an ordinary shape of `scene` has a BSDF with a null component, which light can cross."""
     return any(isinstance(node, mi.BSDF) and mi.has_flag(node.flags(), mi.BSDFFlags.Null)
                for shape in shape_groups(scene) + ordinary_shapes(scene) for node in mi.traverse(shape).hierarchy)
 
 
-def _is_absent(shape) -> bool:
+def _is_absent(shape: mi.Shape) -> bool:
     """Return True if a shape neither scatters light nor emits it."""
     simple = shape.class_name() != "Instance" and not shape.is_medium_transition() and not shape.is_emitter()
-    return simple and shape.bsdf().class_name() == "Null"
+    return simple and str(shape.bsdf().class_name()) == "Null"
 
 
-def _grouped(scene) -> list:
+def _grouped(scene: mi.Scene) -> list[mi.Shape]:
     """Return the shapes inside the shape groups of `scene`."""
     return [node for group in shape_groups(scene) for node in mi.traverse(group).hierarchy if isinstance(node, mi.Shape)
             and node is not group]
 
 
-def _nrf_medium(shape):
+def _nrf_medium(shape: mi.Shape) -> NRFMedium | None:
     medium = shape.interior_medium() if shape.is_medium_transition() else None
-    return medium if getattr(medium, "is_nrf", False) else None
+    return cast(NRFMedium, medium) if getattr(medium, "is_nrf", False) else None
 
 
-def _check_bounds(medium, shapes) -> None:
-    """The medium knows its own place; its one bounding shape must enclose the object there."""
+def _check_bounds(medium: NRFMedium, shapes: Sequence[mi.Shape]) -> None:
+    """Raise MiNtfError unless exactly one shape bounds `medium` and encloses its object."""
     corners = np.stack(np.meshgrid(*zip(*medium.field.grid.bounds, strict=True), indexing="ij"), -1).reshape(-1, 3)
     world = np.array(medium.frame.point_to_world(corners.T.astype(np.float32)), dtype=np.float64).T
-    # Matter lies in the unit sphere too, out of which the corners of a box may stick.
+    # All matter is in the unit sphere, from which the corners of the box may protrude.
     origin, radius = medium.frame.origin, medium.frame.length
     low, high = np.maximum(world.min(0), origin - radius), np.minimum(world.max(0), origin + radius)
     if len(shapes) > 1:
         raise MiNtfError(
-            f"{len(shapes)} bounding shapes ({', '.join(map(_called, shapes))}) share one nrf medium ({medium.path}), "
+            f"{len(shapes)} bounding shapes ({', '.join(map(_label, shapes))}) share one nrf medium ({medium.path}), "
             f"which is at one place, {_text(origin)}, by <ref> or since Mitsuba merges media of the same text; give "
             "each shape a medium of its own with its own to_world, or take the other shapes out"
         )
@@ -94,27 +126,27 @@ def _check_bounds(medium, shapes) -> None:
     box = shape.bbox()
     if not ((np.array(box.min).ravel() <= low + slack).all() and (np.array(box.max).ravel() >= high - slack).all()):
         raise MiNtfError(
-            f"bounding {_called(shape)} spans {_text(box.min)} to {_text(box.max)}, but the nrf medium inside it "
+            f"bounding {_label(shape)} spans {_text(box.min)} to {_text(box.max)}, but the nrf medium inside it "
             f"({medium.path}) has its object from {_text(low)} to {_text(high)}; give shape and medium the same "
             f"placement (a sphere of centre {_text(origin)} and radius {radius:.4g} fits)"
         )
 
 
-def _called(shape) -> str:
-    """A shape as its user knows it: by its id, else by kind and place."""
+def _label(shape: mi.Shape) -> str:
+    """Return the name of a shape in messages: its id, or its class and centre."""
     return f'shape "{shape.id()}"' if shape.id() else f"{shape.class_name()} at {_text(shape.bbox().center())}"
 
 
-def _check_bsdf(shape) -> None:
-    """A bound is no surface: rays enter the medium as if it were not there."""
+def _check_bsdf(shape: mi.Shape) -> None:
+    """Raise MiNtfError unless rays cross a bounding shape as if it were absent."""
     flags, names = shape.bsdf().flags(), ("Diffuse", "Glossy", "DeltaReflection", "DeltaTransmission")
     if any(mi.has_flag(flags, getattr(mi.BSDFFlags, name)) for name in names):
         raise MiNtfError(
-            f"bounding {_called(shape)} has a {shape.bsdf().class_name()} BSDF, but a shape that bounds an nrf "
+            f"bounding {_label(shape)} has a {shape.bsdf().class_name()} BSDF, but a shape that bounds an nrf "
             'medium is no surface; give it <bsdf type="null"/> (the default is diffuse), and add a surface such as '
             "glass as a shape of its own around it"
         )
 
 
-def _text(v) -> str:
+def _text(v: object) -> str:
     return "(" + ", ".join(f"{float(c):.4g}" for c in np.array(v).ravel()) + ")"

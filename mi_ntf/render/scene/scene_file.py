@@ -1,12 +1,14 @@
-"""Scene files: what `mi.load_file` makes of them, with another environment where wanted, and which files they read."""
+"""Scene files: loading them with another environment, and the files that they read."""
+
+from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, cast
 
 import mitsuba as mi
 
 from ...core.errors import MiNtfError
+from .. import log
 from . import changed, environment_option
 from .environment_option import Environment
 
@@ -15,44 +17,52 @@ FILES = ("filename", "map_file")
 
 
 def load(path: Path, parameters: dict[str, str], environment: Environment | None = None,
-         seen: Callable[[Path], None] | None = None) -> Any:
-    """The scene of the XML file `path` in the current variant, `parameters` for its $names.
+         on_file: Callable[[Path], None] | None = None) -> mi.Scene:
+    """Return the scene of an XML file in the current variant.
 
-    `environment` is laid over the scene's own (:class:`Environment`). `seen` is called with each file that the scene
-    reads as soon as it is known, in most cases before it is read: the XML file, its includes, fields, images, meshes.
+    Parameters
+    ----------
+    path
+        The XML file.
+    parameters
+        Values of its $names.
+    environment
+        Changes of the scene's environment.
+    on_file
+        Function called with each file that the scene reads, in most cases before it is read: the XML file, its
+        includes, fields, images, meshes.
 
-    Raises MiNtfError where the file is missing or the environment does not fit, and RuntimeError as Mitsuba does.
+    Raises
+    ------
+    MiNtfError
+        If the file is missing or the environment does not fit.
+    RuntimeError
+        If Mitsuba cannot load the scene.
     """
-    path = Path(path)
-    seen = seen or (lambda _: None)
-    seen(path.resolve())
+    path, on_file = Path(path), on_file or (lambda _: None)
+    on_file(path.resolve())
     if not path.is_file():
         raise MiNtfError(f"scene {path} does not exist")
     with changed.beside(path):
         state = changed.parsed(path, parameters)
         for name in state.files:
-            seen(Path(str(name)).resolve())
+            on_file(Path(str(name)).resolve())
         environment_option.apply(environment or Environment(), state, path)
         for file in _named(state):
-            seen(file)
+            on_file(file)
         return changed.instantiated(path, state)
 
 
-def render_to_film(scene: Any, sensor: Any) -> None:
-    """Render `scene` with its integrator; the film of `sensor` holds the picture.
+def render_to_film(scene: mi.Scene, sensor: mi.Sensor) -> None:
+    """Render `scene` with its integrator into the film of `sensor`.
 
-    Mitsuba's integrators that are written in Python (``prb`` and others) refuse not to develop, although the film has
-    all samples by then.
+    Mitsuba's integrators that are written in Python, such as ``prb``, only render if they may develop the film, too.
     """
     integrator = scene.integrator()
     integrator.render(scene, sensor, develop=type(integrator).__module__.startswith("mitsuba.python."))
 
 
-def _named(state) -> set[Path]:
-    """Files that the plugins of a parsed scene read."""
-    found, resolver = set(), cast(Any, mi).file_resolver()
-    for node in state.nodes:
-        for name in FILES:
-            if name in node.props and node.props.type(name).name == "String":
-                found.add(Path(str(resolver.resolve(node.props[name]))).resolve())
-    return found
+def _named(state: changed.ParsedScene) -> set[Path]:
+    """Return the files that the plugins of a parsed scene name."""
+    return {Path(log.resolve(node.props[name])).resolve() for node in state.nodes for name in FILES
+            if name in node.props and node.props.type(name).name == "String"}

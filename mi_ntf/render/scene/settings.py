@@ -1,17 +1,16 @@
-"""Properties of an ``nrf`` integrator, apart from the plugin, so that others can be tried in their place."""
+"""Settings and limits of a render, apart from the ``nrf`` plugin, so that other values can be tried."""
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class Settings:
-    """Properties of the plugin's table, and what is left out of what the scene calls for.
+    """Properties of the ``nrf`` integrator, and omissions that make a render faster.
 
-    specular   specular lobes take part
-    brightest  number of the table's lights that shine, the brightest ones; 0: all
-    without    numbers of the media that take no part
-    share      (part, parts): the discrete lights of one part, and in part 0 all else; parts add up to the picture
-    only       numbers of the emitters that shine; None: all (of a scene without surfaces)
+    specular          False leaves out the specular lobes
+    brightest_lights  number of the light table's lights that shine, brightest first; 0: all
+    without_media     numbers of the media that take no part
+    only_emitters     numbers of the emitters that shine, for scenes without surfaces; None: all
     """
 
     visibility: str
@@ -29,28 +28,18 @@ class Settings:
     hide_emitters: bool
     unbiased: bool = False
     specular: bool = True
-    brightest: int = 0
-    without: tuple[int, ...] = ()
-    share: tuple[int, int] = (0, 1)
-    only: tuple[int, ...] | None = None
-
-    @classmethod
-    def of(cls, integrator) -> "Settings":
-        """Return the settings of an integrator, or of other settings."""
-        return cls(**{f.name: getattr(integrator, f.name) for f in fields(cls) if hasattr(integrator, f.name)})
-
-    def but(self, **changed) -> "Settings":
-        """Return these settings with some of them changed."""
-        return replace(self, **changed)
+    brightest_lights: int = 0
+    without_media: tuple[int, ...] = ()
+    only_emitters: tuple[int, ...] | None = None
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of a render, which ends when the first of them is reached; 0: no limit of the kind.
+    """Limits of a render, which ends when the first of them is reached; 0 sets no limit.
 
     noise    Monte Carlo noise (:func:`mi_ntf.render.transport.passes.noise`)
-    error    bias against ``raymarch``, relative RMSE of the picture
-    seconds  from the call of ``render`` on, everything included
+    error    relative RMSE of the picture against ``raymarch``
+    seconds  time since the call of ``render``, everything included
     """
 
     noise: float = 0.0
@@ -59,5 +48,8 @@ class Limits:
 
     @property
     def of_samples(self) -> bool:
-        """True if the number of samples is found while rendering."""
+        """True if the number of samples is decided while rendering."""
         return self.noise > 0 or self.seconds > 0
+
+
+NO_LIMITS = Limits()

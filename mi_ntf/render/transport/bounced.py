@@ -1,7 +1,10 @@
-"""Further bounces of light within fields, without noise: radiosity between patches of their skins."""
+"""Multiple scattering between fields without noise: radiosity between patches of their skins."""
+
+from __future__ import annotations
 
 import time
-from typing import Any
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -11,179 +14,222 @@ from ...core import microfacet, radiosity
 from ...infer import march, shade
 from ...infer.backend import floats, words
 from ...infer.bundle import Strand
+from ...infer.grid import Density
 from ...infer.irradiance import Irradiance
+from ...infer.types import Float, Mask, Ray, UInt32, Vector, Vector3
 from .. import log, user_cache
+from ..scene.media import NRFMedium
+from ..scene.settings import Settings
+from .shadow import Part
 
 SEED = 7
-DRAWS = 16
-"""Lights of a patch, where lights are drawn: at least. They are the same for all samples of a pixel, however many."""
+LIGHT_SAMPLES = 16
+"""Least number of sampled lights of a patch. They are the same for all samples of a pixel."""
+
+
+class FieldScene(Protocol):
+    """Fields and lights of a scene (:class:`mi_ntf.render.transport.composition.Composition`)."""
+
+    @property
+    def parts(self) -> Sequence[Part]:
+        """Fields with their lights."""
+
+    @property
+    def settings(self) -> Settings:
+        """Settings of the render."""
+
+    def free_flight(self, ray: Ray, maxt: Float, offset: Float, depths: Sequence[Float],
+                    steps: int) -> tuple[Mask, Float, UInt32]:
+        """Return ``(hit, t, part)`` of rays that end at given optical depths."""
+
+    def reflect(self, part: Part, points: shade.Points, stream: UInt32, view: Float | None = None, *,
+                surface: bool = False, light_samples: int = 0) -> list[Float]:
+        """Return the radiance that points reflect from all lights."""
+
+
+class _Hits(NamedTuple):
+    """Points of a skin that rays hit, (k, 3), the rays' directions, (k, 3), and the rays' indices, (k,)."""
+
+    x: np.ndarray
+    d: np.ndarray
+    ray: np.ndarray
 
 
 class Patches:
-    """The skins of all fields of a scene and what their patches see of each other, whatever the lights.
+    """Patches of the skins of all fields of a scene, and the visibility between them. Lights play no part.
 
-    `composition`: a :class:`mi_ntf.render.transport.composition.Composition`. `first`: number of each skin's first
-    patch; `hits` (patches, rays): the patch that each ray meets, −1 for none. They are found in the user's cache.
+    first   number of each skin's first patch
+    hits    (patches, rays): the patch that each ray from a patch hits, −1 for none
+    albedo  (patches, 3)
+
+    The patches are stored in the user's cache.
     """
 
-    def __init__(self, composition):
-        self._key = _key(composition)
-        self.skins = [Skin(part.medium) for part in composition.parts]
-        found = user_cache.kept("patches", user_cache.key(*self._key), lambda: self._found(composition),
-                                placed=len(self.skins) > 1)
+    def __init__(self, scene: FieldScene) -> None:
+        self._key = _key(scene)
+        self.skins = [Skin(part.medium) for part in scene.parts]
+        arrays = user_cache.cached("patches", user_cache.key(*self._key), lambda: self._arrays(scene),
+                                 placed=len(self.skins) > 1)
         for number, skin in enumerate(self.skins):
             for name in Skin.ARRAYS:
-                setattr(skin, name, found[f"{number}.{name}"])
-        self.first, self.hits = found["first"], found["hits"]
+                setattr(skin, name, arrays[f"{number}.{name}"])
+        self.first, self.hits = arrays["first"], arrays["hits"]
         self.albedo = np.concatenate([s.albedo for s in self.skins])
         log.info(f"nrf integrator: light bounces between {len(self.albedo)} patches of skins, which count as diffuse: "
                  "fast and biased; bounces=paths is not")
 
-    def _found(self, composition) -> dict[str, np.ndarray]:
-        """Return the arrays of all skins, found by random rays, and `first` and `hits`."""
+    def _arrays(self, scene: FieldScene) -> dict[str, np.ndarray]:
+        """Return the arrays of all skins, `first` and `hits`, computed by random rays."""
         begin = time.perf_counter()
         rng = np.random.default_rng(SEED)
-        self.skins[:] = [skin_of(part.medium, rng) for part in composition.parts]
-        for skin, (x, d, _) in zip(self.skins, self._trace(composition, radiosity.FEW, rng), strict=True):
-            skin.add(x, d)
+        self.skins[:] = [skin_of(part.medium, rng) for part in scene.parts]
+        for skin, hits_of_skin in zip(self.skins, self._trace(scene, radiosity.FEW, rng), strict=True):
+            skin.add(hits_of_skin.x, hits_of_skin.d)
         first = np.cumsum([0, *(len(s.position) for s in self.skins)])
         hits = np.full(first[-1] * radiosity.SIDE**2, -1, np.int32)
-        met_of_skins = self._trace(composition, radiosity.SIDE, rng)
-        for skin, start, met in zip(self.skins, first, met_of_skins, strict=False):
-            x, d, ray = met
+        for skin, start, (x, d, ray) in zip(self.skins, first, self._trace(scene, radiosity.SIDE, rng), strict=False):
             normal, _ = skin.reflectance(x)
             patch = skin.table[radiosity.place(x, normal)]
-            # Nothing comes from matter that is seen from behind.
+            # Matter that is seen from behind sends no light.
             hits[ray] = np.where(((normal * d).sum(1) < 0) & (patch >= 0), patch + start, -1)
         arrays = {f"{i}.{name}": getattr(s, name) for i, s in enumerate(self.skins) for name in Skin.ARRAYS}
         log.info(f"nrf integrator: found the patches that light bounces between ({time.perf_counter() - begin:.2g} s)")
         return arrays | {"first": first, "hits": hits.reshape(-1, radiosity.SIDE**2)}
 
-    def of(self, composition) -> bool:
-        """Return True if these are the patches of `composition`, too: of the same fields in the same places."""
-        return self._key == _key(composition)
+    def fit(self, scene: FieldScene) -> bool:
+        """Return True if `scene` has the same fields in the same places."""
+        return self._key == _key(scene)
 
-    def _trace(self, composition, side: int, rng) -> list:
-        """`side`² rays from each patch: for each skin the points (k, 3) where it is met, the rays' directions (k, 3),
-        both in its own coordinates, and their indices (k,)."""
-        origins, ways = [], []
+    def _trace(self, scene: FieldScene, side: int, rng: np.random.Generator) -> list[_Hits]:
+        """Trace `side`² rays from each patch; return their hits on each skin, in its own coordinates."""
+        origins, directions = [], []
         for skin in self.skins:
-            begin, way = radiosity.rays(skin.position, skin.normal, side, rng)
-            origins.append(np.array(skin.frame.point_to_world(_vector(begin))))
-            ways.append(np.array(skin.frame.direction_to_world(_vector(way))))
-        o, d = (_vector(np.concatenate(v, 1).T) for v in (origins, ways))
-        n, nothing = dr.width(o), (np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, int))
+            origin, direction = radiosity.rays(skin.position, skin.normal, side, rng)
+            origins.append(np.array(skin.frame.point_to_world(_vector(origin))))
+            directions.append(np.array(skin.frame.direction_to_world(_vector(direction))))
+        o, d = (_vector(np.concatenate(v, 1).T) for v in (origins, directions))
+        n, nothing = dr.width(o), _Hits(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, int))
         if not n:
             return [nothing] * len(self.skins)
-        steps = min(radiosity.STEPS, composition.settings.samples)
-        hit, t, which = composition.fly(mi.Ray3f(mi.Point3f(o), d), dr.full(mi.Float, dr.inf, n),
-                                        floats(rng.random(n), mi), [mi.Float(radiosity.DEPTH)] * len(self.skins), steps)
-        dr.eval(hit, t, which)
-        hit, which = hit.numpy(), which.numpy()
+        steps = min(radiosity.STEPS, scene.settings.samples)
+        hit, t, part = scene.free_flight(mi.Ray3f(mi.Point3f(o), d), dr.full(mi.Float, dr.inf, n),
+                                         floats(rng.random(n), mi), [mi.Float(radiosity.DEPTH)] * len(self.skins),
+                                         steps)
+        dr.eval(hit, t, part)
+        parts = np.where(hit.numpy(), part.numpy(), -1)
         result = []
         for i, skin in enumerate(self.skins):
-            index = np.flatnonzero(hit & (which == i))
+            index = np.flatnonzero(parts == i)
             if not len(index):
                 result.append(nothing)
                 continue
             k = words(index, mi)
-            along: Any = dr.gather(mi.Vector3f, d, k)
+            along: Vector3 = dr.gather(mi.Vector3f, d, k)
             x = dr.gather(mi.Vector3f, o, k) + dr.gather(mi.Float, t, k) * along
-            place, way = skin.frame.point_to_field(mi.Point3f(x)), skin.frame.direction_to_field(along)
-            dr.eval(place, way)
-            result.append((_rows(place), _rows(way), index))
+            x, along = skin.frame.point_to_field(mi.Point3f(x)), skin.frame.direction_to_field(along)
+            dr.eval(x, along)
+            result.append(_Hits(_rows(x), _rows(along), index))
         return result
 
 
-def _key(composition) -> tuple:
-    """Return what patches depend on: those of a single field do not on its place."""
-    media = [part.medium for part in composition.parts]
+def _key(scene: FieldScene) -> tuple[object, ...]:
+    """Return all inputs of patches. The patches of a single field do not depend on its placement."""
+    media = [part.medium for part in scene.parts]
     fields = [(m.field.digest, m.representation, m.field.grid.resolution, len(media) > 1 and m.frame.placement())
               for m in media]
-    return mi.variant(), min(radiosity.STEPS, composition.settings.samples), tuple(fields)
+    return mi.variant(), min(radiosity.STEPS, scene.settings.samples), tuple(fields)
 
 
 class Bounced:
-    """Light that fields of `composition` scatter more than once, between their `patches`: skins taken for diffuse
-    surfaces that reflect as much as both lobes. `max_depth`: longest path in edges, −1 for any."""
+    """Light that the fields of `scene` scatter more than once, between their `patches`.
 
-    def __init__(self, composition, patches: Patches, max_depth: int):
-        self._media = [part.medium for part in composition.parts]
-        pairs = zip(composition.parts, patches.skins, strict=True)
-        direct = np.concatenate([_direct(composition, part, skin) for part, skin in pairs])
+    Skins count as diffuse surfaces that reflect as much as both lobes. `max_depth`: longest path in edges, −1 for any.
+    """
+
+    def __init__(self, scene: FieldScene, patches: Patches, max_depth: int) -> None:
+        self._media = [part.medium for part in scene.parts]
+        pairs = zip(scene.parts, patches.skins, strict=True)
+        direct = np.concatenate([_direct(scene, part, skin) for part, skin in pairs])
         light = radiosity.solve(patches.hits, patches.albedo, direct, max(max_depth - 2, -1))
         ends = zip(patches.first, patches.first[1:], strict=False)
         self._irradiance = [Irradiance(s.table, light[a:b], mi) for s, (a, b) in zip(patches.skins, ends, strict=True)]
 
-    def reflect(self, part, points) -> list:
-        """Radiance that `points` of `part` send on of it."""
+    def reflect(self, part: Part, points: shade.Points) -> list[Float]:
+        """Return the radiance of multiple scattering that points of `part` reflect."""
         index = next(i for i, m in enumerate(self._media) if m is part.medium)
         light = self._irradiance[index](points.x, points.normal)
         albedo = points.reflectance.diffuse_albedo()
         return [k * e * microfacet.INV_PI for k, e in zip(albedo, light, strict=True)]
 
 
-def _direct(composition, part, skin: "Skin") -> np.ndarray:
-    """(patches, 3): irradiance of the `skin` of `part` by the lights alone."""
+def _direct(scene: FieldScene, part: Part, skin: Skin) -> np.ndarray:
+    """Return the irradiance (patches, 3) of the `skin` of `part` by the lights alone."""
     n = len(skin.position)
     if not n:
         return np.zeros((0, 3))
     one, zero = dr.ones(mi.Float, n), dr.zeros(mi.Float, n)
     x, normal = radiosity.above(skin.position, skin.normal), tuple(_vector(skin.normal))
     white = shade.Points(tuple(_vector(x)), normal, shade.Reflectance(normal, (one, one, one), one, zero, zero))
-    light = composition.reflect(part, white, dr.opaque(mi.UInt32, SEED), surface=True, draws=DRAWS)
+    light = scene.reflect(part, white, dr.opaque(mi.UInt32, SEED), surface=True, light_samples=LIGHT_SAMPLES)
     return _rows(light) * np.pi
 
 
 class Skin:
-    """The patches of one `medium`: `position`, `normal`, `albedo` (n, 3); `table`; none before :meth:`add`."""
+    """Patches of one `medium`, none before :meth:`add`.
+
+    position, normal, albedo  (n, 3)
+    table                     cells → patches (:func:`mi_ntf.core.radiosity.table`)
+    """
 
     ARRAYS = "position", "normal", "albedo", "table"
+    normal: np.ndarray
+    albedo: np.ndarray
+    table: np.ndarray
 
-    def __init__(self, medium):
+    def __init__(self, medium: NRFMedium) -> None:
         self.frame, self._reflectance = medium.frame, medium.reflectance
         self.position = np.zeros((0, 3))
 
     def add(self, x: np.ndarray, d: np.ndarray) -> None:
-        """Points that rays along `d` meet become patches where there are none."""
+        """Add patches at the points `x` (n, 3) where there are none yet; `d`: directions of rays that hit them."""
         normal, _ = self.reflectance(x)
         x = np.concatenate([self.position, x[(normal * d).sum(1) < 0]])
         normal, albedo = self.reflectance(x)
-        kept = radiosity.thin(x, normal)
-        self.position, self.normal, self.albedo = x[kept], normal[kept], albedo[kept]
+        index = radiosity.thin(x, normal)
+        self.position, self.normal, self.albedo = x[index], normal[index], albedo[index]
         self.table = radiosity.table(self.position, self.normal)
 
     def reflectance(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Normals and diffuse albedos (n, 3) at field points."""
+        """Return normals and diffuse albedos (n, 3) at field points."""
         if not len(x):
             return np.zeros((0, 3)), np.zeros((0, 3))
-        found = self._reflectance(tuple(_vector(x)))
-        albedo = found.diffuse_albedo()
-        dr.eval(found.normal, albedo)
-        return _rows(found.normal), _rows(albedo)
+        reflectance = self._reflectance(tuple(_vector(x)))
+        albedo = reflectance.diffuse_albedo()
+        dr.eval(reflectance.normal, albedo)
+        return _rows(reflectance.normal), _rows(albedo)
 
 
-def skin_of(medium, rng) -> Skin:
-    """Return the patches that random lines through the sphere of `medium` meet."""
+def skin_of(medium: NRFMedium, rng: np.random.Generator) -> Skin:
+    """Return the patches that random lines through the sphere of `medium` hit."""
     skin = Skin(medium)
     skin.add(*_chords(medium, rng))
     return skin
 
 
-def _chords(medium, rng) -> tuple[np.ndarray, np.ndarray]:
-    """Points where random lines through the sphere of `medium` meet its skin first, and the lines' directions."""
+def _chords(medium: NRFMedium, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return first hits of random lines through the sphere of `medium` on its skin, and the lines' directions."""
     o = rng.normal(size=(radiosity.CHORDS, 3))
     o /= np.linalg.norm(o, axis=1, keepdims=True)
     d = -radiosity.directions(o, 1, rng)[:, 0]
-    met, x = meet(medium.source, o - 0.1 * d, d, rng)
-    return x[met], d[met]
+    hit, x = first_hits(medium.source, o - 0.1 * d, d, rng)
+    return x[hit], d[hit]
 
 
-def meet(volume, o: np.ndarray, d: np.ndarray, rng) -> tuple[np.ndarray, np.ndarray]:
-    """Return for rays (n, 3), field coordinates, if they meet the skin of a :class:`mi_ntf.infer.grid.Volume`, and
-    where first."""
+def first_hits(density: Density, o: np.ndarray, d: np.ndarray, rng: np.random.Generator
+               ) -> tuple[np.ndarray, np.ndarray]:
+    """Return a mask of the rays (n, 3), field coordinates, that hit the skin of `density`, and their first hits."""
     n, start, along = len(o), _vector(o), _vector(d)
-    strand = Strand(volume, tuple(start), tuple(along), dr.opaque(mi.Float, 2 / radiosity.STEPS))
+    strand = Strand(density, tuple(start), tuple(along), dr.opaque(mi.Float, 2 / radiosity.STEPS))
     hit, t, _ = march.free_flight([strand], dr.full(mi.Float, dr.inf, n), floats(rng.random(n), mi),
                                   [mi.Float(radiosity.DEPTH)])
     x = start + dr.select(hit, t, 0) * along
@@ -191,11 +237,11 @@ def meet(volume, o: np.ndarray, d: np.ndarray, rng) -> tuple[np.ndarray, np.ndar
     return hit.numpy(), _rows(x)
 
 
-def _vector(rows: np.ndarray):
-    # By components: the length of an array of two dimensions would be part of kernels.
+def _vector(rows: np.ndarray) -> Vector3:
+    # Built from components, since the shape of a two-dimensional array would be part of kernels.
     return mi.Vector3f(*(floats(column, mi) for column in rows.reshape(-1, 3).T))
 
 
-def _rows(v) -> np.ndarray:
-    dr.eval(v)  # together, or each would be computed by itself
+def _rows(v: Vector | Vector3) -> np.ndarray:
+    dr.eval(v)  # together, in one kernel
     return np.stack([c.numpy() for c in v], 1).astype(np.float64)

@@ -1,10 +1,13 @@
-"""Ways to render a picture for less, in the order in which a pilot tries them.
+"""Candidates of a pilot: ways to render a picture in less time, in the order in which they are tried.
 
 The pilot tries other visibility methods in place of the march. With the method that it takes, it then leaves out
-effects that the picture hardly shows, one after the other, and each as often as the error allows.
+effects that hardly change the picture, one after the other, each as often as the error allows.
 """
 
-from collections.abc import Callable, Iterator
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,54 +18,41 @@ from ..scene.settings import Settings
 from .composition import Composition
 
 
-def methods(march: Composition) -> Iterator[tuple[Settings, int]]:
-    """Yield ``(settings, rays)`` of what may take the place of the `march`.
+def methods(march: Composition) -> list[tuple[Settings, int]]:
+    """Return the settings of methods that may replace the `march`, and the number of rays that fill their tables.
 
-    `rays` fill what the method holds. Maps that do not fit into `map_memory` at once are left out, since every pass
-    would build them anew, and so are maps of no light.
+    Maps that do not fit into `map_memory` at once are left out, since every pass would build them anew.
     """
-    ways = [march.settings.but(visibility=method.name, map_components=logistics) for method in REGISTRY.values()
-            if method.automatic and method.name != "raymarch"
-            for logistics in ((1, 2) if "map_components" in method.dials else (march.settings.map_components,))]
-    for settings in sorted(ways, key=lambda s: _rays(march, s)):
-        if per_field(settings) or _fits(march, settings):
-            yield settings, _rays(march, settings)
+    media, table, candidates = march.media, march.lights.table(march.media[0].frame), []
+    for method in (m for m in REGISTRY.values() if m.automatic and m.name != "raymarch"):
+        for components in (1, 2) if "map_components" in method.dials else (march.settings.map_components,):
+            settings = replace(march.settings, visibility=method.name, map_components=components)
+            options = building.options(settings)
+            size = table.count * sum(building.size_per_light(method.name, m, table, options) for m in media)
+            rays = len(media) * method.rays(table.count, settings.map_resolution)
+            if method.per_field or 0 < size <= options.map_memory * 2**20:
+                candidates.append((settings, rays if method.per_field else rays * components))
+    return sorted(candidates, key=lambda candidate: candidate[1])
 
 
-def name(settings: Settings, whole: Settings) -> str:
-    """Return in words a method, its dials, and what it leaves out of the picture that `whole` asks for."""
-    drawn = bool(REGISTRY[settings.visibility].drawn)
-    less = {
-        f" of {settings.map_resolution}²": drawn,
-        ", two logistics": drawn and settings.map_components == 2,
-        ", without further bounces": settings.max_depth != whole.max_depth,
-        f", without {len(settings.without)} of the fields": bool(settings.without),
+def name(settings: Settings, original: Settings) -> str:
+    """Return the method in words, with its parameters and what it leaves out of the picture by `original` settings."""
+    per_light = bool(REGISTRY[settings.visibility].sampled)
+    details = {
+        f" of {settings.map_resolution}²": per_light,
+        ", two logistics": per_light and settings.map_components == 2,
+        ", without further bounces": settings.max_depth != original.max_depth,
+        f", without {len(settings.without_media)} of the fields": bool(settings.without_media),
         f", {settings.environment_lights} lights of the environment":
-            settings.environment_lights < whole.environment_lights,
-        f", {settings.brightest} brightest lights": bool(settings.brightest),
-        ", without specular lobes": whole.specular and not settings.specular,
+            settings.environment_lights < original.environment_lights,
+        f", {settings.brightest_lights} brightest lights": bool(settings.brightest_lights),
+        ", without specular lobes": original.specular and not settings.specular,
     }
-    return settings.visibility + "".join(words for words, there in less.items() if there)
-
-
-def per_field(settings: Settings) -> bool:
-    """Return True if what the method holds serves all lights of a field."""
-    return REGISTRY[settings.visibility].per_field
-
-
-def _rays(march: Composition, settings: Settings) -> int:
-    rays = REGISTRY[settings.visibility].rays(len(march.lights.rows.power), settings.map_resolution)
-    return len(march.media) * rays * (1 if per_field(settings) else settings.map_components)
-
-
-def _fits(march: Composition, settings: Settings) -> bool:
-    table, options = march.lights.table(march.media[0].frame), building.options(settings)
-    size = table.count * sum(building.size_per_light(settings.visibility, m, table, options) for m in march.media)
-    return 0 < size <= options.map_memory * 2**20
+    return settings.visibility + "".join(text for text, applies in details.items() if applies)
 
 
 def _no_bounces(now: Composition) -> Settings | None:
-    return now.settings.but(max_depth=2) if now.effects.bounces else None
+    return replace(now.settings, max_depth=2) if now.effects.bounces else None
 
 
 def _no_smallest_field(now: Composition) -> Settings | None:
@@ -70,26 +60,23 @@ def _no_smallest_field(now: Composition) -> Settings | None:
     sizes = [np.inf if box is None else float(np.prod(box[1] - box[0])) for box in boxes]
     if len(sizes) < 2 or min(sizes) == np.inf:
         return None
-    numbers = [i for i in range(len(sizes) + len(now.settings.without)) if i not in now.settings.without]
-    return now.settings.but(without=(*now.settings.without, numbers[int(np.argmin(sizes))]))
+    absent = now.settings.without_media
+    numbers = [i for i in range(len(sizes) + len(absent)) if i not in absent]
+    return replace(now.settings, without_media=(*absent, numbers[int(np.argmin(sizes))]))
 
 
-def _half_of_an_environment(now: Composition) -> Settings | None:
-    most = max((light.shining for light in now.lights.discrete), default=0)
-    return now.settings.but(environment_lights=most // 2) if most > 1 else None
-
-
-def _dimmer_half(now: Composition) -> Settings | None:
-    """Environments are none of these: their lights are of about equal power, and have a way of their own."""
-    if len(now.lights.rows.power) < 2 or any(light.shining for light in now.lights.discrete):
-        return None
-    return now.settings.but(brightest=len(now.lights.rows.power) // 2)
+def _half_of_the_lights(now: Composition) -> Settings | None:
+    """Halve the lights of environments, which have about equal power; without any, leave out the dimmer half."""
+    cells, lights = max((d.shining for d in now.lights.discrete), default=0), len(now.lights.rows.power)
+    if cells:
+        return replace(now.settings, environment_lights=cells // 2) if cells > 1 else None
+    return replace(now.settings, brightest_lights=lights // 2) if lights > 1 else None
 
 
 def _no_lobes(now: Composition) -> Settings | None:
-    return now.settings.but(specular=False) if now.effects.specular else None
+    return replace(now.settings, specular=False) if now.effects.specular else None
 
 
 OMISSIONS: tuple[Callable[[Composition], Settings | None], ...] = (
-    _no_bounces, _no_smallest_field, _half_of_an_environment, _dimmer_half, _no_lobes)
-"""Functions of a composition that return settings which leave something out; None if there is nothing."""
+    _no_bounces, _no_smallest_field, _half_of_the_lights, _no_lobes)
+"""Functions of a composition that return settings which leave out one effect more; None if it is absent."""

@@ -1,190 +1,189 @@
-"""Fields, surfaces and lights of a scene, prepared for one render: what hides, shades and dims what. Camera rays go
-through them in :mod:`mi_ntf.render.transport.camera_light`."""
+"""Fields, surfaces and lights of a scene, prepared for one render.
 
-import itertools
-from dataclasses import dataclass, replace
-from typing import Any
+Camera rays go through them in :mod:`mi_ntf.render.transport.camera_light`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ...core.errors import MiNtfError
 from ...infer import march, shade
 from ...infer.bundle import Strand
+from ...infer.types import Float, Mask, Ray, UInt32, Vector3, Visibility
 from ...infer.visibility import REGISTRY
-from ...infer.visibility.marched_suns import DRAWN
 from ...infer.visibility.unbiased import Unbiased
 from .. import log, timing
 from ..lights import scene_lights
 from ..maps import building
 from ..scene import effects
-from ..scene.media import find_media, ordinary_shapes
+from ..scene.media import NRFMedium, find_media, ordinary_shapes
 from ..scene.settings import Settings
 from .bounced import Bounced, Patches
-from .shadow import Known, Shadow, between
+from .shadow import FieldVisibility, KnownTransmittance, Part, Shadow, transmittance_between
 from .surfaces import Surfaces
 
 IN_SMOKE = 4
-"""Times as many samples have rays that meet smoke: so many times fewer are in flight."""
+"""Factor by which fewer camera rays are in flight where they meet smoke, since each ray has more samples."""
+
+Run = tuple[int, int] | None
+"""Rows (first, end) of the light table whose maps are in memory at once; None: all rows."""
 
 
-@dataclass(frozen=True)
-class Part:
-    """An ``nrf`` medium prepared for a render.
+class SceneStrands(NamedTuple):
+    """Strands of scene rays, one for each part; `unit`: scene length of the unit of their parameter t."""
 
-    lights   all lights, in the medium's field coordinates; `table`: those of the present run
-    mapped   visibility of the table's lights; None: no shadows
-    drawn    visibility of lights that are drawn at random, and of any other rays
-    every    visibility of all lights
-    """
-
-    medium: Any
-    lights: Any
-    table: Any
-    mapped: Any
-    drawn: Any
-    every: Any
-
-    @property
-    def frame(self):
-        return self.medium.frame
-
-    @property
-    def source(self):
-        return self.medium.source
+    strands: list[Strand]
+    unit: float
 
 
 class Composition:
-    """The scene prepared for one render. What it lacks is not built (:mod:`mi_ntf.render.scene.effects`). `patches`:
-    of an earlier render of the same fields, None unless they are needed. `smoke`: the camera sees what has no opaque
-    skin."""
+    """The scene prepared for one render. Effects that it lacks are not built (:mod:`mi_ntf.render.scene.effects`).
 
-    def __init__(self, scene, settings: Settings, sensor, spp: int, patches: Patches | None = None):
-        self.scene, self.settings, self.sensor, self.patches = scene, settings, sensor, patches
-        self.media = media = [m for number, m in enumerate(find_media(scene)) if number not in settings.without]
+    patches  of an earlier render of the same fields, or None
+    smoke    the camera sees a field without opaque skins
+    runs     blocks of lights whose maps are in memory at once
+    run      number of the present one
+    """
+
+    def __init__(self, scene: mi.Scene, settings: Settings, sensor: mi.Sensor, spp: int,
+                 patches: Patches | None = None) -> None:
+        self.scene, self.sensor, self.patches = scene, sensor, patches
+        self.media = media = [m for i, m in enumerate(find_media(scene)) if i not in settings.without_media]
         self.lights = scene_lights.Lights(scene, media, settings.light_samples, settings.environment_lights,
-                                          settings.brightest, settings.only)
-        self.settings = settings = building.resolved(settings, len(self.lights.rows.power), media)
+                                          settings.brightest_lights, settings.only_emitters)
+        settings = building.resolved(settings, len(self.lights.rows.power), media)
         self.effects = effects.describe(scene, settings, sensor, spp, media, self.lights)
         if settings.visibility == "auto" and self.effects.needs_visibility:
             log.info(f"nrf integrator: auto takes visibility={self.effects.visibility}: {self.effects.reason}")
-        self.settings = settings = settings.but(visibility=self.effects.visibility)
-        self._media = [m for m in media if m.field.grid.majorant > 0]
-        self._seen = [m for m, visible in zip(media, self.effects.in_view, strict=True) if visible]
-        self.smoke = not all(m.field.softness.opaque for m in self._seen)
+        self.settings = settings = replace(settings, visibility=self.effects.visibility)
+        self._media_with_matter = [m for m in media if m.field.grid.majorant > 0]
+        self._media_in_view = [m for m, visible in zip(media, self.effects.in_view, strict=True) if visible]
+        self.smoke = not all(m.field.softness.opaque for m in self._media_in_view)
+        self.parts: list[Part] = []
+        self.in_view: list[Part] = []
         self.runs, self.run = self._runs(), -1  # none yet
-        self.own = self._own()
-        self.select(self.own[0] if self.own else 0)
-        self.surfaces = None
+        self.select(0)
+        self.surfaces: Surfaces | None = None
         if self.effects.surfaces:
             shapes = ordinary_shapes(scene)
             self.surfaces = Surfaces(scene, shapes, settings.hide_emitters, self.transmittance)
-        self.bounced = None
-        if self.effects.bounces == "radiosity" and self.parts and 0 in self.own:
-            with timing.building():
-                found = patches if patches and patches.of(self) else Patches(self)
-                self.bounced = self.with_all_lights(lambda: Bounced(self, found, settings.max_depth))
-                self.patches = found
+        self.bounced: Bounced | None = None
+        if self.effects.bounces == "radiosity" and self.parts:
+            with timing.building(), self.with_all_lights():
+                self.patches = patches if patches and patches.fit(self) else Patches(self)
+                self.bounced = Bounced(self, self.patches, settings.max_depth)
 
-    def _runs(self) -> list:
-        """Runs of the table's lights, (first, last), whose maps fit into memory together; [None] for all at once, as
-        where maps are not made. Raises MiNtfError where derivatives need more maps at once than fit."""
-        found = self.effects
-        if not self._media or not found.lit or not found.needs_visibility:
+    def _runs(self) -> list[Run]:
+        """Return the runs of the table's lights, [None] if all maps fit into memory together or there are none.
+
+        Raises MiNtfError if derivatives need more maps at once than fit.
+        """
+        method, media = self.effects.visibility, self._media_with_matter
+        if not media or not self.effects.lit or not self.effects.needs_visibility:
             return [None]
-        table = self.lights.table(self._media[0].frame)
+        table = self.lights.table(media[0].frame)
         options = building.options(self.settings)
-        runs = [(first + a, first + b) for first, last in self._shares(table.count)
-                for a, b in building.parts(found.visibility, self._media, table.part(first, last), options)]
-        if found.gradients and len(runs) > 1:
-            size = sum(building.size_per_light(found.visibility, m, table, options) for m in self._media)
+        runs: list[Run] = [*building.parts(method, media, table, options)]
+        if self.effects.gradients and len(runs) > 1:
+            size = sum(building.size_per_light(method, m, table, options) for m in media)
             raise MiNtfError(
                 f"map_memory is {options.map_memory:.4g} MiB, but derivatives need the maps of all {table.count} "
-                f"lights at once, {size * table.count / 2**20:.4g} MiB ({found.visibility}); raise map_memory or "
+                f"lights at once, {size * table.count / 2**20:.4g} MiB ({method}); raise map_memory or "
                 "choose visibility=raymarch, which holds none"
             )
-        return [None] if found.gradients else runs
-
-    def _shares(self, count: int) -> list:
-        """Rows (first, last) of each part of the lights that has some; part 0 is always there."""
-        parts = self.settings.share[1]
-        ends = [-(-count * i // parts) for i in range(parts + 1)]
-        return [(a, b) for i, (a, b) in enumerate(itertools.pairwise(ends)) if b > a or i == 0]
-
-    def _own(self) -> list:
-        """Return the numbers of the runs that this part of the lights renders, all unless the settings say otherwise.
-        """
-        part, parts = self.settings.share
-        if parts == 1 or self.runs == [None]:
-            return [] if part else list(range(len(self.runs)))
-        count = self.runs[-1][1]
-        begin, end = (-(-count * i // parts) for i in (part, part + 1))
-        return [k for k, (first, _) in enumerate(self.runs) if begin <= first < end or (k == 0 and part == 0)]
+        return [None] if self.effects.gradients else runs
 
     def select(self, run: int) -> None:
-        """Prepare the lights of run `run`: the first adds all else that shines as well, later ones these lights alone,
-        where fields scatter them once. Further bounces ask for all lights in the first run."""
+        """Prepare the lights of run `run`.
+
+        The first run has everything else that shines, too, and multiple scattering of all lights. Later runs have these
+        lights alone, which fields scatter once.
+        """
         if run == self.run:
             return
-        self.run, self.parts, self.in_view = run, [], []  # lets go of the maps before others are made
-        self.parts = [self._part(m) for m in self._media]
-        self.in_view = [p for p in self.parts if p.medium in self._seen]
+        self.run, self.parts, self.in_view = run, [], []  # frees the old maps before new ones are built
+        self.parts = [self._part(m) for m in self._media_with_matter]
+        self.in_view = [p for p in self.parts if p.medium in self._media_in_view]
 
-    def _part(self, medium) -> Part:
-        found = self.effects
-        whole = self.lights.table(medium.frame)
-        if not found.lit or not found.needs_visibility:
-            return Part(medium, whole, whole, None, None, None)
-        table = whole.part(*self.runs[self.run]) if len(self.runs) > 1 else whole
+    def _part(self, medium: NRFMedium) -> Part:
+        all_lights, run = self.lights.table(medium.frame), self.runs[self.run]
+        if not self.effects.lit or not self.effects.needs_visibility:
+            return Part(medium, all_lights, all_lights)
+        table = all_lights.part(*run) if run and len(self.runs) > 1 else all_lights
         options = building.options(self.settings)
-        drawn = REGISTRY[found.visibility].for_drawn
-        if table.moving and not REGISTRY[drawn].derivatives:
-            drawn = "raymarch"
-        method = found.visibility if table.count else drawn  # maps of no light are no maps
-        mapped = building.build(method, medium, table, options)
+        for_sampled = REGISTRY[self.effects.visibility].for_sampled
+        if table.moving and not REGISTRY[for_sampled].derivatives:
+            for_sampled = "raymarch"
+        method = self.effects.visibility if table.count else for_sampled  # there are no maps of no light
+        visibility = building.build(method, medium, table, options)
         if self.settings.unbiased and REGISTRY[method].numbers:
             march = building.build("raymarch", medium, table, options)
-            mapped = Unbiased(mapped, march, self._media.index(medium), mi)
-        if drawn != method:
-            other = building.build(drawn, medium, table, options)
-            return Part(medium, whole, table, mapped, other, other)
+            assert visibility and march
+            visibility = Unbiased(visibility, march, self._media_with_matter.index(medium), mi)
+        if for_sampled != method:
+            other = building.build(for_sampled, medium, table, options)
+            return Part(medium, all_lights, table, visibility, other, other)
         if not REGISTRY[method].per_field:
-            return Part(medium, whole, table, mapped, mapped, mapped)
-        suns = self.lights.suns()
+            return Part(medium, all_lights, table, visibility, visibility, visibility)
+        assert visibility
+        lookup, suns = visibility, self.lights.suns()
 
-        def marched(suns):
-            return building.with_suns(mapped, suns, medium, table, options) if suns.any() else mapped
+        def with_suns(suns: np.ndarray | None) -> Visibility:
+            if suns is not None and not suns.any():
+                return lookup
+            return building.with_suns(lookup, suns, medium, table, options)
 
-        own = suns[table.first : table.first + table.count]
-        return Part(medium, whole, table, marched(own), marched(DRAWN), marched(suns))
+        run_suns = suns[table.first : table.first + table.count]
+        return Part(medium, all_lights, table, with_suns(run_suns), with_suns(None), with_suns(suns))
 
-    def draw_from(self, stream) -> None:
-        """Methods whose lookups draw numbers take them from `stream`, an opaque seed: one for each seed of the user's
-        and chunk of pixels."""
+    def seed_lookups(self, stream: UInt32) -> None:
+        """Set the opaque seed of visibility methods whose lookups take random numbers."""
         for part in self.parts:
-            for method in (part.mapped, part.drawn):
+            for method in (part.for_run, part.for_sampled):
                 while method:
                     if hasattr(method, "stream"):
                         method.stream = stream
                     method = getattr(method, "looked_up", None)
 
-    def transmittance(self, p, d, distance, active, sun=False):
-        """Return the transmittance of the fields from scene point `p` along `d`, as far as `distance`.
+    @contextmanager
+    def with_all_lights(self) -> Iterator[None]:
+        """Light the fields by the lights of all runs within the block."""
+        parts = self.parts
+        if len(self.runs) > 1:
+            self.parts = [replace(p, table=p.all_lights, for_run=p.for_all) for p in parts]
+        try:
+            yield
+        finally:
+            self.parts = parts
+
+    def transmittance(self, p: Vector3, d: Vector3, distance: Float, active: Mask, sun: Mask = False) -> Float:
+        """Return the transmittance of the fields from the scene points `p` along `d`, as far as `distance`.
 
         `sun`: the light is :func:`mi_ntf.render.lights.emitter_samples.sharp`.
         """
         tau = mi.Float(1)
         for part in self.parts:
-            if part.drawn:
-                tau = tau * between(part.frame, part.drawn, p, d, distance, mi.UInt32(sun), active)
+            if part.for_sampled:
+                field = FieldVisibility(part.frame, part.for_sampled)
+                tau = tau * transmittance_between(field, p, d, distance, mi.UInt32(0), active, mi.Bool(sun))
         return tau
 
-    def strands(self, ray, parts, steps=None):
-        """``(strands, unit)`` of scene rays through `parts`: t counts in `unit`, scene lengths. `steps` across the unit
-        sphere's diameter: the settings' `samples` unless told."""
+    def strands(self, ray: Ray, parts: Sequence[Part], steps: int = 0) -> SceneStrands:
+        """Return the strands of scene rays through `parts`.
+
+        `steps`: cells across the diameter of a unit sphere; 0: as many as the settings have.
+        """
         several = len(parts) > 1
         unit = min(p.frame.length for p in parts)
-        result = [
+        strands = [
             Strand(
                 p.source,
                 p.frame.point_to_field(ray.o),
@@ -194,48 +193,55 @@ class Composition:
             )
             for p in parts
         ]
-        return result, unit
+        return SceneStrands(strands, unit)
 
-    def fly(self, ray, maxt, offset, depths, steps=None):
-        """:func:`mi_ntf.infer.march.free_flight` of scene rays through all fields: ``(hit, t, index)``, t in scene
-        lengths from the ray's origin. `steps`: as for :meth:`strands`."""
+    def free_flight(self, ray: Ray, maxt: Float, offset: Float, depths: Sequence[Float],
+                    steps: int) -> tuple[Mask, Float, UInt32]:
+        """Return ``(hit, t, part)`` of :func:`mi_ntf.infer.march.free_flight` through all fields, t in scene lengths.
+
+        `steps`: as for :meth:`strands`.
+        """
         strands, unit = self.strands(ray, self.parts, steps)
         hit, t, index = march.free_flight(strands, maxt / unit, offset, depths)
         return hit, t * unit, index
 
-    def with_all_lights(self, do):
-        """Return ``do()``, while the lights of all runs shine."""
-        parts = self.parts
-        if len(self.runs) > 1:
-            self.parts = [replace(p, table=p.lights, mapped=p.every) for p in parts]
-        try:
-            return do()
-        finally:
-            self.parts = parts
+    def reflect(self, part: Part, points: shade.Points, stream: UInt32, view: Float | None = None, *,
+                surface: bool = False, light_samples: int = 0) -> list[Float]:
+        """Return the radiance that points of `part` reflect from all lights.
 
-    def reflect(self, part: Part, points, stream, view=None, surface=False, draws: int = 0):
-        """Radiance that `points` of `part` reflect from all lights; `view`: their transmittance, if lights share it;
-        `surface`: whether they are diffuse points of a surface above the skin; `draws`: least number of those drawn."""
+        Parameters
+        ----------
+        stream
+            Opaque seed of sampled lights.
+        view
+            Transmittance of the points, if lights at the camera share it.
+        surface
+            The points lie on a diffuse surface above the skin.
+        light_samples
+            Least number of sampled lights.
+        """
         total = [dr.zeros(mi.Float, dr.width(points.x[0])) for _ in range(3)]
-        for source, mapped in self.lights.sources(part.table, part.frame, points, stream, draws,
+        for source, mapped in self.lights.sources(part.table, part.frame, points, stream, light_samples,
                                                   self.effects.gradients):
             if self.run and not mapped:
                 continue
-            # Maps and volumes stay where the lights were.
-            kind = "mapped" if mapped and not part.table.moving else "drawn"
-            shadow = Known(view) if view is not None else self.shadow(part, kind, source.far)
+            # Maps and volumes do not follow a light that moves.
+            sampled = not mapped or part.table.moving
+            shadow = KnownTransmittance(view) if view is not None else self.shadow(part, sampled, source.far)
             light = shade.reflect(points, source, shadow, self.effects.specular and not surface,
                                   self.effects.gradients, not surface)  # fmt: skip
             total = [a + b for a, b in zip(total, light, strict=True)]
         return total
 
-    def shadow(self, part: Part, kind: str, far: bool = False):
-        """Return the shadow of every field and surface at points of `part`.
+    def shadow(self, part: Part, sampled: bool, far: bool = False) -> Visibility | None:
+        """Return the visibility of lights from points of `part` through all fields and surfaces.
 
-        `kind`: of lights, ``mapped`` or ``drawn``; `far`: the lights lie outside of the part's sphere.
+        `sampled`: of sampled lights, not of those of the run; `far`: the lights lie outside of the part's sphere.
         """
-        own = getattr(part, kind)
-        far = far and (kind == "drawn" or REGISTRY[self.effects.visibility].per_field)  # a light's map needs its place
-        others = [(p.frame, getattr(p, kind)) for p in self.parts if p is not part]
-        whole = others or self.surfaces or far
-        return Shadow(part.frame, own, others, self.surfaces, far) if own and whole else own
+        visibility = part.visibility(sampled)
+        far = far and (sampled or REGISTRY[self.effects.visibility].per_field)  # a light's map needs its position
+        others = [FieldVisibility(p.frame, method) for p in self.parts
+                  if p is not part and (method := p.visibility(sampled))]
+        if visibility and (others or self.surfaces or far):
+            return Shadow(FieldVisibility(part.frame, visibility), others, self.surfaces, far)
+        return visibility

@@ -1,91 +1,98 @@
 """Passes of a render whose number of samples a limit of noise or time decides."""
 
+from __future__ import annotations
+
 import math
 import time
+from collections.abc import Callable
 
 import numpy as np
 
 from ..scene.settings import Limits
 
 MOST = 1 << 16
-"""Samples a pixel, more than which float32 pictures do not show."""
+"""Most samples per pixel, which float32 pictures can represent."""
 GROWTH = 4
-"""A pass has at most as many times the samples of all before it: what they say of noise and time is not exact."""
-
-SHARE = 0.6
-"""Of the time or the samples that are left, what a pass is meant to take: the machine may be slower then, the noise
-less. `REST`: of the time, what is no longer worth a pass."""
+"""Most samples of a pass relative to all before it, whose noise and time are only estimates."""
+PASS_FRACTION = 0.6
+"""Fraction of the remaining time or samples that a pass should take, since the estimates may be too low."""
 REST = 0.03
+"""Fraction of the time that is too short for another pass."""
 
 
 def noise(one: np.ndarray, other: np.ndarray, weights: tuple[float, float]) -> float:
-    """Monte Carlo noise of the mean picture I of two independent ones, linear RGB (h, w, 3), of `weights` samples a
-    pixel each: |I − A| over √I, A from half of the samples, the scale of Cycles' adaptive sampling (its
-    ``noise_threshold``), on which I − A is as far off as I itself. Channels are summed, as there.
+    """Return the Monte Carlo noise of the mean I of two independent pictures, linear RGB (h, w, 3).
 
-    Cycles asks this of each pixel; here both sides are summed over the picture first, or pixels next to black would
-    decide. Where the halves are unequal, |I − A| is scaled to what it would be.
+    The noise is |I − A| over √I, channels summed, where A has half of the samples: the error of I − A is that of I.
+    Cycles computes it for each pixel (its ``noise_threshold``). Here both sides are summed over the picture, or pixels
+    close to black would dominate. `weights`: samples per pixel of both pictures; |I − A| is scaled if they differ.
     """
     a, b = weights
-    whole = (a * one + b * other) / (a + b)
-    scale = np.sqrt(np.maximum(whole.sum(-1), 0)).sum()
-    return float(np.abs(whole - one).sum() * math.sqrt(a / b) / scale) if scale > 0 else 0.0
+    mean = (a * one + b * other) / (a + b)
+    scale = np.sqrt(np.maximum(mean.sum(-1), 0)).sum()
+    return float(np.abs(mean - one).sum() * math.sqrt(a / b) / scale) if scale > 0 else 0.0
 
 
 class Passes:
-    """The samples of each pass: as many as `limits` still ask for and the time allows, by what the passes so far took.
+    """Numbers of samples of each pass, as many as `limits` need and the time allows. It is made as the render begins.
 
-    It is made when the render begins. `count`: samples a pixel so far; `noise`, `seconds`: as measured last; `ended`:
-    what was reached, ``samples``, ``noise``, ``time`` or ``timeout``.
+    count    samples per pixel so far
+    passes   passes so far
+    noise    last measurement, nan before the second pass
+    seconds  time at the end of the last pass
+    ended    limit that was reached: ``samples``, ``noise``, ``time`` or ``timeout``
     """
 
-    def __init__(self, limits: Limits, clock=None):
+    def __init__(self, limits: Limits, clock: Callable[[], float] | None = None) -> None:
         self.limits, self._clock = limits, clock or time.monotonic
         self.count, self.passes = 0, 0
         self.noise = math.nan
         self.seconds = 0.0
         self.ended = "samples"
         self._begin = self._started = self._clock()
-        self._each = math.inf  # seconds of one sample a pixel
+        self._each = math.inf  # seconds of one sample per pixel
 
     def first(self, samples: int, runs: int) -> int:
-        """Samples of the first pass, `samples` by the scene: those, unless a limit decides. Several runs of lights are
-        made anew for each pass: few passes then. What went before is no pass's."""
+        """Return the samples of the first pass: `samples`, the scene's own, unless a limit decides.
+
+        The maps of several runs of lights are built anew for each pass, so there are few passes then. The time before
+        this call belongs to no pass.
+        """
         self._started = self._clock()
         return samples if not self.limits.of_samples or runs > 1 else 1
 
     def done(self, samples: int, noise: float) -> None:
-        """A pass of so many has ended; `noise` of all so far, nan where that is not known yet."""
+        """Count a pass of so many samples per pixel; `noise`: of all samples so far, or nan."""
         now = self._clock()
         self._each = (now - self._started) / samples
         self._started, self.seconds = now, now - self._begin
         self.count, self.passes, self.noise = self.count + samples, self.passes + 1, noise
 
-    def gone(self) -> float:
-        """Seconds since the render began."""
+    def elapsed(self) -> float:
+        """Return the seconds since the render began."""
         return self._clock() - self._begin
 
     def overtime(self, timeout: float) -> bool:
         """Return True if more than `timeout` seconds have passed; never for one below 0."""
-        return 0 < timeout < self.gone()
+        return 0 < timeout < self.elapsed()
 
     def next(self) -> int:
-        """Samples of the next pass; 0: a limit is reached."""
-        wanted = min(GROWTH * self.count, MOST - self.count)
+        """Return the samples of the next pass; 0: a limit is reached."""
+        samples = min(GROWTH * self.count, MOST - self.count)
         if self.limits.noise > 0 and math.isfinite(self.noise):
             if self.noise <= self.limits.noise:
                 return self._end("noise")
             needed = self.count * (self.noise / self.limits.noise) ** 2 - self.count
-            wanted = min(wanted, max(1, self.count // 8, math.ceil(SHARE * needed)))
+            samples = min(samples, max(1, self.count // 8, math.ceil(PASS_FRACTION * needed)))
         elif self.limits.noise > 0:
-            wanted = min(wanted, self.count)  # the other half
+            samples = min(samples, self.count)  # the other half
         if self.limits.seconds > 0:
             left = self.limits.seconds - self.seconds
             if left < max(self._each, REST * self.limits.seconds):
                 return self._end("time")
-            wanted = min(wanted, max(1, int(SHARE * left / self._each)))
-        return wanted if wanted > 0 else self._end("samples")
+            samples = min(samples, max(1, int(PASS_FRACTION * left / self._each)))
+        return samples if samples > 0 else self._end("samples")
 
-    def _end(self, why: str) -> int:
-        self.ended = why
+    def _end(self, limit: str) -> int:
+        self.ended = limit
         return 0

@@ -1,93 +1,109 @@
 """From a scene to its film: passes of camera rays, in chunks of pixels and runs of lights."""
 
+from __future__ import annotations
+
 import itertools
 import math
+from collections.abc import Callable
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ...core.errors import MiNtfError
+from ...infer.types import Array, Float, UInt32
 from .. import log
 from ..scene.camera import Camera, Reconstruction
-from ..scene.settings import Limits, Settings
-from . import aovs, camera_light, choosing, passes
-from .choosing import Choice
-from .composition import IN_SMOKE
+from ..scene.settings import NO_LIMITS, Limits
+from . import aovs, camera_light, passes
+from .choosing import Choice, Chooser
+from .composition import IN_SMOKE, Composition
+from .context import RenderContext
 
 CHUNK = 1 << 18
-"""Camera rays in flight: bounds the memory at about half a GiB whatever the image and the number of lights."""
+"""Camera rays in flight, which bounds the memory at about half a GiB for any image and number of lights."""
 
 
-def render(integrator, scene, sensor, seed, spp: int, develop: bool):
-    """Camera rays → radiance and opacity → film. Without limits all samples are one pass.
+def render(context: RenderContext, scene: mi.Scene, sensor: mi.Sensor, seed: int | UInt32, spp: int, develop: bool,
+           should_stop: Callable[[], bool]) -> Array:
+    """Render `scene` into the film of `sensor`, in one pass unless a limit decides on the samples.
 
-    `integrator` is the plugin, or what has its attributes, and maybe ``seen``
-    (:class:`mi_ntf.render.transport.seen.Seen`) of an earlier render of the same rays, and ``chunk``, camera rays in
-    flight."""
+    Parameters
+    ----------
+    context
+        Settings of the render; it receives the result.
+    spp
+        Samples per pixel; 0: the sampler's own number.
+    develop
+        Return the developed image; it is empty otherwise.
+    should_stop
+        Called before each chunk of pixels; True ends the render.
+    """
     if dr.flag(dr.JitFlag.FreezingScope):
         raise MiNtfError(
             "nrf integrator: dr.freeze cannot record a render whose number of shading points is known only while it "
             "runs; call mi.render outside of frozen functions (its kernels are cached all the same)"
         )
-    counted = passes.Passes(integrator.limits)
+    limits = context.limits
+    progress = passes.Passes(limits)
     camera = Camera(sensor, spp)
     film = camera.film
-    chooser = choosing.Chooser(
-        scene, Settings.of(integrator), integrator.limits, sensor, camera.spp, integrator.patches, counted.gone,
-        integrator.chosen, whole=any(name in aovs.OF_LIGHTS for name in integrator.aovs))
-    choice = chooser.choose()
-    composition, integrator.chosen = choice.composition, choice.kept()
-    integrator.patches = composition.patches
-    picture = None
-    if integrator.aovs:
-        integrator.lights_seen = len(composition.lights.rows.power)
-        picture = aovs.Picture(camera, integrator.aovs, integrator.lights_seen)
+    composition, choice = Chooser(
+        scene, context.settings, limits, sensor, camera.spp, patches=context.patches, elapsed=progress.elapsed,
+        previous=context.choice, complete=any(name in aovs.OF_LIGHTS for name in context.aovs)).choose()
+    context.choice, context.patches = choice, composition.patches
+    context.light_count = len(composition.lights.rows.power)
+    picture = aovs.Picture(camera, context.aovs, context.light_count) if context.aovs else None
     film.prepare(picture.names if picture else [])
     halves = _Halves(film, len(picture.names) if picture else 0)
-    samples = counted.first(camera.spp, len(composition.runs))
+    samples = progress.first(camera.spp, len(composition.runs))
     while samples:
         if samples != camera.spp:
             camera = Camera(sensor, samples)
+        if picture:
+            picture.begin_pass(camera)
         block = halves.block()
-        whole = _trace(integrator, composition, Reconstruction(block, camera), picture and picture.seen_by(camera),
-                       _seed(seed, counted.passes), counted)  # fmt: skip
-        if whole or not counted.passes or (counted.count and len(composition.runs) == 1):
+        complete = _trace(context, composition, Reconstruction(block, camera), picture, _seed(seed, progress.passes),
+                          progress, should_stop)
+        if complete or not progress.passes or (progress.count and len(composition.runs) == 1):
             halves.add(block, camera.spp, picture)
-        if not whole:
+        if not complete:
             break
-        if integrator.limits.of_samples:
+        if limits.of_samples:
             halves.wait()
-        counted.done(camera.spp, halves.noise() if integrator.limits.noise > 0 else math.nan)
-        samples = counted.next() if integrator.limits.of_samples else 0
+        progress.done(camera.spp, halves.noise() if limits.noise > 0 else math.nan)
+        samples = progress.next() if limits.of_samples else 0
     if not composition.effects.gradients:
         halves.wait()  # the program develops the film next
         width, height = film.crop_size()
-        log.info(f"nrf integrator: done, {width} × {height} pixels with {counted.count} samples each "
-                 f"({counted.gone():.2g} s)")
-    integrator.achieved = _achieved(integrator.limits, choice, counted)
+        log.info(f"nrf integrator: done, {width} × {height} pixels with {progress.count} samples each "
+                 f"({progress.elapsed():.2g} s)")
+    context.achieved = _achieved(limits, composition, choice, progress)
     if not develop:
         return mi.TensorXf()
-    image = film.develop()
-    return image + _no_slope(scene) if composition.effects.gradients and not dr.grad_enabled(image) else image
+    image: Array = film.develop()
+    return image + _zero_gradient(scene) if composition.effects.gradients and not dr.grad_enabled(image) else image
 
 
 class _Halves:
-    """Two halves of the passes, which tell noise, and the film, which shows their sum after every pass."""
+    """Two halves of the passes, from which noise is measured; the film shows their sum after every pass.
 
-    def __init__(self, film, extra: int):
-        """`extra`: channels behind the film's own, the last of which are the filter's weights."""
+    `extra`: number of channels behind the film's own, the last of which are the filter's weights.
+    """
+
+    def __init__(self, film: mi.Film, extra: int) -> None:
         self._film, self._extra, self._samples = film, extra, [0, 0]
-        self._blocks: list = []
+        self._blocks: list[mi.ImageBlock] = []
 
-    def block(self):
-        """An empty one for a pass."""
-        block = self._film.create_block()
-        block.set_offset(self._film.crop_offset())
+    def block(self) -> mi.ImageBlock:
+        """Return an empty block for a pass."""
+        block, offset = self._film.create_block(), self._film.crop_offset()
+        block.set_offset(mi.ScalarPoint2i(offset))
         return block
 
-    def add(self, block, samples: int, picture) -> None:
-        """A pass of so many samples a pixel, to the half that has fewer."""
+    def add(self, block: mi.ImageBlock, samples: int, picture: aovs.Picture | None) -> None:
+        """Add a pass of so many samples per pixel to the half that has fewer."""
         half = int(self._samples[0] > self._samples[1])
         self._samples[half] += samples
         if half < len(self._blocks):
@@ -101,18 +117,18 @@ class _Halves:
             self._film.put_block(each)
 
     def wait(self) -> None:
-        """Until all is computed: kernels run beside the program, and a clock would see them in the next pass."""
+        """Wait for all kernels, whose time would be measured in the next pass otherwise."""
         dr.eval([block.tensor() for block in self._blocks])
         dr.sync_thread()
 
-    def _weight(self, block):
+    def _weight(self, block: mi.ImageBlock) -> Float:
         """Return the sum of the filter's weights for each pixel."""
         tensor = block.tensor()
         pixel = dr.arange(mi.UInt32, tensor.shape[0] * tensor.shape[1])
         return dr.gather(mi.Float, tensor.array, pixel * tensor.shape[2] + (tensor.shape[2] - self._extra - 1))
 
     def noise(self) -> float:
-        """:func:`mi_ntf.render.transport.passes.noise`; nan before the second pass."""
+        """Return the noise (:func:`mi_ntf.render.transport.passes.noise`), nan before the second pass."""
         if len(self._blocks) < 2:
             return math.nan
         pictures = []
@@ -124,87 +140,90 @@ class _Halves:
         return passes.noise(one, other, (self._samples[0], self._samples[1]))
 
 
-def _trace(integrator, composition, pixels: Reconstruction, picture, seed, counted: passes.Passes) -> bool:
-    """Camera rays in chunks of pixels: lights in runs whose maps fit into memory, and for each the same rays. False:
-    it was told to stop."""
+def _trace(context: RenderContext, composition: Composition, pixels: Reconstruction, picture: aovs.Picture | None,
+           seed: UInt32, progress: passes.Passes, should_stop: Callable[[], bool]) -> bool:
+    """Trace one pass: for each run of lights all camera rays, in chunks of pixels; return False if it was stopped."""
     camera = pixels.camera
     alpha = mi.has_flag(camera.film.flags(), mi.FilmFlags.Alpha)
-    rays = getattr(integrator, "chunk", CHUNK) // (IN_SMOKE if composition.smoke else 1)
-    chunks = range(0, camera.count, max(1, rays // camera.spp))
-    seen = getattr(integrator, "seen", None)
-    progress, parts = log.Progress("nrf integrator: rendering"), len(composition.own) * len(chunks)
-    for number, (run, first) in enumerate(itertools.product(composition.own, chunks)):
-        progress(number / parts)
-        if integrator.should_stop() or counted.overtime(integrator.timeout):
-            _stop(pixels, run, first, len(composition.runs))
-            counted.ended = "timeout"
+    rays_in_flight = (context.rays_in_flight or CHUNK) // (IN_SMOKE if composition.smoke else 1)
+    chunks = range(0, camera.count, max(1, rays_in_flight // camera.spp))
+    runs, cache = range(len(composition.runs)), context.sample_cache
+    report = log.Progress("nrf integrator: rendering")
+    for number, (run, first) in enumerate(itertools.product(runs, chunks)):
+        report(number / (len(runs) * len(chunks)))
+        if should_stop() or progress.overtime(context.timeout):
+            _stop(pixels, run, first, len(runs))
+            progress.ended = "timeout"
             return False
         composition.select(run)
         count = min(chunks.step, camera.count - first)
-        # Another stream for each chunk and seed; opaque, so that no seed is compiled into a kernel.
+        # An independent stream for each chunk and seed; opaque, so that no seed is compiled into a kernel.
         stream = mi.sample_tea_32(seed, _opaque(first))[0]
         ray, weight, position = camera.rays(first, count, stream)
-        sums = picture and picture.sums(dr.width(ray), run, composition.runs[run])
+        sums = picture.sums(dr.width(ray), run, composition.runs[run]) if picture else None
         with composition.lights.bare():
             radiance, opacity = camera_light.trace(composition, ray, camera.quadrature(count), stream, sums,
-                                                   seen and seen.chunk(first))
-        # Opacity comes with the scene's first run, the filter's weights with the first that is rendered here.
-        begins = run == composition.own[0]
-        once = [*([None if run else opacity] if alpha else []), dr.ones(mi.Float, dr.width(ray)) if begins else None]
-        pixels.add(first, position, [*(radiance * weight), *once])
+                                                   cache.chunk(first) if cache else None)
+        # The first run adds the opacity and the filter's weights.
+        once = [None, None] if run else [opacity, dr.ones(mi.Float, dr.width(ray))]
+        pixels.add(first, position, [*(radiance * weight), *(once if alpha else once[1:])])
         if picture and sums:
             picture.put(first, position, sums)
     return True
 
 
-def _no_slope(scene):
-    """0, attached to every attached parameter of `scene`: of a picture in which none of them shows, derivatives are 0;
-    Dr.Jit would take a detached one for a mistake of the caller."""
-    attached = [value for _, value in mi.traverse(scene) if dr.grad_enabled(value)]
-    zero = dr.opaque(mi.Float, 0)  # a literal one would detach
-    return sum((zero * dr.sum(dr.ravel(getattr(value, "matrix", value))) for value in attached), zero)
+def _zero_gradient(scene: mi.Scene) -> Float:
+    """Return 0, attached to every attached parameter of `scene`.
+
+    It is added to a picture that depends on none of them, since Dr.Jit refuses to differentiate a detached picture.
+    """
+    zero: Float = dr.opaque(mi.Float, 0)  # a literal one would detach
+    total = zero
+    for _, value in mi.traverse(scene):
+        if dr.grad_enabled(value):
+            flat: Array = dr.ravel(getattr(value, "matrix", value))
+            total = total + zero * dr.sum(flat)
+    return total
 
 
 def _stop(pixels: Reconstruction, run: int, first: int, runs: int) -> None:
-    """Rendering ends before source pixel `first` of `run`: pixels that not all runs of lights have reached stay
-    empty."""
+    """Clear the pixels that some run of lights has not reached, and warn; `first`: source pixel where `run` stopped."""
     last = run == runs - 1
     if runs > 1:
-        pixels.keep(first if last else 0)
-    mi.Log(  # type: ignore[operator]  # an object in the stub
-        mi.LogLevel.Warn,
+        pixels.clear_unfinished(first if last else 0)
+    log.warn(
         f"nrf integrator: stopped after {first if last else 0} of {pixels.camera.count} pixels"
-        + ("" if last else f", in run {run + 1} of {runs} of the lights: more map_memory needs fewer runs"),
+        + ("" if last else f", in run {run + 1} of {runs} of the lights: more map_memory needs fewer runs")
     )
 
 
-def _achieved(limits: Limits, choice: Choice, counted: passes.Passes) -> dict:
-    """Return the result of a render under limits, and log it if there are any."""
-    effects = choice.effects
-    found = {
-        "visibility": effects.visibility, "reason": effects.reason, "spp": counted.count, "passes": counted.passes,
-        "noise": counted.noise, "seconds": counted.seconds, "ended": counted.ended,
+def _achieved(limits: Limits, composition: Composition, choice: Choice, progress: passes.Passes) -> dict[str, Any]:
+    """Return the result of a render, and log it if there are limits."""
+    best, visibility = choice.best, composition.effects.visibility
+    if limits != NO_LIMITS:
+        error = f", error below {best.bound:.1%}" if best else ""
+        noise = "" if math.isnan(progress.noise) else f", noise {progress.noise:.3g}"
+        log.info(f"nrf integrator: {best.name if best else visibility}{error}{noise}, {progress.count} samples, ended "
+                 f"by {progress.ended}")
+        for trial in choice.trials:
+            log.debug(f"nrf integrator: {trial}")
+    return {
+        "visibility": visibility, "reason": best.why if best else composition.effects.reason, "spp": progress.count,
+        "passes": progress.passes, "noise": progress.noise, "seconds": progress.seconds, "ended": progress.ended,
         "predicted": choice.predicted, "trials": [vars(t) for t in choice.trials],
     }
-    if limits != Limits():
-        taken = [t for t in choice.trials if t.taken]
-        error = f", error below {taken[-1].bound:.1%}" if taken else ""
-        noise = "" if math.isnan(counted.noise) else f", noise {counted.noise:.3g}"
-        log.info(f"nrf integrator: {taken[-1].name if taken else found['visibility']}{error}{noise}, "
-                 f"{counted.count} samples, ended by {counted.ended}")
-        for trial in choice.trials:
-            mi.Log(mi.LogLevel.Debug, f"nrf integrator: {trial}")  # type: ignore[operator]  # an object in the stub
-    return found
 
 
-def _seed(seed, number: int):
-    """Return the seed of pass `number`: the first has the user's own."""
+def _seed(seed: int | UInt32, number: int) -> UInt32:
+    """Return the seed of pass `number`; the first pass has the user's own."""
     return mi.sample_tea_32(_opaque(seed), _opaque(number))[0] if number else _opaque(seed)
 
 
-def _opaque(seed):
-    """A seed, Python number (from Python) or array (from the stock program), or the number of a pixel, as a value that
-    no kernel contains."""
-    value = mi.UInt32(seed)
+def _opaque(number: int | UInt32) -> UInt32:
+    """Return a number as a value that no kernel contains.
+
+    It is a Python number, or an array from the stock program.
+    """
+    value: UInt32 = mi.UInt32(number)
     dr.make_opaque(value)
     return value

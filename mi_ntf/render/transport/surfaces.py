@@ -1,62 +1,83 @@
-"""Ordinary shapes around the fields: what hides them, what shades them, and how they reflect the scene's light."""
+"""Ordinary shapes around the fields: their shadows, what rays hit, and how they reflect the scene's light."""
 
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from typing import Protocol
 from weakref import WeakKeyDictionary
 
 import drjit as dr
 import mitsuba as mi
 
+from ...infer.types import Array, Color3, Float, Mask, Ray, Vector3
 from ..lights import environment
 from ..lights.emitter_samples import sharp
 from ..lights.recent import Recent, Version
 from ..scene.media import lets_light_through, shape_groups
 
-_scenes: WeakKeyDictionary = WeakKeyDictionary()
+_scenes: WeakKeyDictionary[mi.Integrator, Recent[mi.Scene]] = WeakKeyDictionary()
+
+
+class Transmittance(Protocol):
+    """Function that returns the transmittance of the fields along scene rays."""
+
+    def __call__(self, p: Vector3, d: Vector3, distance: Float, active: Mask, sun: Mask = False) -> Float:
+        """Return the transmittance from `p` along `d`, as far as `distance`; `sun`: of a light that is marched."""
 
 
 class Surfaces:
     """The ordinary shapes of `scene`, without the fields' bounding shapes.
 
-    shapes         those shapes
-    hide_emitters  whether shapes that shine are left out of what the camera sees
-    transmittance  callable ``(p, d, distance, active, sun=False)``: what the fields let through, scene coordinates
+    Direct light is estimated as in ``volpath``: by emitter and BSDF sampling, weighted by the power heuristic (Veach
+    1997). Each sample is attenuated by the fields and by the null transmission of shapes on its way.
 
-    Direct light as stock ``volpath`` estimates it: emitter and BSDF sampling, weighted by the power heuristic (Veach
-    1997), each dimmed by the fields on its way and by the null transmission of shapes (`transmitting`: some may have
-    any).
+    shapes         those shapes
+    hide_emitters  the camera does not see shapes that emit light
+    transmittance  transmittance of the fields
+    transmitting   light may cross a shape
+    shining        the camera sees a shape that emits light
     """
 
-    def __init__(self, scene, shapes: list, hide_emitters: bool, transmittance):
+    def __init__(self, scene: mi.Scene, shapes: Sequence[mi.Shape], hide_emitters: bool,
+                 transmittance: Transmittance) -> None:
         environment.check_unscaled(scene.environment())
         self.scene, self.transmittance = scene, transmittance
         groups = shape_groups(scene)
-        self._all = _scene_of(groups + shapes, scene.integrator())
-        seen = [s for s in shapes if not (hide_emitters and s.is_emitter())]
-        self._seen = self._all if len(seen) == len(shapes) else _scene_of(groups + seen, scene.integrator())
+        self._all = _scene_of([*groups, *shapes], scene.integrator())
+        visible = [s for s in shapes if not (hide_emitters and s.is_emitter())]
+        self._visible = self._all
+        if len(visible) < len(shapes):
+            self._visible = _scene_of([*groups, *visible], scene.integrator())
         self.transmitting = lets_light_through(scene)
-        self.shining = any(s.is_emitter() for s in seen)
+        self.shining = any(s.is_emitter() for s in visible)
         deltas = (mi.has_flag(e.flags(), mi.EmitterFlags.Delta) for e in scene.emitters())
         self.lights_can_be_hit = not all(deltas)
 
-    def first(self, ray):
-        """The camera rays' intersection, a PreliminaryIntersection3f."""
-        return self._seen.ray_intersect_preliminary(ray, coherent=True)
+    def first(self, ray: Ray) -> Array:
+        """Return the first intersection of camera rays, a PreliminaryIntersection3f."""
+        coherent: Mask = True
+        return self._visible.ray_intersect_preliminary(ray, coherent=coherent)
 
-    def intersect(self, ray):
-        """The next intersection of rays on their way through the scene, a SurfaceInteraction3f."""
+    def intersect(self, ray: Ray) -> Array:
+        """Return the next intersection of rays on their way through the scene, a SurfaceInteraction3f."""
         return self._all.ray_intersect(ray)
 
-    def transmission(self, p, d, distance, active):
-        """Return the share of the light at `distance` along `d` that the shapes let through to `p`: a Float of 0 or 1,
-        or a Color3f where they are `transmitting`."""
-        far = dr.detach(distance) * (1 - mi.math.ShadowEpsilon)
-        return self._transmission(mi.Ray3f(dr.detach(p), dr.detach(d), far, 0.0, []), active)
+    def transmission(self, p: Vector3, d: Vector3, distance: Float, active: Mask) -> Array:
+        """Return the transmission of the shapes from `p` along `d`, as far as `distance`.
 
-    def _transmission(self, ray, active):
-        """:meth:`transmission` along a whole ray: the product of the null transmissions of all that it crosses."""
+        It is 0 or 1, or a colour if they are `transmitting`.
+        """
+        maxt = dr.detach(distance) * (1 - mi.math.ShadowEpsilon)
+        arguments: Array = dr.detach(p), dr.detach(d), maxt, 0.0, []
+        return self._transmission(mi.Ray3f(*arguments), active)
+
+    def _transmission(self, ray: Ray, active: Mask) -> Array:
+        """Return the product of the null transmissions of all shapes that a ray crosses."""
         if not self.transmitting:
             return dr.select(self._all.ray_test(ray, active), mi.Float(0), 1)
 
-        def cross(ray, through, active):
+        def cross(ray: Ray, through: Color3, active: Mask) -> tuple[Ray, Color3, Mask]:
             si = self._all.ray_intersect(ray, active)
             active = active & si.is_valid()
             value = si.bsdf().eval_null_transmission(si, active)
@@ -66,16 +87,17 @@ class Surfaces:
             return onward, through, active & (dr.max(through) > 0)
 
         n = max(dr.width(ray.o), dr.width(ray.d), dr.width(active))
-        with dr.suspend_grad():
-            return dr.while_loop(
-                state=(mi.Ray3f(ray), dr.ones(mi.Color3f, n), mi.Bool(active)),
-                cond=lambda ray, through, active: active,
-                body=cross,
-                label="null surfaces",
-            )[1]
+        state: Array = mi.Ray3f(ray), dr.ones(mi.Color3f, n), mi.Bool(active)
 
-    def direct(self, si, rng, active):
-        """Reflected radiance of one emitter sample."""
+        def crossing(ray: Ray, through: Color3, active: Mask) -> Mask:
+            return active
+
+        suspended: Array = dr.suspend_grad
+        with suspended():
+            return dr.while_loop(state=state, cond=crossing, body=cross, label="null surfaces")[1]
+
+    def direct(self, si: Array, rng: Array, active: Mask) -> Color3:
+        """Return the reflected radiance of one emitter sample."""
         bsdf = si.bsdf()
         active = active & (mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth))
         u = mi.Point2f(rng.next_float32(), rng.next_float32())
@@ -87,21 +109,26 @@ class Surfaces:
         value = value * self._transmission(si.spawn_ray_to(ds.p), active)
         return dr.select(active, value * self.transmittance(si.p, ds.d, ds.dist, active, sharp(ds)), 0)
 
-    def scatter(self, si, rng, active):
-        """Return ``(ray, weight, pdf, crossed)`` of a BSDF sample; pdf is −1 for specular reflection and refraction;
-        `crossed`: the sample is of the null component, so the ray goes straight on."""
+    def scatter(self, si: Array, rng: Array, active: Mask) -> tuple[Ray, Color3, Float, Mask]:
+        """Return ``(ray, weight, pdf, crossed)`` of a BSDF sample.
+
+        The pdf is −1 for specular reflection and refraction. `crossed` marks samples of the null component, whose rays
+        continue straight on.
+        """
         u = mi.Point2f(rng.next_float32(), rng.next_float32())
         sample, weight = si.bsdf().sample(mi.BSDFContext(), si, rng.next_float32(), u, active)
         pdf = dr.select(mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta), -1, sample.pdf)
         crossed = active & mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
         return si.spawn_ray(si.to_world(sample.wo)), dr.select(active, weight, 0), pdf, crossed
 
-    def emission(self, si, ray, pdf, active, way=None):
-        """Radiance along BSDF-sampled rays from the emitter that they reach at `si`; `pdf` is that of the sample, `way`
-        the distance from the point of that sample to where `ray` begins, None for 0."""
+    def emission(self, si: Array, ray: Ray, pdf: Float, active: Mask, distance: Float | None = None) -> Color3:
+        """Return the radiance along BSDF-sampled rays from the emitter that they reach at `si`.
+
+        `pdf`: density of the sample; `distance`: from the point of that sample to the ray's origin, None for 0.
+        """
         emitter = si.emitter(self.scene)
         start = dr.zeros(mi.Interaction3f, dr.width(ray.o))
-        start.p = ray.o if way is None else ray.o - way * ray.d
+        start.p = ray.o if distance is None else ray.o - distance * ray.d
         ds = mi.DirectionSample3f(self.scene, si, start)
         other = self.scene.pdf_emitter_direction(start, ds, active & (pdf > 0))
         value = emitter.eval(si, active) * dr.select(pdf < 0, 1, _power(pdf, other))
@@ -109,33 +136,45 @@ class Surfaces:
         return dr.select(active, value * self.transmittance(ray.o, ray.d, si.t, active), 0)
 
 
-def _scene_of(shapes: list, integrator):
-    """Return a scene of these very shapes alone, for the rays' intersections.
+def _scene_of(shapes: list[mi.Shape], integrator: mi.Integrator) -> mi.Scene:
+    """Return a scene of these very shapes alone, which rays can intersect.
 
-    It is built again only when a shape has changed: its acceleration structure may take longer than the picture. It is
-    kept as long as `integrator`, the one of the shapes' scene, exists. Nothing is kept for Mitsuba's own integrators,
-    which weak references cannot refer to."""
-    try:
-        kept = _scenes.setdefault(integrator, Recent(2))
-    except TypeError:
+    Its acceleration structure may take longer to build than the picture, so it is reused until a shape changes. It is
+    stored as long as `integrator`, that of the shapes' scene, exists. Mitsuba's own integrators have no weak
+    references, so nothing is stored for them.
+    """
+    if not hasattr(integrator, "__weakref__"):
         return _built(shapes)
-    # What is kept holds the shapes, so no others get their addresses.
-    return kept.of((*(s.ptr for s in shapes), Version(*shapes, owners=mi.Shape)), lambda: _built(shapes))
+    recent = _scenes.setdefault(integrator, Recent(2))
+    # The stored scene holds the shapes, so that no other shapes get their addresses.
+    return recent.of((*(s.ptr for s in shapes), Version(*shapes, owners=mi.Shape)), lambda: _built(shapes))
 
 
-def _built(shapes: list):
+@functools.cache
+def _unused_emitter(_variant: str) -> mi.Emitter:
+    """Return one emitter for all scenes of shapes.
+
+    The number of emitters that exist is part of the code of Dr.Jit's kernels: a further one for each scene would
+    compile them again.
+    """
+    emitter: mi.Emitter = mi.load_dict({"type": "point"})
+    return emitter
+
+
+def _built(shapes: list[mi.Shape]) -> mi.Scene:
     """Return a new scene of `shapes`, which keep their names."""
-    # Mitsuba refuses a scene in which all emitters have the weight 0, as those of these shapes may. It also renames
-    # the objects of a dictionary by its keys.
+    # Mitsuba refuses a scene in which all emitters have the weight 0, as those of these shapes may. It also gives
+    # objects the names of their keys.
     names = [shape.id() for shape in shapes]
-    objects = {"unused": {"type": "point"}, **{f"shape_{i}": s for i, s in enumerate(shapes)}}
+    objects = {"unused": _unused_emitter(str(mi.variant())), **{f"shape_{i}": s for i, s in enumerate(shapes)}}
     try:
-        return mi.load_dict({"type": "scene", **objects}, optimize=False)
+        scene: mi.Scene = mi.load_dict({"type": "scene", **objects}, optimize=False)
+        return scene
     finally:
         for shape, name in zip(shapes, names, strict=True):
             shape.set_id(name)
 
 
-def _power(a, b):
-    """Weight of a sample of density `a` beside another technique of density `b`."""
+def _power(a: Float, b: Float) -> Float:
+    """Return the power heuristic's weight of a sample of density `a`; `b`: density of the other technique."""
     return dr.select(a > 0, a * a / (a * a + b * b), 0)

@@ -1,52 +1,59 @@
-"""More than one bounce: paths through fields and between surfaces, a wavefront a bounce."""
+"""Paths of more than one bounce through fields and between surfaces, one wavefront for each bounce."""
+
+from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from ...infer import scatter, shade
+from ...infer.types import Array, Color3, Float, Mask, Ray, UInt32
+from .composition import Composition
+from .shadow import Part
 
 ROULETTE_DEPTH = 5
-"""Paths may end at random from this depth on, as Mitsuba's path tracers do."""
+"""Depth from which Russian roulette may end paths, as in Mitsuba's path tracers."""
 
 STEPS = 128
-"""Cells of a further flight across a field's sphere, at most, each asked at the ends of its pieces: brightness of
-`examples/three_fields.py` differs by 0.02 % from that of 384, in 0.8 of the time; of `globe` by 0.013 %, of `cloud` by
-0.005 % (point light, three bounces)."""
+"""Most cells across a field's sphere for flights after the first bounce, which are smoother than camera rays."""
 
 
 @dataclass(frozen=True)
 class Paths:
-    """Rays on their way: `weight` of the light that they bring to their `pixel`; `pdf` of the BSDF sample that sent
-    them, −1 for a specular one, 0 where they come from a field, whose light is summed at its points; random stream.
-    `way`: distance from the last scattering point to where `ray` begins, None where no surface can be crossed."""
+    """Rays on their way through the scene.
 
-    ray: Any
-    weight: Any
-    pixel: Any
-    pdf: Any
-    rng: Any
-    way: Any = None
+    weight    of the light that a ray brings to its `pixel`
+    pdf       density of the BSDF sample that sent the ray; −1: specular; 0: from a field, whose light is summed at
+              its points
+    distance  from the last scattering point to the origin of `ray`; None where no surface can be crossed
+    """
 
-    def take(self, index) -> "Paths":
-        """Return those of the given indices."""
+    ray: Ray
+    weight: Color3
+    pixel: UInt32
+    pdf: Float
+    rng: Array
+    distance: Float | None = None
+
+    def take(self, index: UInt32) -> Paths:
+        """Return the paths of the given indices."""
         return replace(self, **{name: dr.gather(type(a), a, index) for name, a in self._values()})
 
-    def put(self, others: "Paths", index) -> None:
-        """Write `others` to the given places."""
-        for (_, a), (_, b) in zip(self._values(), others._values(), strict=True):
+    def put(self, paths: Paths, index: UInt32) -> None:
+        """Write `paths` to the given indices."""
+        for (_, a), (_, b) in zip(self._values(), paths._values(), strict=True):
             dr.scatter(a, b, index)
 
-    def _values(self) -> list:
+    def _values(self) -> list[tuple[str, Array]]:
         pairs = [(f.name, getattr(self, f.name)) for f in fields(self)]
         return [(name, value) for name, value in pairs if value is not None]
 
 
-def join(parts: list[Paths]) -> Paths:
-    """Return the paths of all `parts`, one after the other; at least one has some."""
+def join(parts: Sequence[Paths]) -> Paths:
+    """Return the paths of all `parts`, one after the other. At least one part must not be empty."""
     if len(parts) == 1:
         return parts[0]
     ends = list(itertools.accumulate(dr.width(paths.pixel) for paths in parts))
@@ -58,15 +65,20 @@ def join(parts: list[Paths]) -> Paths:
 
 
 class Walk:
-    """`composition`: the scene; `max_depth`: longest path in edges, −1 for any; `total`: three arrays of a float a
-    pixel, which light is added to; `number`: of each pixel's camera ray, which random lights follow from."""
+    """Random walk of paths through a scene.
 
-    def __init__(self, composition, max_depth: int, total, stream, number):
+    max_depth  longest path in edges; −1: no limit
+    total      light of each pixel so far, three arrays
+    number     number of each pixel's camera ray, from which sampled lights follow
+    """
+
+    def __init__(self, composition: Composition, max_depth: int, total: list[Float], stream: UInt32,
+                 number: UInt32) -> None:
         self.scene, self.max_depth, self.total, self.stream = composition, max_depth, total, stream
         self.number = number
 
     def run(self, paths: Paths, depth: int = 2) -> None:
-        """Follow `paths`, whose light would arrive over `depth` edges."""
+        """Follow `paths` to their ends; their next vertices are at `depth` edges from the camera."""
         while dr.width(paths.pixel):
             last = 0 <= self.max_depth <= depth
             depth += 1
@@ -79,53 +91,57 @@ class Walk:
                 return
             paths = self._roulette(join(scattered), depth)
 
-    def add(self, paths: Paths, light) -> None:
+    def add(self, paths: Paths, light: Color3) -> None:
         """Add `light` times the paths' weights to their pixels."""
         for total, value in zip(self.total, paths.weight * light, strict=True):
-            # By default Dr.Jit sums copies for each thread, and the number of pixels would be part of the kernel.
+            # The default mode sums copies for each thread, whose kernels depend on the number of pixels.
             dr.scatter_reduce(dr.ReduceOp.Add, total, value, paths.pixel, mode=dr.ReduceMode.Direct)
 
     def _flight(self, paths: Paths, depth: int, last: bool) -> tuple[Paths, Paths | None]:
-        """Follow paths to their next vertices, in fields or on surfaces, and add the light there. Return those that
-        scatter and, apart, those that cross a surface, which is no vertex; None: no surface lets any cross. `last`:
-        only emitters add light, since paths are as long as they may be."""
-        surfaces, crossing = self.scene.surfaces, None
+        """Follow paths to their next vertices, in fields or on surfaces, and add the light there.
+
+        Returns the paths that scatter and those that cross a surface, which is no vertex; None if no path can cross a
+        surface. `last`: the paths have their full length, and only emitters add light.
+        """
+        surfaces = self.scene.surfaces
+        crossing: Paths | None = None
         si = surfaces.intersect(paths.ray) if surfaces else None
         if surfaces and surfaces.lights_can_be_hit:
-            self.add(paths, surfaces.emission(si, paths.ray, paths.pdf, paths.pdf != 0, paths.way))
+            self.add(paths, surfaces.emission(si, paths.ray, paths.pdf, paths.pdf != 0, paths.distance))
         if last and not (surfaces and surfaces.transmitting):
             return paths, None
         n = dr.width(paths.pixel)
-        hit, t, which = self._fly(paths, si.t if si else mi.Float(dr.inf))
+        hit, t, number = self._fly(paths, si.t if si else mi.Float(dr.inf))
         onward = paths.take(dr.arange(mi.UInt32, n))
         onward = replace(onward, weight=dr.zeros(mi.Color3f, n))
         for i, part in enumerate(() if last else self.scene.parts):
-            index: Any = dr.compress(hit & (which == i))
+            index: UInt32 = dr.compress(hit & (number == i))
             if dr.width(index):
-                there = self.in_field(part, paths.take(index), dr.gather(mi.Float, t, index), depth)
-                onward.put(there, index)
-        index = dr.compress(~hit & si.is_valid()) if si is not None else ()
-        if dr.width(index):
-            there = paths.take(index)
-            there, crossing = self.on_surface(there, surfaces.intersect(there.ray), not last)
-            onward.put(there, index)
+                scattered = self.in_field(part, paths.take(index), dr.gather(mi.Float, t, index), depth)
+                onward.put(scattered, index)
+        if surfaces and si is not None:
+            index = dr.compress(~hit & si.is_valid())
+            if dr.width(index):
+                incident = paths.take(index)
+                scattered, crossing = self.on_surface(incident, surfaces.intersect(incident.ray), not last)
+                onward.put(scattered, index)
         return onward, crossing
 
-    def _fly(self, paths: Paths, end):
-        """Return whether paths scatter in a field before the distance `end`, where, and the number of its part."""
+    def _fly(self, paths: Paths, end: Float) -> tuple[Mask, Float, UInt32]:
+        """Return a mask of the paths that scatter in a field before the distance `end`, the distance, and the part."""
         n = dr.width(paths.pixel)
-        hit, t, which = dr.zeros(mi.Bool, n), end, dr.zeros(mi.UInt32, n)
+        hit, t, number = dr.zeros(mi.Bool, n), end, dr.zeros(mi.UInt32, n)
         if self.scene.parts:
             depths = [-dr.log(1 - paths.rng.next_float32()) for _ in self.scene.parts]
             steps = min(STEPS, self.scene.settings.samples)
-            hit, t, which = self.scene.fly(paths.ray, t, paths.rng.next_float32(), depths, steps)
+            hit, t, number = self.scene.free_flight(paths.ray, t, paths.rng.next_float32(), depths, steps)
             if self.scene.effects.visibility == "none":
-                hit = hit & (paths.pdf != 0)  # nothing dims what leaves a field, so nothing scatters it either
-        dr.eval(hit, t, which, paths.rng.state)
-        return hit, t, which
+                hit = hit & (paths.pdf != 0)  # light that leaves a field is neither attenuated nor scattered
+        dr.eval(hit, t, number, paths.rng.state)
+        return hit, t, number
 
-    def in_field(self, part, paths: Paths, t, depth: int) -> Paths:
-        """Paths that meet a point of `part` at the distance `t`; at `depth` 2 its direct light is known already."""
+    def in_field(self, part: Part, paths: Paths, t: Float, depth: int) -> Paths:
+        """Return `paths` scattered at the distance `t` in `part`; add the direct light there unless `depth` is 2."""
         frame = part.frame
         x = frame.point_to_field(paths.ray.o + t * paths.ray.d)
         number = dr.gather(mi.UInt32, self.number, paths.pixel)
@@ -140,16 +156,21 @@ class Walk:
         weight = paths.weight * dr.select(pdf > 1e-8, mi.Color3f(*value) / pdf, 0)
         ray = mi.Ray3f(frame.point_to_world(x), frame.direction_to_world(wi))
         zero = dr.zeros(mi.Float, dr.width(t))
-        return replace(paths, ray=ray, weight=weight, pdf=zero, way=None if paths.way is None else mi.Float(zero))
+        distance = None if paths.distance is None else mi.Float(zero)
+        return replace(paths, ray=ray, weight=weight, pdf=zero, distance=distance)
 
-    def on_surface(self, paths: Paths, si, lit: bool) -> tuple[Paths, Paths | None]:
-        """Add the direct light at the surface points `si`, if `lit`. Return the paths that scatter there, one for each
-        of `paths`, and those that cross the surface (None: no surface lets any)."""
+    def on_surface(self, paths: Paths, si: Array, lit: bool) -> tuple[Paths, Paths | None]:
+        """Add the direct light at the surface points `si` if `lit`.
+
+        Returns the paths that scatter there, one for each of `paths`, and those that cross the surface, None if no path
+        can cross a surface.
+        """
         surfaces = self.scene.surfaces
+        assert surfaces
         active = si.is_valid() & (dr.max(paths.weight) > 0)
         if lit:
             self.add(paths, surfaces.direct(si, paths.rng, active))
-            # One kernel for each: fused, Dr.Jit 1.5 defines a BSDF's function twice and LLVM refuses it.
+            # Kept apart from the next kernel: fused, Dr.Jit 1.5 defines a BSDF's function twice, which LLVM refuses.
             dr.eval(self.total, paths.rng.state)
         ray, weight, pdf, crossed = surfaces.scatter(si, paths.rng, active)
         weight = paths.weight * weight
@@ -157,16 +178,17 @@ class Walk:
         if not surfaces.transmitting:
             return scattered, None
         dr.eval(scattered.ray, weight, pdf, crossed, paths.rng.state)
-        straight = replace(paths, ray=ray, weight=weight, way=paths.way + si.t)
+        straight = replace(paths, ray=ray, weight=weight, distance=paths.distance + si.t)
         straight = straight.take(dr.compress(crossed & (dr.max(weight) > 0)))
-        return replace(scattered, weight=dr.select(crossed, 0, weight), way=dr.zeros(mi.Float, dr.width(pdf))), straight
+        weight = dr.select(crossed, 0, weight)
+        return replace(scattered, weight=weight, distance=dr.zeros(mi.Float, dr.width(pdf))), straight
 
     def _roulette(self, paths: Paths, depth: int) -> Paths:
-        """The paths that still carry light."""
+        """Return the paths that still carry light; from `ROULETTE_DEPTH` on, a random choice of them."""
         weight = dr.max(paths.weight)
         alive = weight > 0
         if depth > ROULETTE_DEPTH:
-            chance = dr.detach(dr.minimum(weight, 0.95))  # who survives has no derivative
+            chance = dr.detach(dr.minimum(weight, 0.95))  # the choice has no derivative
             alive = alive & (paths.rng.next_float32() < chance)
             paths = replace(paths, weight=paths.weight * dr.select(alive, dr.rcp(chance), 0))
         return paths.take(dr.compress(alive))
