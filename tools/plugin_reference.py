@@ -2,67 +2,32 @@
 
     python tools/plugin_reference.py
 
-All of it stands in the package: in the docstrings of the plugins' classes and of the outputs' module, whose tables are
-reStructuredText, and in the registry of visibility methods. Needs no variant of Mitsuba.
+All of it stands in the package: in the docstrings of the modules of the plugins and of the outputs, whose tables and
+examples are reStructuredText, and in the registry of visibility methods. Needs no variant of Mitsuba.
 """
 
 import ast
+import itertools
 import re
+import textwrap
 from pathlib import Path
 
 from mi_ntf.infer.visibility import REGISTRY
 from mi_ntf.infer.visibility.method import Method
 
+CODE = ".. code-block:: "
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "docs" / "plugins.md"
 PACKAGE = ROOT / "mi_ntf" / "render"
 
 PLUGINS = {
-    "Integrator `nrf`": ("plugins/integrator.py", "NRFIntegrator"),
-    "Medium `nrf`": ("plugins/medium.py", "NRFMedium"),
-    "Emitter `ntf`": ("plugins/emitter.py", "NTFEmitter"),
-    "Phase function `nrf`": ("plugins/phase.py", "NRFPhase"),
+    "Integrator `nrf`": "plugins/integrator.py",
+    "Medium `nrf`": "plugins/medium.py",
+    "Emitter `ntf`": "plugins/emitter.py",
+    "Phase function `nrf`": "plugins/phase.py",
+    "Further outputs (`aovs`)": "transport/aovs.py",
 }
-"""Heading → file and class of a plugin."""
-OUTPUTS = "transport/aovs.py"
-
-EXAMPLES = {
-    "Integrator `nrf`": (
-        """<integrator type="nrf">
-    <string name="visibility" value="transmittance_map"/>
-    <integer name="max_depth" value="4"/>
-</integrator>""",
-        """{"type": "nrf", "visibility": "transmittance_map", "max_depth": 4}""",
-    ),
-    "Medium `nrf`": (
-        """<shape type="sphere">
-    <point name="center" x="0.101624" y="0.794786" z="0.000442"/> <float name="radius" value="1.002768"/>
-    <bsdf type="null"/>
-    <medium type="nrf" name="interior">
-        <string name="filename" value="scenes/statue/field.safetensors"/>
-    </medium>
-</shape>""",
-        """{
-    "type": "sphere",
-    "center": [0.101624, 0.794786, 0.000442],
-    "radius": 1.002768,
-    "bsdf": {"type": "null"},
-    "interior": {"type": "nrf", "filename": "scenes/statue/field.safetensors"},
-}""",
-    ),
-    "Emitter `ntf`": (
-        """<emitter type="ntf">
-    <emitter type="point"> <point name="position" x="1.5" y="2.6" z="2.7"/> </emitter>
-    <medium type="nrf"> <string name="filename" value="scenes/statue/field.safetensors"/> </medium>
-</emitter>""",
-        """{
-    "type": "ntf",
-    "light": {"type": "point", "position": [1.5, 2.6, 2.7]},
-    "field": {"type": "nrf", "filename": "scenes/statue/field.safetensors"},
-}""",
-    ),
-}
-"""Heading → the plugin as XML and as dictionary of `mi.load_dict`."""
+"""Heading → file whose docstring is the text below it."""
 
 INTRODUCTION = """# Plugins
 
@@ -83,33 +48,34 @@ environments. Other lights, such as area lights, are sampled at random.
 
 def page() -> str:
     """The text of docs/plugins.md."""
-    parts = [INTRODUCTION]
-    for heading, (file, name) in PLUGINS.items():
-        summary, _, rest = markdown(docstring(PACKAGE / file, name)).partition("\n\n")
-        parts.append("\n\n".join([f"## {heading}", summary, *example(heading), rest, ""]).rstrip("\n") + "\n")
-    parts.append(f"## Further outputs (`aovs`)\n\n{markdown(docstring(PACKAGE / OUTPUTS))}\n")
-    return "\n".join([*parts, METHODS, methods(), ""])
+    parts = [f"## {heading}\n\n{markdown(docstring(file))}\n" for heading, file in PLUGINS.items()]
+    return "\n".join([INTRODUCTION, *parts, METHODS, methods(), ""])
 
 
-def example(heading: str) -> list[str]:
-    """Return code blocks with the plugin as XML and as dictionary."""
-    blocks = zip(("xml", "python"), EXAMPLES.get(heading, ()), strict=False)
-    return [f"```{language}\n{code}\n```" for language, code in blocks]
+def docstring(file: str) -> str:
+    """Return the docstring of a module in the folder of the renderer."""
+    return ast.get_docstring(ast.parse((PACKAGE / file).read_text(encoding="utf-8"))) or ""
 
 
-def docstring(file: Path, name: str | None = None) -> str:
-    """The docstring of the class `name` in `file`, wherever it is defined there, or that of the module."""
-    tree = ast.parse(file.read_text(encoding="utf-8"))
-    if name is None:
-        return ast.get_docstring(tree)
-    classes = (node for node in ast.walk(tree) if isinstance(node, ast.ClassDef))
-    return next(ast.get_docstring(node) for node in classes if node.name == name)
+def examples(text: str) -> dict[str, str]:
+    """Return the code blocks of reStructuredText: language → code."""
+    blocks = text.split("\n\n")
+    return {before.removeprefix(CODE): textwrap.dedent(block)
+            for before, block in itertools.pairwise(blocks) if before.startswith(CODE)}
 
 
 def markdown(text: str) -> str:
-    """reStructuredText with simple tables as Markdown."""
-    blocks = (block.splitlines() for block in text.split("\n\n"))
-    return inline("\n\n".join(table(simple_table(b)) if is_border(b[0]) else "\n".join(b) for b in blocks))
+    """Convert reStructuredText with simple tables and code blocks to Markdown."""
+    parts = []
+    for block in text.split("\n\n"):
+        lines = block.splitlines()
+        if block.startswith(CODE):
+            parts.append(f"```{block.removeprefix(CODE)}")
+        elif block.startswith(" "):
+            parts[-1] += f"\n{textwrap.dedent(block)}\n```"
+        else:
+            parts.append(inline(table(simple_table(lines)) if is_border(lines[0]) else block))
+    return "\n\n".join(parts)
 
 
 def inline(text: str) -> str:
@@ -160,7 +126,7 @@ def described(method: Method) -> list[str]:
         method.name,
         method.summary,
         "nothing" if not method.numbers else "maps, for the field" if method.per_field else "a table",
-        f"discrete, others by `{method.drawn}`" if method.drawn else "any",
+        f"discrete, others by `{method.sampled}`" if method.sampled else "any",
         ", ".join(f"`{dial}`" for dial in method.dials),
     ]
 

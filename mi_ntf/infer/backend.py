@@ -7,10 +7,11 @@ import numpy as np
 
 from ..core.errors import MiNtfError
 from ..core.variants import VARIANTS
+from .types import Float, UInt32
 
 
 def module(variant: str) -> ModuleType:
-    """The Dr.Jit module (``Float``, ``Texture2f``, …) behind a Mitsuba variant such as ``llvm_ad_rgb``.
+    """Return the Dr.Jit module (``Float``, ``Texture2f``, …) behind a Mitsuba variant such as ``llvm_ad_rgb``.
 
     Raises MiNtfError for variants without a JIT compiler, without derivatives, or not linear RGB in single precision.
     """
@@ -23,25 +24,27 @@ def module(variant: str) -> ModuleType:
 
 
 ALIGNMENT = 64
-"""Bytes that Dr.Jit's own arrays begin at a multiple of."""
+"""Alignment of Dr.Jit's own arrays, bytes."""
 
 
-def floats(values: np.ndarray, dj: ModuleType):
-    """`values`, raveled, as a ``Float`` of the module `dj`. Dr.Jit takes NumPy's memory as it lies on a processor, and
-    kernels that fetch from it differ by whether it is aligned, which is chance: they were compiled again now and then,
-    for a light that moved."""
+def floats(values: np.ndarray, dj: ModuleType) -> Float:
+    """Return `values`, raveled, as a ``Float`` of the module `dj`.
+
+    Dr.Jit uses NumPy's memory in place on a processor, and compiles a kernel anew if the alignment of its inputs
+    changes. NumPy's alignment is a matter of chance, so the values are copied to aligned memory.
+    """
     return dj.Float(_aligned(values, np.float32))
 
 
-def words(values: np.ndarray, dj: ModuleType):
+def words(values: np.ndarray, dj: ModuleType) -> UInt32:
     """Return `values`, raveled, as a ``UInt32`` of the module `dj`; see :func:`floats`."""
     return dj.UInt32(_aligned(values, np.uint32))
 
 
-def _aligned(values: np.ndarray, kind: type) -> np.ndarray:
-    flat: np.ndarray = np.asarray(values, kind).ravel()
+def _aligned(values: np.ndarray, dtype: type) -> np.ndarray:
+    flat: np.ndarray = np.asarray(values, dtype).ravel()
     raw = np.empty(flat.nbytes + ALIGNMENT, np.uint8)
     first = -raw.ctypes.data % ALIGNMENT
-    aligned: np.ndarray = raw[first : first + flat.nbytes].view(kind)
+    aligned: np.ndarray = raw[first : first + flat.nbytes].view(dtype)
     aligned[:] = flat
     return aligned

@@ -1,38 +1,42 @@
-"""A field's density and reflectance, sampled into sparse volumes: made once, kept as plain arrays."""
+"""A field's density and reflectance, sampled once into sparse volumes, plain arrays."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from types import ModuleType
+from typing import TypeAlias
 
 import drjit as dr
 import numpy as np
 
 from ..core.architecture import LOG_FLOOR
+from ..core.spheres import fibonacci
 from . import bricks
 from .backend import words
 from .bricks import SIDE, any_between, bricks_per_side, grown
 from .network import LOG_MIN_DENSITY, NetworkField
+from .types import Float, Reflected, Vector
 
 VERSION = 1
-"""Version of the arrays. Those of another version are not read from field files."""
+"""Version of the arrays; arrays of other versions in field files are not read."""
 SURVEY = 192
-"""Voxels per side of the first, dense sampling. Bricks are sampled only near its density."""
+"""Largest number of voxels per side of the first, dense sampling. Bricks are sampled only near its density."""
 REFLECTANCE_RESOLUTION = 128
-"""Voxels per side of reflectance and of softness, at most."""
+"""Largest number of voxels per side of reflectance and of softness."""
 PART = 1 << 20
 """Number of points that are evaluated together, which bounds the memory."""
+Progress: TypeAlias = Callable[[float], None]
+"""Receives the fraction of the work that is done."""
 
 
 def bake(field: NetworkField, resolution: int, dj: ModuleType,
-         progress: Callable[[float], None] = lambda done: None) -> dict[str, np.ndarray]:
+         progress: Progress = lambda done: None) -> dict[str, np.ndarray]:
     """Return the arrays of a :class:`mi_ntf.infer.grid.GridField`: ln σ at `resolution`³ voxels, and arrays from it.
 
     Names with a dot are arrays of :class:`mi_ntf.infer.bricks.Bricks`. ``density`` holds ln σ, since the networks' own
     σ is the exponential of a smooth function. Its voxels hold the coefficients f − f″/12 along each axis, between which
     trilinear interpolation is right on average (Condat and Möller 2011, quasi-interpolation); none exceeds the highest
-    sample. ``reflectance``, of fields whose own is slow, has 8 channels, as
-    :meth:`mi_ntf.infer.network.NetworkField.reflectance`. ``hull`` (k, 3): points whose convex hull holds all density.
-    ``numbers``: upper bound of the density; highest specular lobe, s/(4 α²), at a voxel with matter. `progress` is told
-    the fraction of the densities that are sampled.
+    sample. ``reflectance``, only of fields with a slow network, has the 8 channels of :func:`flat`. ``hull`` (k, 3):
+    points whose convex hull holds all density. ``numbers``: upper bound of the density; highest specular lobe,
+    s/(4 α²), at a voxel with matter. `progress` counts the sampled densities.
     """
     places, values = _density(field, resolution, dj, progress)
     coarse = min(resolution, REFLECTANCE_RESOLUTION)
@@ -42,8 +46,8 @@ def bake(field: NetworkField, resolution: int, dj: ModuleType,
     majorant = float(np.exp(values.max())) if len(values) else 0.0
     del values
     index = np.flatnonzero(matter)
-    found = at_voxels(lambda p: flat(field.reflectance(p)), 8, index, coarse, dj)
-    gloss = float((found[:, 7] / (4 * found[:, 6] ** 4)).max(initial=0.0))
+    matter_reflectance = at_voxels(lambda p: flat(field.reflectance(p)), 8, index, coarse, dj)
+    gloss = float((matter_reflectance[:, 7] / (4 * matter_reflectance[:, 6] ** 4)).max(initial=0.0))
     if not field.quick:
         near = np.flatnonzero(grown(matter))
         dense = np.zeros((coarse**3, 8), np.float32)
@@ -52,13 +56,13 @@ def bake(field: NetworkField, resolution: int, dj: ModuleType,
     return result | {"hull": support_points(ends, resolution), "numbers": np.array([majorant, gloss])}
 
 
-def _named(prefix: str, arrays: dict) -> dict:
+def _named(prefix: str, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {f"{prefix}.{name}": array for name, array in arrays.items()}
 
 
-def _density(field: NetworkField, n: int, dj: ModuleType, progress) -> tuple[np.ndarray, np.ndarray]:
+def _density(field: NetworkField, n: int, dj: ModuleType, progress: Progress) -> tuple[np.ndarray, np.ndarray]:
     """Return the places (bricks, 3), z first, and voxels (bricks, 9, 9, 9) of all bricks that hold density."""
-    kept: list = [(np.zeros((0, 3), int), np.zeros((0,) + (SIDE + 1,) * 3, np.float32))]
+    parts = [(np.zeros((0, 3), int), np.zeros((0,) + (SIDE + 1,) * 3, np.float32))]
     highest = LOG_FLOOR
     for places, samples in sampled_bricks(field, n, (-1, SIDE + 2), dj, progress):
         highest = max(highest, float(samples.max()))
@@ -66,14 +70,14 @@ def _density(field: NetworkField, n: int, dj: ModuleType, progress) -> tuple[np.
             inner, before, after = (samples.take(range(k, k + samples.shape[axis] - 2), axis) for k in (1, 0, 2))
             samples = (14 * inner - before - after) / 12
         dense = (samples > LOG_MIN_DENSITY).any((1, 2, 3))
-        kept.append((places[dense], samples[dense]))
-    places, values = (np.concatenate(parts) for parts in zip(*kept, strict=True))
+        parts.append((places[dense], samples[dense]))
+    places, values = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     return places, np.minimum(values, np.float32(highest), out=values)
 
 
 def sampled_bricks(field: NetworkField, n: int, reach: tuple[int, int], dj: ModuleType,
-                   progress: Callable[[float], None] = lambda done: None) -> Iterator[tuple]:
-    """Yield the places (k, 3), z first, of some bricks near density and ln σ of their voxels, `LOG_FLOOR` at least.
+                   progress: Progress = lambda done: None) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield parts of all bricks near density: places (k, 3), z first, and ln σ of their voxels, at least `LOG_FLOOR`.
 
     `reach`: the first voxel of an edge and the one behind its last, counted from the brick's first. Voxels outside the
     volume are those of its border.
@@ -85,19 +89,19 @@ def sampled_bricks(field: NetworkField, n: int, reach: tuple[int, int], dj: Modu
     places = np.argwhere(any_between(grown(coarse > LOG_FLOOR), first * survey // (2 * n), last * survey // (2 * n)))
     edge = reach[1] - reach[0]
     parts = -(-len(places) * edge**3 // PART)
-    for number, some in enumerate(np.array_split(places, parts) if parts else ()):
+    for number, part in enumerate(np.array_split(places, parts) if parts else ()):
         progress((1 + number / parts) / 2)
-        voxels = np.clip(SIDE * some[..., None] + np.arange(*reach), 0, n - 1).astype(np.uint32)
+        voxels = np.clip(SIDE * part[..., None] + np.arange(*reach), 0, n - 1).astype(np.uint32)
         z, y, x = voxels[:, 0, :, None, None], voxels[:, 1, None, :, None], voxels[:, 2, None, None, :]
         samples = at_voxels(lambda p: [field.log_density(p)], 1, ((z * n + y) * n + x).ravel(), n, dj)
-        yield some, np.maximum(samples, LOG_FLOOR).reshape(len(some), edge, edge, edge)
+        yield part, np.maximum(samples, LOG_FLOOR).reshape(len(part), edge, edge, edge)
 
 
-def at_voxels(function, count: int, index: np.ndarray | None, n: int, dj: ModuleType,
-              progress: Callable[[float], None] = lambda done: None) -> np.ndarray:
+def at_voxels(function: Callable[[Vector], Sequence[Float]], count: int, index: np.ndarray | None, n: int,
+              dj: ModuleType, progress: Progress = lambda done: None) -> np.ndarray:
     """Return ``function(p)``, a list of `count` arrays, at the centres of voxels; (voxels, count), float32.
 
-    `index`: numbers of the voxels among n³, x fastest; None: all of them. `progress` is told the fraction that is done.
+    `index`: numbers of the voxels among n³, x fastest; None: all of them.
     """
     total = n**3 if index is None else len(index)
     result = np.empty((total, count), np.float32)
@@ -114,20 +118,22 @@ def at_voxels(function, count: int, index: np.ndarray | None, n: int, dj: Module
     return result
 
 
-def flat(reflectance) -> list:
-    """Return the 8 channels of a reflectance."""
+def flat(reflectance: Reflected) -> list[Float]:
+    """Return a reflectance as 8 channels."""
     normal, albedo, roughness, specular = reflectance
     return [*normal, *albedo, roughness, specular]
 
 
 def _outline(places: np.ndarray, values: np.ndarray, n: int, coarse: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first and the last voxel (k, 3), x first, of each line along x that holds density, and which of
-    coarse³ voxels (z, y, x) hold some of it."""
+    """Return the outline of the density and a mask of the coarse³ voxels (z, y, x) that hold some.
+
+    The outline are the first and last voxel (k, 3), x first, of each line along x that holds density.
+    """
     low, high = np.full((n + 1, n + 1), n, np.int32), np.full((n + 1, n + 1), -1, np.int32)
     matter = np.zeros((coarse,) * 3, bool)
-    for some, part in zip(*(np.array_split(a, max(1, len(places) // 512)) for a in (places, values)), strict=True):
-        dense = part > LOG_MIN_DENSITY
-        z, y, x = np.minimum(SIDE * some.T[..., None] + np.arange(SIDE + 1), n - 1)  # (bricks, 9) each
+    for place, value in zip(*(np.array_split(a, max(1, len(places) // 512)) for a in (places, values)), strict=True):
+        dense = value > LOG_MIN_DENSITY
+        z, y, x = np.minimum(SIDE * place.T[..., None] + np.arange(SIDE + 1), n - 1)  # (bricks, 9) each
         brick, line_z, line_y = np.nonzero(dense.any(3))
         line = dense[brick, line_z, line_y]
         where = z[brick, line_z], y[brick, line_y]
@@ -140,18 +146,15 @@ def _outline(places: np.ndarray, values: np.ndarray, n: int, coarse: int) -> tup
 
 
 def support_points(voxels: np.ndarray, n: int, directions: int = 1200) -> np.ndarray:
-    """Return the furthest points along many directions that interpolation between some `voxels` (k, 3) of n³ can reach.
+    """Return the furthest points along many directions that interpolation between `voxels` (k, 3) of n³ can reach.
 
-    Voxels and points (k, 3), float64, have x first; without voxels the one point is the origin. The points' hull misses
-    hardly any density: 1e-4 on average, 0.005 at most, along directions in between (four objects).
+    Voxels and points (k, 3), float64, have x first; without voxels the one point is the origin.
     """
     if not len(voxels):
         return np.zeros((1, 3))
     points = (voxels + 0.5) * (2 / n) - 1
-    z = 1 - (np.arange(directions) + 0.5) * 2 / directions
-    phi = np.arange(directions) * np.pi * (3 - 5**0.5)
-    fan = np.stack([np.sqrt(1 - z * z) * np.cos(phi), np.sqrt(1 - z * z) * np.sin(phi), z], 1)
-    fan = np.concatenate([fan, np.eye(3), -np.eye(3)])
+    fan = np.concatenate([fibonacci(directions), np.eye(3), -np.eye(3)])
     furthest = np.concatenate([(points @ part.T).argmax(0) for part in np.array_split(fan, 40)])
     reach = np.where(fan < 0, -2 / n, 2 / n)  # a voxel fades out at its neighbours
-    return np.clip(np.unique(points[furthest] + reach, axis=0), -1, 1)
+    result: np.ndarray = np.clip(np.unique(points[furthest] + reach, axis=0), -1, 1)
+    return result

@@ -1,4 +1,4 @@
-"""Sparse volumes: bricks of 8³ trilinear cells where there is anything, and an index that also skips empty space."""
+"""Sparse volumes: bricks of 8³ trilinear cells that hold matter, and an index that also skips empty space."""
 
 import itertools
 from types import ModuleType
@@ -7,10 +7,12 @@ import drjit as dr
 import numpy as np
 
 from ..core.errors import MiNtfError
+from . import ops
 from .backend import words
+from .types import Float, Mask, Place, UInt32, Vector
 
 SIDE = 8
-"""Cells along an edge of a brick. A brick holds the 9³ voxels around its cells: those on its far faces twice."""
+"""Cells along an edge of a brick. A brick holds the 9³ voxels around its cells, so neighbours share a face."""
 LINE, LAYER, WORDS = SIDE, SIDE * (SIDE + 1), SIDE * (SIDE + 1) ** 2
 """Words of a line of voxels, of a layer of lines, and of a brick, for each channel."""
 FARTHEST = 15
@@ -30,7 +32,7 @@ class Bricks:
     Parameters
     ----------
     arrays
-        Result of :func:`pack`. Raises ValueError where they cannot be that.
+        Result of :func:`pack`. Raises ValueError if they cannot be that.
     dj
         Dr.Jit module of the back end.
 
@@ -38,7 +40,7 @@ class Bricks:
     -----
     A word holds the 16-bit levels of a voxel and of the next one along x, so a lookup takes four fetches for each
     channel and one of the index. An entry of the index is the number of a brick, one bit for each of its octants that
-    holds anything, and the distance to the next brick that does. Brick 0 is empty.
+    holds matter, and the distance to the next brick that does. Brick 0 is empty.
 
     Points outside the voxels' centres read the nearest voxels. :meth:`place` does the work that lookups and clear
     distances at the same points share.
@@ -61,14 +63,14 @@ class Bricks:
         """Size in bytes."""
         return 4 * (dr.width(self._words) + dr.width(self._index))
 
-    def place(self, p) -> tuple:
-        """Return where the points `p` lie: in voxels from the first centre, by axis, and their entries in the index."""
+    def place(self, p: Vector) -> Place:
+        """Return the places of `p`: by axis in voxels from the first centre, and their entries in the index."""
         # NaN must not become an index.
-        place = [dr.fmin(dr.fmax(dr.fma(self._half, c, self._first), 0), self._last) for c in p]
+        place = [ops.fmin(ops.fmax(dr.fma(self._half, c, self._first), 0), self._last) for c in p]
         x, y, z = (self._dj.UInt32(f) >> 3 for f in place)
         return *place, dr.gather(self._dj.UInt32, self._index, (z * self._bricks + y) * self._bricks + x)
 
-    def at(self, place: tuple) -> list:
+    def at(self, place: Place) -> list[Float]:
         """Return the channels at a :meth:`place`."""
         *cell, entry = place
         corner = [self._dj.UInt32(f) for f in cell]
@@ -76,12 +78,12 @@ class Bricks:
         x, y, z = (c & (SIDE - 1) for c in corner)
         first = (entry & ((1 << _OCTANTS) - 1)) * self._size + z * LAYER + y * LINE + x
 
-        def along_x(index):
+        def along_x(index: UInt32) -> Float:
             word = dr.gather(self._dj.UInt32, self._words, index)
             low = self._dj.Float(word & 0xFFFF)
             return low + fx * (self._dj.Float(word >> 16) - low)
 
-        def along_y(index):
+        def along_y(index: UInt32) -> Float:
             low = along_x(index)
             return low + fy * (along_x(index + LINE) - low)
 
@@ -91,8 +93,8 @@ class Bricks:
             result.append(low + step * (near + fz * (along_y(first + (channel * WORDS + LAYER)) - near)))
         return result
 
-    def clear_distance(self, place: tuple, inverse_d):
-        """Return the distance that a ray runs through empty space from a :meth:`place`; 0 where there may be anything.
+    def clear_distance(self, place: Place, inverse_d: Vector) -> Float:
+        """Return the distance that a ray runs through empty space from a :meth:`place`; 0 where there may be matter.
 
         `inverse_d`: componentwise 1/direction (finite). The distance ends at the empty octant, or at the empty cube of
         bricks around an empty brick.
@@ -111,13 +113,14 @@ class Bricks:
             distance = dr.minimum(distance, ((SIDE // 2) * face - f) * inverse)
         return dr.select(empty, dr.maximum(distance * self._voxel, 0), 0)
 
-    def occupied(self, place: tuple):
-        """Return True where a :meth:`place` lies in a brick that holds anything."""
+    def occupied(self, place: Place) -> Mask:
+        """Return True where a :meth:`place` lies in a brick that holds matter."""
         return (place[-1] & ((1 << _OCTANTS) - 1)) > 0
 
     def distances(self) -> np.ndarray:
-        """Return the Chebyshev distance of each brick (z, y, x) to the next one that holds anything, in bricks."""
-        return (self._index.numpy() >> _DISTANCE).reshape((self.side,) * 3)
+        """Return the Chebyshev distance of each brick (z, y, x) to the next one that holds matter, in bricks."""
+        distances: np.ndarray = (self._index.numpy() >> _DISTANCE).reshape((self.side,) * 3)
+        return distances
 
 
 def pack(values: np.ndarray, places: np.ndarray, octants: np.ndarray, resolution: int,
@@ -131,12 +134,11 @@ def pack(values: np.ndarray, places: np.ndarray, octants: np.ndarray, resolution
     places
         (bricks, 3) positions of the bricks, z first, in bricks.
     octants
-        (bricks, 2, 2, 2) bool, z first: which octants hold anything.
+        (bricks, 2, 2, 2) bool, z first: the octants that hold matter.
     resolution
         Voxels along an edge of the volume.
     empty
-        Upper bound of every channel's value where there is no brick. Values are stored to 1/65535 of their channel's
-        range.
+        Upper bound of every channel where there is no brick. Values are stored to 1/65535 of their channel's range.
 
     Raises
     ------
@@ -165,28 +167,27 @@ def pack(values: np.ndarray, places: np.ndarray, octants: np.ndarray, resolution
 
 def _check(arrays: dict[str, np.ndarray]) -> None:
     """Raise ValueError if a lookup in `arrays`, which may come from a file, would read outside of their memory."""
-    index, held, ranges, resolution = (
+    index, stored, ranges, resolution = (
         arrays.get(name, np.zeros(0)) for name in ("index", "words", "range", "resolution"))
     side = bricks_per_side(int(resolution[0])) if resolution.size == 1 else 0
-    whole = (held.ndim == 5 and held.shape[2:] == (SIDE + 1, SIDE + 1, SIDE) and ranges.shape == (2, held.shape[1])
-             and index.shape == (side,) * 3 and index.dtype == held.dtype == np.uint32)
-    if not whole or not np.isfinite(ranges).all() or (index & ((1 << _OCTANTS) - 1)).max() >= len(held):
+    fits = (stored.ndim == 5 and stored.shape[2:] == (SIDE + 1, SIDE + 1, SIDE) and ranges.shape == (2, stored.shape[1])
+            and index.shape == (side,) * 3 and index.dtype == stored.dtype == np.uint32)
+    if not fits or not np.isfinite(ranges).all() or (index & ((1 << _OCTANTS) - 1)).max() >= len(stored):
         raise ValueError("these are no bricks")
 
 
-def of_dense(values: np.ndarray, wanted: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the arrays of a :class:`Bricks` of `values` (z, y, x, channels) where the voxels `wanted` (z, y, x) are
-    interpolated."""
+def of_dense(values: np.ndarray, mask: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the arrays of a :class:`Bricks` of `values` (z, y, x, channels) around the voxels of `mask`."""
     n = len(values)
     first = SIDE * np.arange(bricks_per_side(n))
-    places = np.argwhere(any_between(wanted, first, first + SIDE))
+    places = np.argwhere(any_between(mask, first, first + SIDE))
     voxels = np.minimum(SIDE * places[..., None] + np.arange(SIDE + 1), n - 1)  # (bricks, axis, 9)
     z, y, x = voxels[:, 0, :, None, None], voxels[:, 1, None, :, None], voxels[:, 2, None, None, :]
-    return pack(np.moveaxis(values[z, y, x], -1, 1), places, octants_of(wanted[z, y, x]), n, 0.0)
+    return pack(np.moveaxis(values[z, y, x], -1, 1), places, octants_of(mask[z, y, x]), n, 0.0)
 
 
 def octants_of(dense: np.ndarray) -> np.ndarray:
-    """Return which octants (bricks, 2, 2, 2) interpolate between any voxel that is `dense` (bricks, 9, 9, 9)."""
+    """Return a mask of the octants (bricks, 2, 2, 2) that interpolate a voxel that is `dense` (bricks, 9, 9, 9)."""
     half = SIDE // 2
     parts = [dense[:, z : z + half + 1, y : y + half + 1, x : x + half + 1].any((1, 2, 3))
              for z, y, x in itertools.product((0, half), repeat=3)]
@@ -194,8 +195,7 @@ def octants_of(dense: np.ndarray) -> np.ndarray:
 
 
 def any_between(mask: np.ndarray, first: np.ndarray, last: np.ndarray) -> np.ndarray:
-    """Return which cells (z, y, x) hold any voxel of `mask`, where cell k spans the voxels first[k] to last[k] of each
-    axis."""
+    """Return a mask of the cells (z, y, x) that hold a voxel of `mask`; cell k spans voxels first[k] to last[k]."""
     for axis in range(3):
         parts = [mask.take(range(a, min(b + 1, mask.shape[axis])), axis).any(axis)
                  for a, b in zip(first, last, strict=True)]

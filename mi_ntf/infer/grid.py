@@ -1,7 +1,7 @@
 """Densities that marches read: a field baked into bricks, or its networks with the bricks' empty space."""
 
 from types import ModuleType
-from typing import Any, Protocol
+from typing import Protocol
 
 import drjit as dr
 import numpy as np
@@ -11,10 +11,11 @@ from . import ops
 from .bake import bake
 from .bricks import Bricks
 from .network import NOTHING, NetworkField, cut, density_of, inside
+from .types import Float, Place, Reflected, Vector
 
 
-class Volume(Protocol):
-    """Extinction inside the unit sphere: all that marches, maps and atlases know of a medium.
+class Density(Protocol):
+    """Extinction inside the unit sphere, the interface of a medium for marches, maps and atlases.
 
     ``resolution``: voxels per side of its finest detail, for default step lengths.
     ``majorant``: upper bound of the density, 1/(unit-sphere radius).
@@ -26,16 +27,19 @@ class Volume(Protocol):
     hull: np.ndarray
     bounds: tuple[np.ndarray, np.ndarray]
 
-    def density(self, p: Any) -> Any:
+    def density(self, p: Vector, /) -> Float:
         """Return σ at the points `p`, 1/(unit-sphere radius); 0 outside the unit sphere."""
 
-    def place(self, p: Any) -> tuple:
-        """Return a tuple of arrays: what `log_density` and `clear_distance` share at the points `p`."""
+    def reflectance(self, p: Vector, /) -> Reflected:
+        """Return normal, albedo, roughness and specular weight at the points `p`."""
 
-    def log_density(self, place: tuple) -> Any:
+    def place(self, p: Vector, /) -> Place:
+        """Return the work that `log_density` and `clear_distance` share at the points `p`."""
+
+    def log_density(self, place: Place, /) -> Float:
         """Return ln σ at a :meth:`place` inside the unit sphere, ``NOTHING`` where there is none."""
 
-    def clear_distance(self, place: tuple, inverse_d: Any) -> Any:
+    def clear_distance(self, place: Place, inverse_d: Vector, /) -> Float:
         """Return the distance from a :meth:`place` inside the sphere along which a ray meets no density, or 0.
 
         `inverse_d`: 1/direction by axis, finite.
@@ -48,10 +52,10 @@ class GridField:
     Parameters
     ----------
     arrays
-        Result of :func:`mi_ntf.infer.bake.bake`. Raises KeyError or ValueError where they cannot be that.
+        Result of :func:`mi_ntf.infer.bake.bake`. Raises KeyError or ValueError if they cannot be that.
     field
-        The networks, which give reflectance where it costs no more than some fetches: shading points are few beside the
-        steps of marches, and voxels as fine as the networks' planes would take gigabytes.
+        The networks, which give the reflectance if it costs no more than a few fetches: shading points are few beside
+        the steps of marches, and voxels as fine as the networks' planes would take gigabytes.
     """
 
     def __init__(self, arrays: dict[str, np.ndarray], field: NetworkField, dj: ModuleType):
@@ -72,16 +76,16 @@ class GridField:
         """Size in bytes."""
         return self.bricks.nbytes + (self._reflectance.nbytes if self._reflectance else 0)
 
-    def density(self, p):
+    def density(self, p: Vector) -> Float:
         """Return σ at `p`, 1/(unit-sphere radius)."""
         return density_of(inside(self.log_density(self.place(p)), p))
 
-    def log_density(self, place):
+    def log_density(self, place: Place) -> Float:
         """Return ln σ at a place, ``NOTHING`` where there is none."""
         return cut(self.bricks.at(place)[0])
 
-    def reflectance(self, p):
-        """Return what :meth:`mi_ntf.infer.network.NetworkField.reflectance` does."""
+    def reflectance(self, p: Vector) -> Reflected:
+        """Return normal, albedo, roughness and specular weight at `p`."""
         if self._reflectance is None:
             return self._field.reflectance(p)
         v = self._reflectance.at(self._reflectance.place(p))
@@ -96,17 +100,17 @@ class NetworkVolume:
         self.hull, self.bounds, self.resolution = grid.hull, grid.bounds, grid.resolution
         self._field, self._bricks = field, grid.bricks
 
-    def place(self, p):
+    def place(self, p: Vector) -> Place:
         """Return the points and their places in the bricks."""
         return tuple(p), self._bricks.place(p)
 
-    def log_density(self, place):
+    def log_density(self, place: Place) -> Float:
         """Return ln σ at a place, ``NOTHING`` where there is none and outside the bricks."""
         p, place = place
         return dr.select(self._bricks.occupied(place), cut(self._field.log_density(p)), NOTHING)
 
-    def clear_distance(self, place, inverse_d):
-        """Return how far a ray runs through empty bricks."""
+    def clear_distance(self, place: Place, inverse_d: Vector) -> Float:
+        """Return the distance that a ray runs through empty bricks."""
         return self._bricks.clear_distance(place[1], inverse_d)
 
 

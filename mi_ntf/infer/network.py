@@ -1,8 +1,9 @@
 """The field as its networks, in Dr.Jit: the twin of :mod:`mi_ntf.core.reference` (conventions there)."""
 
 import math
+from collections.abc import Callable
 from types import ModuleType
-from typing import Any
+from typing import TypeAlias
 
 import drjit as dr
 import numpy as np
@@ -12,34 +13,35 @@ from ..core import depth_profile, logistic, mixture, spheres
 from ..core.architecture import MAX_LOG_DENSITY, MIN_LOG_DENSITY, NO_VISIBILITY, Encoding, Header
 from ..core.errors import MiNtfError
 from ..core.microfacet import MIN_ROUGHNESS
-from ..core.ops import normalize
+from ..core.ops import Tensors, normalize
 from ..core.reference import PLANES
 from . import ops
+from .types import Array, Float, Mask, Reflected, Vector
+
+Profile: TypeAlias = Callable[[Vector, Vector], tuple[list[Float], Float]]
+"""``(o, d)`` of rays → places and total of :func:`mi_ntf.core.depth_profile.frame`."""
 
 MIN_DENSITY = 0.1
-"""σ below this counts as empty, 1/(unit-sphere radius): an optical depth of 0.2 at most across the whole sphere.
-Training drives empty space below it; every renderer of the field (also stock `volpath`) sees the same zero."""
+"""Least σ, 1/(unit-sphere radius); space with less is empty. It is an optical depth of 0.2 across the whole sphere.
+Training drives empty space below it, and every renderer of the field (also stock `volpath`) sees the same zero."""
 LOG_MIN_DENSITY = math.log(MIN_DENSITY)
-
 CLEAR_DEPTH = 1e-3
-"""Rays with less optical depth than this count as clear: τ = 1."""
-
-
+"""Optical depth below which a ray counts as clear: τ = 1."""
 NOTHING = -60.0
 """ln σ where there is no matter."""
 
 
-def cut(log_sigma):
+def cut(log_sigma: Float) -> Float:
     """Return `log_sigma`, but ``NOTHING`` below ``MIN_DENSITY``."""
     return dr.select(log_sigma > LOG_MIN_DENSITY, log_sigma, NOTHING)
 
 
-def inside(log_sigma, p):
+def inside(log_sigma: Float, p: Vector) -> Float:
     """Return `log_sigma`, but ``NOTHING`` outside the unit sphere."""
     return dr.select(p[0] * p[0] + p[1] * p[1] + p[2] * p[2] < 1, log_sigma, NOTHING)
 
 
-def density_of(log_sigma):
+def density_of(log_sigma: Float) -> Float:
     """Return σ, 0 where ln σ is ``NOTHING``."""
     return dr.select(log_sigma > NOTHING, dr.exp(log_sigma), 0)
 
@@ -47,11 +49,10 @@ def density_of(log_sigma):
 class NetworkField:
     """Density, reflectance and ray transmittance of one field, evaluated by its networks.
 
-    `dj` is the Dr.Jit module of the back end (:func:`mi_ntf.infer.backend.module`). Points and directions are
-    3-component tuples or arrays of ``dj.Float``.
+    `dj`: Dr.Jit module of the back end (:func:`mi_ntf.infer.backend.module`).
     """
 
-    def __init__(self, header: Header, tensors: dict[str, np.ndarray], dj: ModuleType):
+    def __init__(self, header: Header, tensors: Tensors, dj: ModuleType):
         arch = header.architecture
         self.components = arch.transmittance.components
         self._density = _Network(arch.density.encoding, "density", tensors, dj)
@@ -62,37 +63,36 @@ class NetworkField:
         self.has_visibility = baseline is not None
         self._least_specular = arch.least_specular
         self.quick = arch.reflectance.encoding.kind == "planes"
-        """True if reflectance costs no more than some fetches."""
+        """True if a reflectance costs no more than a few fetches."""
 
-    def log_density(self, p):
-        """ln σ at `p`, clipped to the legal range; without the cuts of :meth:`density`."""
+    def log_density(self, p: Vector) -> Float:
+        """Return ln σ at `p`, clipped to the legal range, without the cuts of :meth:`density`."""
         (raw,) = self._density.layers(self._density.encode(p))
         return dr.clip(raw, MIN_LOG_DENSITY, MAX_LOG_DENSITY)
 
-    def density(self, p):
-        """σ at `p`, 1/(unit-sphere radius)."""
+    def density(self, p: Vector) -> Float:
+        """Return σ at `p`, 1/(unit-sphere radius)."""
         return density_of(inside(cut(self.log_density(p)), p))
 
-    def reflectance(self, p):
-        """``(normal, albedo, roughness, specular)``: two 3-tuples and two scalars, ranges as in core.reference."""
+    def reflectance(self, p: Vector) -> Reflected:
+        """Return normal, albedo, roughness and specular weight at `p`."""
         raw = self._reflectance.layers(self._reflectance.encode(p))
         normal = normalize(ops, tuple(raw[:3]))
         r, g, b, rough, spec = (logistic.sigmoid(ops, v) for v in raw[3:])
         least = self._least_specular
         return normal, (r, g, b), MIN_ROUGHNESS + (1 - MIN_ROUGHNESS) * rough, least + (1 - least) * spec
 
-    def visibility(self, p, d):
-        """τ from `p` along the unit directions `d` towards the light, by the baseline's network: a query a point."""
+    def visibility(self, p: Vector, d: Vector) -> Float:
+        """Return τ from `p` along the unit directions `d` towards the light, by a query of the baseline's network."""
         if self._visibility is None:
             raise MiNtfError(NO_VISIBILITY)
         (raw,) = self._visibility.layers(self._visibility.encode((*p, *d)))
         return logistic.sigmoid(ops, raw)
 
-    def ray_mixture(self, o, d, profile):
-        """``(hit, h, mixture)`` of the rays through `o` along unit directions `d` towards the light: one query a ray.
+    def ray_mixture(self, o: Vector, d: Vector, profile: Profile) -> tuple[Mask, Float, mixture.Mixture]:
+        """Return ``(hit, h, mixture)`` of the rays through `o` along unit directions `d` towards the light.
 
-        `profile(o, d)`: see :class:`mi_ntf.infer.profile.DepthProfile`; read by the encoding ``depth`` alone. `mixture`
-        is a tuple of ``(w, a, b)``, see :mod:`mi_ntf.core.mixture`.
+        `profile`: see :class:`mi_ntf.infer.profile.DepthProfile`; only the encoding ``depth`` reads it.
         """
         hit, m, h = spheres.chord(ops, o, d)
         net, count = self._transmittance, 2 * self.components
@@ -109,14 +109,14 @@ class NetworkField:
 
 
 def _half(dj: ModuleType) -> bool:
-    """Return True if cooperative vectors are float16 (largest number 65504): on CUDA. On LLVM float32 is faster."""
+    """Return True if cooperative vectors are float16, as on CUDA; on LLVM float32 is faster."""
     return dr.backend_v(dj.Float) == dr.JitBackend.CUDA
 
 
 class _Network:
     """An encoding and its perceptron."""
 
-    def __init__(self, encoding: Encoding, name: str, tensors: dict, dj: ModuleType):
+    def __init__(self, encoding: Encoding, name: str, tensors: Tensors, dj: ModuleType):
         self.encoding = encoding
         self.dj = dj
         levels = [tensors[f"{name}.planes.{i}"] for i in range(len(encoding.resolutions))]
@@ -131,7 +131,7 @@ class _Network:
         count = sum(k.startswith(f"{name}.layers.") and k.endswith("weight") for k in tensors)
         self._pack(name, tensors, count)
 
-    def _pack(self, name: str, tensors: dict, count: int) -> None:
+    def _pack(self, name: str, tensors: Tensors, count: int) -> None:
         half = _half(self.dj)
         self.scalar = self.dj.Float16 if half else self.dj.Float
         tensor = self.dj.TensorXf16 if half else self.dj.TensorXf
@@ -147,10 +147,10 @@ class _Network:
                     end = np.finfo(np.float16).max
                     value = np.clip(value, -end, end).astype(np.float16)
                 net[f"layers.{2 * i}.{theirs}"] = tensor(value)
-        self.packed: Any = nn.pack(net, layout="inference")  # the network, called
+        self.packed: Array = nn.pack(net, layout="inference")
 
-    def encode(self, p) -> list:
-        """Features of the points `p`, a list of scalar arrays."""
+    def encode(self, p: Vector) -> list[Float]:
+        """Return the features of the points `p`."""
         if self.encoding.kind == "frequency":
             features = list(p)
             for k in range(self.encoding.octaves):
@@ -164,7 +164,7 @@ class _Network:
             features += [x * y * z for x, y, z in zip(*values, strict=True)]
         return features
 
-    def layers(self, features: list) -> list:
-        """The perceptron's outputs, a list of float32 arrays."""
+    def layers(self, features: list[Float]) -> list[Float]:
+        """Return the perceptron's outputs, float32."""
         out = self.packed(nn.CoopVec(*(self.scalar(f) for f in features)))
         return [self.dj.Float(v) for v in out]

@@ -1,6 +1,6 @@
-"""The march that describes a ray: where, seen from the light, its optical depth passes given levels."""
+"""The march along a ray from the light inwards: the places at which its optical depth passes given levels."""
 
-from types import ModuleType
+from collections.abc import Sequence
 
 import drjit as dr
 
@@ -8,76 +8,78 @@ from ..core import spheres
 from ..core.depth_profile import LEVELS
 from . import ops
 from .bundle import onward, safe_inverse
+from .grid import Density
 from .network import density_of
-
-FOR_NETWORKS = 0.93
-"""Steps of the march that networks read, in cells of the camera's march: with 1.1 of them `statue` is 2.6 % off, with
-0.93 2.4 %, as with 0.75. No simple fraction: where steps end on the voxels' own borders, rounding decides which are
-skipped."""
-FOR_MAPS = 0.97
-"""The same for maps of one logistic that are fitted to the march; those of two take half of it."""
-
-
-def of(medium, step: float, dj: ModuleType) -> "DepthProfile":
-    """The march through `medium` in steps of `step`, field units."""
-    return DepthProfile(medium.source, dr.opaque(dj.Float, step))
+from .types import Array, Float, Mask, Place, Vector
 
 
 class DepthProfile:
-    """`volume`: a :class:`mi_ntf.infer.grid.Volume`; `step`: opaque float, field units."""
+    """A march through `volume` in steps of `step`, an opaque float, field units."""
 
-    def __init__(self, volume, step):
+    def __init__(self, volume: Density, step: Float):
         self.volume, self.step = volume, step
 
-    def __call__(self, o, d, levels=LEVELS, begin=None):
-        """``(places, total)`` of the rays through `o` along `d` towards the light, as in
-        :func:`mi_ntf.core.depth_profile.frame`.
+    def __call__(self, o: Vector, d: Vector, levels: Sequence[float] = LEVELS,
+                 begin: Float | None = None) -> tuple[list[Float], Float]:
+        """Return ``(places, total)`` of the rays through `o` along `d` towards the light.
 
-        From the light inwards: σ in the middle of each step, σ linear across it with the slope from the step before.
-        Constant σ would find the places too close to the light where density sets in, and points in a skin too dark.
-        Steps stay on one lattice, whatever is skipped: a ray a little beside finds the same.
-        Ends at the last of the (ascending) `levels`. `begin`: t' of a light inside the sphere, beyond which no matter
-        counts.
+        Parameters
+        ----------
+        levels
+            Optical depths, ascending; the march ends at the last one.
+        begin
+            t' of a light inside the sphere, beyond which no matter counts.
+
+        Notes
+        -----
+        For places and total see :func:`mi_ntf.core.depth_profile.frame`. σ is taken in the middle of each step, linear
+        across it with the slope from the step before: constant σ would place the levels too close to the light where
+        density sets in. Steps stay on one lattice even where empty space is skipped, so neighbouring rays agree.
         """
         return self.with_end(o, d, levels, begin)[:2]
 
-    def with_end(self, o, d, levels, begin=None):
-        """``(places, total, last)``: also the place behind which the march met no more matter."""
+    def with_end(self, o: Vector, d: Vector, levels: Sequence[float],
+                 begin: Float | None) -> tuple[list[Float], Float, Float]:
+        """Return ``(places, total, last)``; behind the place `last` the march met no more matter."""
         hit, m, h = spheres.chord(ops, o, d)
         back = tuple(-c for c in d)
         inverse = safe_inverse(back)
         floats = type(o[0])
         step = self.step
 
-        def cross(s, depth, before, last, place, *places):
+        def cross(s: Float, depth: Float, before: Float, last: Float, place: Place,
+                  *places: Float) -> tuple[Array, ...]:
             sigma = density_of(self.volume.log_density(place))
             after = depth + sigma * step
             rate = dr.rcp(dr.maximum(sigma * step, 1e-6))
             bend = dr.clip(0.5 * (sigma - before) * step * rate, -1, 1)
-            shares = [(q - depth) * rate for q in levels]  # of the step, for constant σ
+            fractions = [(q - depth) * rate for q in levels]  # of the step, for constant σ
             places = tuple(
                 dr.select((g > 0) & (g <= 1), s + step * (g + bend * g * (1 - g)), c)
-                for c, g in zip(places, shares, strict=True)
+                for c, g in zip(places, fractions, strict=True)
             )
             return after, sigma, dr.select(sigma > 0, s + step, last), *places
 
-        def pass_by(s, depth, before, last, place, *places):
+        def skip_step(s: Float, depth: Float, before: Float, last: Float, place: Place,
+                      *places: Float) -> tuple[Array, ...]:
             return depth, type(before)(0), last, *places
 
-        def body(s, depth, before, places, last, active):
+        def body(s: Float, depth: Float, before: Float, places: tuple[Float, ...], last: Float,
+                 active: Mask) -> tuple[Array, ...]:
             place = self.volume.place(tuple(mi + (h - s - 0.5 * step) * di for mi, di in zip(m, d, strict=True)))
             skip = self.volume.clear_distance(place, inverse)
-            depth, before, last, *places = dr.if_stmt(
-                (s, depth, before, last, place, *places), active & (skip <= 0), cross, pass_by, label="cross"
+            depth, before, last, *crossed = ops.if_stmt(
+                (s, depth, before, last, place, *places), active & (skip <= 0), cross, skip_step, label="cross"
             )
             s = s + onward(skip, step)
-            return s, depth, before, tuple(places), last, active & (s < 2 * h) & (depth < levels[-1])
+            return s, depth, before, tuple(crossed), last, active & (s < 2 * h) & (depth < levels[-1])
 
         zero = dr.zeros(floats, dr.width(h))
         start = zero if begin is None else dr.maximum(h - begin, 0)
         active = dr.mask_t(floats)(hit & (start < 2 * h))
-        _, depth, _, places, last, _ = dr.while_loop(
-            state=(start, zero, floats(zero), tuple(floats(zero) for _ in levels), floats(zero), active),
+        state = (start, zero, floats(zero), tuple(floats(zero) for _ in levels), floats(zero), active)
+        _, depth, _, places, last, _ = ops.while_loop(
+            state=state,
             cond=lambda s, depth, before, places, last, active: active,
             body=body,
             label="ray profile",

@@ -1,58 +1,113 @@
 """Reflected light at shading points: points × lights in one kernel."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 
 from ..core import fresnel, microfacet
 from ..core.ops import dot
 from . import ops
+from .lights import LightSource
+from .types import Array, Float, Mask, UInt32, Vector, Visibility
 
 EDGE = 0.02
 """Cosines over which derivatives spread the jump of the phase function between light from below and from above."""
 
 
-def reflect(points, lights, visibility, specular=True, gradients=False, skin=True):
-    """Σ over lights of irradiance · τ · f, f the phase function of :func:`mi_ntf.core.microfacet.scattering`: the h(x,
-    ω_o) of method.md, section 1.
+class Reflectance(NamedTuple):
+    """Reflectance of field points: ranges as in :mod:`mi_ntf.core.microfacet`, softness as in :mod:`mi_ntf.core.skin`.
 
-    points      :class:`Points`
-    lights      has ``count`` and ``sample(index, x, active) → (wi, irradiance, distance)``, and the number that
-                `visibility` knows the light by, where that is not its index
-    visibility  has ``tau`` (:mod:`mi_ntf.infer.visibility`), a number or a colour; None: no shadow. The light then does
-                not pass the skin either, so a point reflects as a surface does, ρ ⟨n,ω_i⟩⁺
-    specular    whether the field has a specular lobe; without, all its albedo is diffuse
-    skin        whether the points lie in a skin; otherwise on a surface, as without shadow
-    gradients   whether a parameter is attached: the loop can then be differentiated in reverse. Transmittances are held
-                fixed unless the lights' own places are attached (``lights.moving``)
+    `fresnel`: the specular weight is that at normal incidence (:mod:`mi_ntf.core.fresnel`).
+    """
 
-    Returns radiance per point, a 3-tuple. The loop over lights is symbolic: compile time and memory do not depend on
-    their number (but for moving lights, as Dr.Jit cannot differentiate one loop within another).
+    normal: Vector
+    albedo: Vector
+    roughness: Float
+    specular: Float
+    softness: Float
+    fresnel: bool = False
+
+    def diffuse_albedo(self) -> list[Float]:
+        """Return the linear RGB albedo of a diffuse surface that reflects as much of uniform light."""
+        return [fresnel.diffuse_albedo(ops, k, self.roughness, self.specular, self.fresnel) for k in self.albedo]
+
+
+class Points:
+    """Shading points: position, direction to the viewer, reflectance; vectors and scalars of one width.
+
+    Parameters
+    ----------
+    ray, ordinal
+        Number of each point's camera ray, and its place among the points of this ray. The random numbers of sampled
+        lights follow from these two. None: the point's place in the arrays, and 0.
+    """
+
+    def __init__(self, x: Vector, wo: Vector, reflectance: Reflectance, ray: UInt32 | None = None,
+                 ordinal: UInt32 | None = None):
+        self.x, self.wo, self.reflectance = x, wo, reflectance
+        uint = dr.uint32_array_t(type(x[0]))
+        self.ray: UInt32 = dr.arange(uint, dr.width(x[0])) if ray is None else ray
+        self.ordinal: UInt32 = uint(0) if ordinal is None else ordinal
+        self.normal, self.albedo, self.roughness, self.specular, self.softness, _ = reflectance
+
+    def evaluate(self) -> None:
+        """Evaluate the arrays now, before a loop over lights."""
+        dr.eval(self.x, self.wo, self.normal, self.albedo, self.roughness, self.specular, self.softness, self.ray,
+                self.ordinal)
+
+
+def reflect(points: Points, lights: LightSource, visibility: Visibility | None, specular: bool = True,
+            gradients: bool = False, skin: bool = True) -> tuple[Float, Float, Float]:
+    """Return the radiance that `points` reflect from all lights: Σ of irradiance · τ · f.
+
+    f is the phase function of :func:`mi_ntf.core.microfacet.scattering`; the sum is h(x, ω_o) of method.md, section 1.
+
+    Parameters
+    ----------
+    visibility
+        None: no shadow. The light then does not pass the skin either, so a point reflects as a surface, ρ ⟨n,ω_i⟩⁺.
+    specular
+        The field has a specular lobe; otherwise all its albedo is diffuse.
+    gradients
+        A parameter is attached, so the loop must be differentiable in reverse. Transmittances are held fixed unless the
+        lights' own places are attached (``lights.moving``).
+    skin
+        The points lie in a skin, otherwise on a surface.
+
+    Notes
+    -----
+    The loop over lights is symbolic: compile time and memory do not depend on their number. It is unrolled for moving
+    lights, since Dr.Jit cannot differentiate one loop within another.
     """
     floats = type(points.x[0])
     uint = dr.uint32_array_t(floats)
-    moving = getattr(lights, "moving", False)
+    moving = lights.moving
 
-    def body(i, r, g, b):
-        wi, irradiance, distance, *known = lights.sample(i, points.x, True)
-        number = known[0] if known else i
-        lit, diffuse, gloss = _lobes(wi, points, skin and bool(visibility), specular)
-        tau = _tau(visibility, points.x, wi, distance, number, lit, gradients and not moving) if visibility else 1
-        if moving and visibility:
-            tau = tau * _edge(wi, points.normal)
-        value = [k * diffuse + gloss for k in points.albedo] if specular else [k * diffuse for k in points.albedo]
+    def body(i: UInt32, r: Float, g: Float, b: Float) -> tuple[Array, ...]:
+        light = lights.sample(i, points.x, True)
+        lit, diffuse, glossy = _lobes(light.wi, points, skin and bool(visibility), specular)
+        tau: Array = 1
+        if visibility:
+            wi, distance = light.wi, light.distance
+            if gradients and not moving:
+                wi, distance = dr.detach(wi), dr.detach(distance)
+            index = i if light.sun is None else uint(0)  # sampled lights are in no table
+            tau = dr.select(lit, visibility.tau(points.x, wi, distance, index, lit, light.sun), 0)
+            if moving:
+                tau = tau * _edge(light.wi, points.normal)
+        value = [k * diffuse + glossy for k in points.albedo] if specular else [k * diffuse for k in points.albedo]
         dimmed = tuple(tau) if dr.depth_v(tau) > 1 else (tau, tau, tau)
-        r, g, b = (c + e * v * t for c, e, v, t in zip((r, g, b), irradiance, value, dimmed, strict=True))
+        r, g, b = (c + e * v * t for c, e, v, t in zip((r, g, b), light.irradiance, value, dimmed, strict=True))
         return i + 1, r, g, b
 
     zero = dr.zeros(floats, dr.width(points.x[0]))
     if moving:
-        light = zero, zero, zero
+        r = g = b = zero
         for i in range(lights.count):
-            light = body(dr.opaque(uint, i), *light)[1:]
-        return light
+            _, r, g, b = body(dr.opaque(uint, i), r, g, b)
+        return r, g, b
     count = dr.opaque(uint, lights.count)
-    _, r, g, b = dr.while_loop(
+    _, r, g, b = ops.while_loop(
         state=(dr.zeros(uint, dr.width(zero)), zero, zero, zero),
         cond=lambda i, r, g, b: i < count,
         body=body,
@@ -62,66 +117,25 @@ def reflect(points, lights, visibility, specular=True, gradients=False, skin=Tru
     return r, g, b
 
 
-def _edge(wi, normal):
-    """1, with the slope of a ramp over EDGE: what the jump of the skin's lobes at the horizon adds to derivatives."""
+def _edge(wi: Vector, normal: Vector) -> Float:
+    """Return 1, with the slope of a ramp over EDGE: the derivative of the jump of the skin's lobes at the horizon."""
     cos = dot(normal, wi)
-    return dr.replace_grad(type(cos)(1), dr.select(dr.detach(cos) < EDGE, cos * (1 / EDGE), 0))
+    return ops.replace_grad(type(cos)(1), dr.select(dr.detach(cos) < EDGE, cos * (1 / EDGE), 0))
 
 
-def _tau(visibility, x, wi, distance, index, lit, fixed: bool):
-    """The transmittance where `lit`, 0 elsewhere; without derivatives if `fixed`."""
-    if fixed:
-        wi, distance = dr.detach(wi), dr.detach(distance)
-    return dr.select(lit, visibility.tau(x, wi, distance, index, lit), 0)
+def _lobes(wi: Vector, points: Points, skin: bool, specular: bool) -> tuple[Mask, Float, Float | None]:
+    """Return a mask of light on the normal's side, the diffuse lobe, to be multiplied by the albedo, and the specular.
 
-
-def _lobes(wi, points, skin: bool, specular: bool):
-    """Return a mask of light on the normal's side, the diffuse lobe, to be multiplied by the albedo, and the specular
-    one (None without), each with its weight, which may be 0."""
+    Each lobe has its weight, which may be 0; the specular one is None without `specular`.
+    """
     if not specular:
         cos = dr.maximum(dot(points.normal, wi), 0)
         if skin:
             cos = microfacet.joint_cosine(ops, cos, dr.maximum(dot(points.normal, points.wo), 0), points.softness)
         return cos > 0, cos * microfacet.INV_PI, None
     direction = wi, points.wo, points.normal, points.roughness
-    diffuse, gloss = (
+    diffuse, glossy = (
         microfacet.scattering(ops, *direction, points.softness) if skin else microfacet.lobes(ops, *direction)
     )
-    of_diffuse, of_gloss = fresnel.weights(ops, *direction, points.specular, points.reflectance.fresnel)
-    return diffuse > 0, of_diffuse * diffuse, of_gloss * gloss
-
-
-class Reflectance(NamedTuple):
-    """Reflectance of field points: ranges as in :mod:`mi_ntf.core.microfacet`, softness as in :mod:`mi_ntf.core.skin`.
-    `fresnel`: whether the specular weight is that at normal incidence alone."""
-
-    normal: tuple
-    albedo: tuple
-    roughness: Any
-    specular: Any
-    softness: Any
-    fresnel: bool = False
-
-    def diffuse_albedo(self) -> list:
-        """Albedos, linear RGB, of a diffuse surface that reflects as much of light from everywhere."""
-        return [fresnel.diffuse_albedo(ops, k, self.roughness, self.specular, self.fresnel) for k in self.albedo]
-
-
-class Points:
-    """Shading points: position, direction to the viewer, reflectance. 3-tuples and scalars, all of one width.
-
-    ray, ordinal  of each point: the number of its camera ray, and its place among the points of this ray. Random
-                  lights of the point follow from these two. None: the point's place in the arrays, and 0.
-    """
-
-    def __init__(self, x, wo, reflectance: Reflectance, ray=None, ordinal=None):
-        self.x, self.wo, self.reflectance = x, wo, reflectance
-        uint = dr.uint32_array_t(type(x[0]))
-        self.ray = dr.arange(uint, dr.width(x[0])) if ray is None else ray
-        self.ordinal = uint(0) if ordinal is None else ordinal
-        self.normal, self.albedo, self.roughness, self.specular, self.softness, _ = reflectance
-
-    def evaluate(self) -> None:
-        """Compute them now: what follows loops over lights."""
-        dr.eval(self.x, self.wo, self.normal, self.albedo, self.roughness, self.specular, self.softness, self.ray,
-                self.ordinal)
+    diffuse_weight, specular_weight = fresnel.weights(ops, *direction, points.specular, points.reflectance.fresnel)
+    return diffuse > 0, diffuse_weight * diffuse, specular_weight * glossy

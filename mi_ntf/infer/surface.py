@@ -1,9 +1,10 @@
-"""A field's surface: triangles around its dense matter, and what a camera sees there.
+"""A field's surface: triangles around its dense matter, with the reflectance that a camera sees there.
 
-Fields are skins: photographs tell nothing of what lies behind, and matter there comes and goes. What is enclosed
-therefore counts as solid.
+Fields are skins: photographs do not show the inside, where training leaves arbitrary matter. Enclosed space therefore
+counts as solid.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from types import ModuleType
 
@@ -15,26 +16,30 @@ from ..core.errors import MiNtfError
 from .bake import sampled_bricks
 from .bricks import SIDE
 from .network import NetworkField
+from .types import Array
 
 LEVEL = 10.0
-"""σ of the surface, 1/(unit-sphere radius). Of 3 to 30 the one whose mean distance to the photographed meshes is least:
-0.2 to 0.4 % of the radius at 256 voxels; lower ones lie outside of them, higher ones tear skins open."""
+"""σ of the surface, 1/(unit-sphere radius). Tuned on the mean distance to the photographed meshes of four objects:
+lower levels lie outside of them, higher ones tear skins open."""
 TIGHT = 0.3
-"""Share of the level at which a skin counts as closed when what it encloses is filled: a thin spot is no hole."""
+"""Fraction of the level at which a skin counts as closed when the space that it encloses is filled."""
 CRUMB = 1e-4
-"""Parts with a smaller share of the largest one's voxels are left out."""
+"""Number of voxels, over those of the largest part, below which a part is removed."""
 RESOLUTIONS = (32, 512)
-"""Voxels per side. The bound is one of memory: at 512 the scene `skull` took 1.8 GB, at 384 0.85 GB, at 256 0.44 GB."""
+"""Least and largest number of voxels per side; 512 takes about 2 GB of memory."""
 BEFORE, BEHIND, STEP = 0.008, 0.032, 0.004
-"""Where a camera's look along the normal is followed: from outside of the surface to behind it, radii."""
+"""Begin, end and step of a camera's look along the normal, before and behind the surface, field units."""
 PART = 1 << 18
-"""Vertices that are looked at together: some 100 MB."""
+"""Vertices that are evaluated together, about 100 MB."""
 
 
 @dataclass(frozen=True)
 class Surface:
-    """In the coordinates of the field. `level`: its σ; `vertices`, `normals`, `albedo` (V, 3), the last linear RGB;
-    `roughness`, `specular` (V,); `faces` (F, 3), counter-clockwise seen from outside."""
+    """A surface in the coordinates of the field.
+
+    `level`: its σ; `vertices`, `normals`, `albedo` (V, 3), the last linear RGB; `roughness`, `specular` (V,); `faces`
+    (F, 3), counter-clockwise seen from outside.
+    """
 
     level: float
     vertices: np.ndarray
@@ -46,10 +51,14 @@ class Surface:
 
 
 def surface(field: NetworkField, resolution: int, level: float | None, dj: ModuleType) -> Surface:
-    """The surface of `field` where its density is `level`, found in `resolution`³ voxels; None: ``LEVEL``, or half of
-    the highest density where that is less. Raises MiNtfError where there is no such density."""
-    from skimage.measure import marching_cubes
+    """Return the surface of `field` at density `level`, from `resolution`³ voxels.
 
+    `level` None: ``LEVEL``, or half of the highest density where that is less. Raises MiNtfError if the field has no
+    such density.
+    """
+    from skimage import measure
+
+    marching_cubes: Callable[..., Array] = measure.marching_cubes
     values = _log_density(field, resolution, dj)
     highest = float(np.exp(values.max()))
     level = min(LEVEL, highest / 2) if level is None else level
@@ -61,7 +70,7 @@ def surface(field: NetworkField, resolution: int, level: float | None, dj: Modul
     del values
     vertices = (places[:, ::-1] + corner[::-1] + 0.5) * (2 / resolution) - 1
     normals = _from_faces(vertices, faces)
-    return Surface(level, vertices, faces, *_seen(field, vertices, normals, dj))
+    return Surface(level, vertices, faces, *_reflectance(field, vertices, normals, dj))
 
 
 def _log_density(field: NetworkField, n: int, dj: ModuleType) -> np.ndarray:
@@ -75,8 +84,7 @@ def _log_density(field: NetworkField, n: int, dj: ModuleType) -> np.ndarray:
 
 
 def _cropped(values: np.ndarray, threshold: float) -> tuple[np.ndarray, np.ndarray]:
-    """The part of `values` (z, y, x) that holds all above `threshold`, with a border of emptiness, and the index of its
-    first voxel."""
+    """Return the part of `values` (z, y, x) above `threshold`, with an empty border, and its first voxel's index."""
     dense = values > threshold
     sides = [np.flatnonzero(dense.any(tuple({0, 1, 2} - {axis}))) for axis in range(3)]
     inner = values[tuple(slice(s[0], s[-1] + 1) for s in sides)]
@@ -84,11 +92,11 @@ def _cropped(values: np.ndarray, threshold: float) -> tuple[np.ndarray, np.ndarr
 
 
 def _solid(values: np.ndarray, level: float) -> np.ndarray:
-    """ln σ with what is enclosed filled, and without crumbs."""
+    """Return ln σ with enclosed space filled, and without small parts."""
     from scipy.ndimage import label
 
-    for share in (TIGHT, 1.0):
-        empty, _ = label(values <= np.log(share * level), output=np.int32)
+    for fraction in (TIGHT, 1.0):
+        empty, _ = label(values <= np.log(fraction * level), output=np.int32)
         values = np.where((empty > 0) & (empty != empty[0, 0, 0]), np.float32(MAX_LOG_DENSITY), values)
     parts, count = label(values > np.log(level), output=np.int32)
     sizes = np.bincount(parts.ravel(), minlength=count + 1)
@@ -98,18 +106,22 @@ def _solid(values: np.ndarray, level: float) -> np.ndarray:
 
 
 def _from_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(V, 3) unit normals: of the faces around each vertex, by area."""
+    """Return unit normals (V, 3), means of the faces around each vertex by area."""
     a, b, c = (vertices[faces[:, i]].astype(np.float64) for i in range(3))
     across = np.cross(b - a, c - a)
     total = np.stack([sum(np.bincount(faces[:, i], across[:, axis], len(vertices)) for i in range(3))
                       for axis in range(3)], axis=1)
-    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
+    unit: np.ndarray = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
+    return unit
 
 
-def _seen(field: NetworkField, vertices: np.ndarray, normals: np.ndarray, dj: ModuleType) -> tuple[np.ndarray, ...]:
-    """Normals, albedo, roughness and specular weight that a camera sees that looks at each vertex along its normal:
-    means over matter's share of the picture, as in rendering."""
-    found = np.empty((len(vertices), 8), np.float32)
+def _reflectance(field: NetworkField, vertices: np.ndarray, normals: np.ndarray,
+                 dj: ModuleType) -> tuple[np.ndarray, ...]:
+    """Return normals, albedo, roughness and specular weight, as a camera that looks along each normal sees them.
+
+    They are means weighted by opacity, as in rendering.
+    """
+    result = np.empty((len(vertices), 8), np.float32)
     for first in range(0, len(vertices), PART):
         part = slice(first, first + PART)
         p, n = (tuple(dj.Float(np.ascontiguousarray(column, np.float32)) for column in array[part].T)
@@ -123,11 +135,11 @@ def _seen(field: NetworkField, vertices: np.ndarray, normals: np.ndarray, dj: Mo
             clear = after
             dr.eval(clear, sums)
         weight = dr.maximum(1 - clear, 1e-6)
-        found[part] = np.stack([(s / weight).numpy() for s in sums], axis=1)
-    return _outward(found[:, :3], normals), found[:, 3:6], found[:, 6], found[:, 7]
+        result[part] = np.stack([(s / weight).numpy() for s in sums], axis=1)
+    return _outward(result[:, :3], normals), result[:, 3:6], result[:, 6], result[:, 7]
 
 
-def _outward(found: np.ndarray, geometric: np.ndarray) -> np.ndarray:
-    """Unit normals `found`; the `geometric` ones where those point aside or inward, as where no photograph saw."""
-    unit = found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-6)
+def _outward(normals: np.ndarray, geometric: np.ndarray) -> np.ndarray:
+    """Return unit `normals`, or the `geometric` ones where those point sideways or inward, unseen in photographs."""
+    unit = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-6)
     return np.where(((unit * geometric).sum(1) > 0.2)[:, None], unit, geometric).astype(np.float32)

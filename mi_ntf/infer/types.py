@@ -1,4 +1,4 @@
-"""Names of Dr.Jit's array types in annotations, and of what holds them.
+"""Names of Dr.Jit's array types in annotations, and the interface of a visibility method.
 
 The arrays are those of whichever back end the caller uses, for which Dr.Jit's stubs have no common type: the names tell
 readers the type, and type checkers take any.
@@ -24,10 +24,21 @@ __all__ = ["Array", "Color3", "Float", "Mask", "Place", "Ray", "Reflected", "UIn
 
 
 class Visibility(Protocol):
-    """Transmittance from shading points of a field to lights (:mod:`mi_ntf.infer.visibility`)."""
+    """Transmittance from points to lights (:mod:`mi_ntf.infer.visibility`)."""
 
-    def tau(self, x: Vector, wi: Vector, distance: Float, index: UInt32, active: Mask) -> Array:
-        """Return the transmittance, a number or a colour, from the points `x` along the unit vectors `wi`.
+    def tau(self, x: Vector, wi: Vector, distance: Float, index: UInt32, active: Mask, sun: Mask = None) -> Array:
+        """Return the transmittance, a number or a colour, in [0, 1].
 
-        `distance` to the light, field units; `index`: row of the light table; lanes that are not `active` are unused.
+        Parameters
+        ----------
+        x, wi
+            Points and unit vectors towards the light, field coordinates.
+        distance
+            Distance of the light, field units; infinite for directional lights.
+        index
+            Row of the light table; 0 for sampled lights, which are in no table.
+        active
+            Lanes whose result is used.
+        sun
+            True where a sampled light is a sun, whose shadow is marched; None: no light is.
         """

@@ -15,7 +15,7 @@ from helpers import scenes
 from helpers.maps import OPTIONS, SIZE, build, find_medium, table, texels, without_cache
 from helpers.variants import VARIANT
 
-from mi_ntf.infer import profile
+from mi_ntf.infer import tuning
 from mi_ntf.render import user_cache
 from mi_ntf.render.maps import map_cache
 from mi_ntf.render.scene import loaded
@@ -218,7 +218,7 @@ def test_keys_follow_the_march_and_the_libraries(medium, cache, monkeypatch):
     seen.append(names_of(cache, medium, dataclasses.replace(OPTIONS, step=2 / 128)))
     network = dataclasses.replace(OPTIONS, map_source="network")
     seen.append(names_of(cache, medium, network))
-    monkeypatch.setattr(profile, "FOR_NETWORKS", 1.25)  # the rule for a march's step, which only this source follows
+    monkeypatch.setattr(tuning, "NETWORK_STEP", 1.25)  # the rule for a march's step, which only this source follows
     seen.append(names_of(cache, medium, network))
     assert names_of(cache, medium) == seen[-1]
     for module in (user_cache.mi, user_cache.dr, user_cache.np):

@@ -15,7 +15,7 @@ from helpers import fields, hard_cases
 from helpers.jit import arrays
 
 from mi_ntf.core import field_file
-from mi_ntf.infer import march
+from mi_ntf.infer import march, tuning
 from mi_ntf.infer.bundle import Strand
 
 KINDS = ("plane", "sphere", "bumps")
@@ -108,7 +108,7 @@ def shipped(name: str):
     d = arrays(np.tile(-view, (count, 1)))
     strand = Strand(medium.source, arrays(o), d, mi.Float(2 / 384))
     random = [mi.Float(rng.random(count)) for _ in range(2)]
-    with mock.patch.object(march, "SHARE", 1e-4):  # points of the faint depths of skins as well, whatever they weigh
+    with mock.patch.object(tuning, "SAMPLE_FRACTION", 1e-4):  # points in the faint depths of skins, too
         samples = march.camera_samples([strand], mi.Float(np.full(count, 1e9)), *random)
     kept = rng.permutation(len(samples.ray))[:1200]
     x = np.array(samples.place(0, samples.ray, samples.t)[0], np.float64).T[kept]

@@ -192,10 +192,10 @@ def look(method, table: LightTable, x: np.ndarray, index=None) -> np.ndarray:
     rows = np.broadcast_to(np.arange(len(x)).reshape(-1, *[1] * (x.ndim - 2)), x.shape[:-1])
     index = mi.UInt32(np.ascontiguousarray(rows if index is None else index).ravel().astype(np.uint32))
     p = arrays(x.reshape(-1, 3))
-    wi, _, distance = table.sample(index, p, True)
+    light = table.sample(index, p, True)
     if method is None:
         return np.ones(x.shape[:-1])
-    tau = method.tau(p, wi, distance, index, dr.full(mi.Bool, True, dr.width(p[0])))
+    tau = method.tau(p, light.wi, light.distance, index, dr.full(mi.Bool, True, dr.width(p[0])))
     return np.array(tau, np.float64).reshape(x.shape[:-1])
 
 

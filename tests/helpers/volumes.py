@@ -8,7 +8,7 @@ from mi_ntf.infer.network import NOTHING
 
 
 class Formula:
-    """A :class:`mi_ntf.infer.grid.Volume` of the density `density`, without any empty space."""
+    """A :class:`mi_ntf.infer.grid.Density` of the density `density`, without any empty space."""
 
     def __init__(self, density, hull=None):
         self.density, self.hull = density, hull

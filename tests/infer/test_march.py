@@ -9,7 +9,7 @@ from helpers.jit import arrays
 from helpers.variants import VARIANT
 from helpers.volumes import Formula, Unskipped
 
-from mi_ntf.infer import bundle, march
+from mi_ntf.infer import bundle, march, tuning
 from mi_ntf.infer.bundle import Strand
 from mi_ntf.infer.grid import baked
 from mi_ntf.infer.network import NOTHING, NetworkField
@@ -62,9 +62,9 @@ def test_transmittance_and_weights(grid, rng):
     # Midpoint rule on trilinear density of slope ~1e3: error per step ~ σ'Δ²/8, below 1e-3 in depth.
     np.testing.assert_allclose(np.array(transmittance), np.exp(-depth), atol=3e-3)
     sums = np.bincount(np.array(index), weights=np.array(w), minlength=300)
-    # What MIN_SHARE and MIN_TRANSMITTANCE leave out.
+    # What MIN_LOSS and MIN_TRANSMITTANCE leave out.
     np.testing.assert_allclose(sums, 1 - np.array(transmittance), atol=1.2e-3)
-    assert (np.array(w) > march.MIN_SHARE).all()
+    assert (np.array(w) > march.MIN_LOSS).all()
     x = np.array(samples.place(0, index, t)[0]).T
     assert np.linalg.norm(x, axis=1).max() < 1
 
@@ -260,8 +260,8 @@ def test_shared_samples_are_fair(grid, rng, monkeypatch):
     o, d = (np.repeat(v, numbers, axis=0) for v in rays(rng, lines))
     offset, u = np.repeat(rng.random(lines), numbers), rng.random(lines * numbers)
     found, noise = [], []
-    for share in (march.SHARE, 1e-2):
-        monkeypatch.setattr(march, "SHARE", share)
+    for share in (tuning.SAMPLE_FRACTION, 1e-2):
+        monkeypatch.setattr(tuning, "SAMPLE_FRACTION", share)
         samples = march.camera_samples([Strand(grid, arrays(o), arrays(d), mi.Float(2 / 200))],
                                        mi.Float(np.inf), mi.Float(offset), mi.Float(u))
         assert np.array(samples.count).max() <= 1 / share + 1
@@ -270,7 +270,7 @@ def test_shared_samples_are_fair(grid, rng, monkeypatch):
                          for f in (np.ones_like(t), t, np.cos(20 * t))])
         found.append(sums.mean(2))
         noise.append(sums.var(2) / numbers)
-    np.testing.assert_allclose(found[0][0], found[1][0], atol=march.MIN_SHARE)
+    np.testing.assert_allclose(found[0][0], found[1][0], atol=march.MIN_LOSS)
     z = (found[0] - found[1])[1:, found[0][0] > 0] / np.sqrt(noise[0] + noise[1])[1:, found[0][0] > 0]
     assert np.abs(z).max() < 4.5  # of 40 numbers, by chance one time in 4000
 
@@ -329,9 +329,9 @@ def test_rays_have_the_samples_of_the_finest_field_that_they_meet():
     u = [mi.Float((np.arange(1500) * g) % 1) for g in (0.618034, 0.7548777)]
     lost = 1 - np.exp(-2)
     for shares in ((1 / 8, 1 / 64), ()):
-        samples = march.camera_samples(strands, mi.Float(1e9), *u, shares=shares)
+        samples = march.camera_samples(strands, mi.Float(1e9), *u, fractions=shares)
         solid, smoke, none = np.array(samples.count).reshape(-1, 3).T
-        for count, share in zip((solid, smoke), shares or (march.SHARE,) * 2, strict=True):
+        for count, share in zip((solid, smoke), shares or (tuning.SAMPLE_FRACTION,) * 2, strict=True):
             assert count.min() >= np.floor(lost / share) and count.max() <= np.ceil(lost / share) + 1
         assert not none.any()
         for weight in samples.weights:
@@ -384,6 +384,6 @@ def test_no_ray_has_more_samples_than_shares(rng):
     offset = mi.Float(np.full(len(o), np.nextafter(np.float32(1), np.float32(0))))
     strands = [Strand(dense, arrays(o - [x, 0, 0]), arrays(d), mi.Float(2 / 256), mi.Float(1)) for x in (0, 4)]
     samples = march.camera_samples(strands, mi.Float(np.inf), offset, mi.Float(rng.random(len(o))),
-                                   shares=(march.SMOKE_SHARE,) * 2)
-    assert sum(np.array(w) for w in samples.weights).min() > 0.9 * march.MIN_SHARE
-    assert np.array(samples.count).max() <= 1 / march.SMOKE_SHARE
+                                   fractions=(tuning.SMOKE_SAMPLE_FRACTION,) * 2)
+    assert sum(np.array(w) for w in samples.weights).min() > 0.9 * march.MIN_LOSS
+    assert np.array(samples.count).max() <= 1 / tuning.SMOKE_SAMPLE_FRACTION

@@ -10,7 +10,7 @@ import pytest
 from helpers import fields, hard_cases
 
 from mi_ntf.core import field_file
-from mi_ntf.infer import octahedral, texels
+from mi_ntf.infer import octahedral, texels, tuning
 from mi_ntf.infer.lights import LightTable
 from mi_ntf.infer.visibility import outside, raymarch, transmittance_atlas
 from mi_ntf.infer.visibility.marched_suns import MarchedSuns
@@ -124,7 +124,7 @@ def test_directions_are_drawn_from_the_stream_without_bias(statue, monkeypatch):
     for x, d in zip(0.8 * unit(12, 18).T, unit(12, 19).T, strict=True):
         ray = [tuple(mi.Float(float(c)) for c in v) for v in (x, d)]
         u = transmittance_atlas._uniforms(mi, atlas.stream, *ray)
-        place = [float(f[0]) for f in octahedral.place(ray[1], mi.Float(transmittance_atlas.SIDE))]
+        place = [float(f[0]) for f in octahedral.place(ray[1], mi.Float(tuning.ATLAS_SIDE))]
         for f, drawn in ((place[0], u[0]), (place[1], u[1]), (0.3, u[2]), (0.7, u[3]), (0.5, u[4])):
             mean = np.floor(f + np.array(drawn, np.float64)).mean()
             share = f - np.floor(f)
@@ -150,8 +150,8 @@ def test_lights_inside_are_marched(statue, monkeypatch):
     x, d = 0.3 * unit(3000, 9), unit(3000, 10)
     expected = tau(building.build("raymarch", medium, None, Options(2 / 384)), x, d, 0.3)
     np.testing.assert_array_equal(tau(atlas, x, d, 0.3), expected)
-    monkeypatch.setattr(transmittance_atlas, "SIDE", 4)
-    monkeypatch.setattr(transmittance_atlas, "RESOLUTION", 8)
+    monkeypatch.setattr(tuning, "ATLAS_SIDE", 4)
+    monkeypatch.setattr(tuning, "ATLAS_RESOLUTION", 8)
     sun = LightTable(np.array([[0.6, 0.0, 0.8]]), np.ones((1, 3)), np.array([False]), 1.0, mi)
     shared = building.build("transmittance_atlas", medium, sun, Options(2 / 384))
     np.testing.assert_array_equal(tau(shared, x, d, 0.3), expected)
@@ -161,7 +161,7 @@ def test_depth_close_by_is_right_on_average(variant):
     """Exponentials and logistics of any width, from thin to thick; τ of each, the mean of 4,096 draws."""
     v = (dr.arange(mi.Float, 4096) + 0.5) / 4096
     x, wi = (tuple(mi.Float(c) for c in p) for p in ((0.0, 0.0, 0.0), (0.0, 0.6, 0.8)))
-    t = np.linspace(0, transmittance_atlas.REACH, 20_001)
+    t = np.linspace(0, tuning.REACH, 20_001)
     off = []
     for width in np.geomspace(0.002, 0.06, 20):
         for start in (None, 1.0, 2.5):

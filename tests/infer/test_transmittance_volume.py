@@ -28,8 +28,8 @@ def lights():
 
 def look(volume, lights, x, k):
     x = arrays(x)
-    wi, _, distance = lights.sample(mi.UInt32(k), x, True)
-    return np.array(volume.tau(x, wi, distance, mi.UInt32(k), True))
+    light = lights.sample(mi.UInt32(k), x, True)
+    return np.array(volume.tau(x, light.wi, light.distance, mi.UInt32(k), True))
 
 
 def ball(p):
@@ -89,9 +89,9 @@ def test_volume_follows_the_march(lights, rng):
     volume = TransmittanceVolume(lights, 128, 384, grid, mi)
     x = rng.uniform(-0.6, 0.6, (3000, 3))
     for k in range(3):
-        wi, _, distance = lights.sample(mi.UInt32(k), arrays(x), True)
+        light = lights.sample(mi.UInt32(k), arrays(x), True)
         steps = tuple(mi.Float(s) for s in (1 / 512, 1 / 512, 0.1))
-        truth = np.exp(-np.array(optical_depth(grid, arrays(x), wi, distance, steps, mi.Bool(True))))
+        truth = np.exp(-np.array(optical_depth(grid, arrays(x), light.wi, light.distance, steps, mi.Bool(True))))
         error = look(volume, lights, x, k) - truth
         # Bilinear texels of 1/100 (octahedral: 1/50) over skins that are as thin: a few silhouettes blur.
         assert np.abs(error).mean() < (8e-3 if k == 2 else 5e-3) and np.sqrt((error**2).mean()) < 0.03

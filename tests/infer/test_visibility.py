@@ -33,10 +33,10 @@ def test_ray_network_is_a_transmittance(network, reader, rng):
 def test_light_table_units():
     """Irradiance I/r² in scene units; directional lights know no distance."""
     lights = LightTable([[0, 0, 2.0], [0, 1, 0]], [[8, 4, 2], [1, 2, 3]], [True, False], 3.0, mi)
-    wi, power, distance = lights.sample(mi.UInt32([0, 1]), arrays([[0, 0, 0.5], [0.1, 0.2, 0.3]]), True)
-    np.testing.assert_allclose(np.array(wi).T, [[0, 0, 1], [0, 1, 0]], atol=1e-6)
-    np.testing.assert_allclose(np.array(power).T, [[8 / 20.25, 4 / 20.25, 2 / 20.25], [1, 2, 3]], rtol=1e-6)
-    np.testing.assert_allclose(np.array(distance), [1.5, np.inf], rtol=1e-6)
+    light = lights.sample(mi.UInt32([0, 1]), arrays([[0, 0, 0.5], [0.1, 0.2, 0.3]]), True)
+    np.testing.assert_allclose(np.array(light.wi).T, [[0, 0, 1], [0, 1, 0]], atol=1e-6)
+    np.testing.assert_allclose(np.array(light.irradiance).T, [[8 / 20.25, 4 / 20.25, 2 / 20.25], [1, 2, 3]], rtol=1e-6)
+    np.testing.assert_allclose(np.array(light.distance), [1.5, np.inf], rtol=1e-6)
 
 
 def test_raymarch_sees_lights_inside_matter(grid):

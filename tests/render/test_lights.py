@@ -131,15 +131,15 @@ def test_drawn_suns_are_told(candidates, rng):
     at = points(1, n, rng)
 
     def told(emitters):
-        wi, _, _, sun = drawn(emitters, at, 1, candidates).sample(index, at.x, mi.Bool(True))
-        return np.array(wi), np.broadcast_to(np.array(sun), n) > 0
+        light = drawn(emitters, at, 1, candidates).sample(index, at.x, mi.Bool(True))
+        return np.array(light.wi), np.broadcast_to(np.array(light.sun), n)
 
     wi, sun = told([sky])
     np.testing.assert_array_equal(sun, np.degrees(np.arccos(np.minimum(axis @ wi, 1))) < 0.27)
     assert 0.2 < sun.mean() < 0.99
     assert not told([plain])[1].any() and not told([lamp])[1].any()
     wi, sun = told([plain, lamp])
-    way = np.array(drawn([lamp], at, 1, 1).sample(index, at.x, mi.Bool(True))[0])[:, :1]
+    way = np.array(drawn([lamp], at, 1, 1).sample(index, at.x, mi.Bool(True)).wi)[:, :1]
     np.testing.assert_array_equal(sun, np.abs(wi - way).max(0) < 1e-6)
 
 
@@ -162,7 +162,7 @@ def test_directions_of_any_length_are_unit_vectors():
         table = LightTable(np.array([[scale], [1.0]])[:rows] * where[:rows], np.ones((rows, 3)),
                            np.array([False, True])[:rows], 1.0, mi)
         assert table.far
-        return np.array(table.sample(dr.zeros(mi.UInt32, 2), x, True)[0])
+        return np.array(table.sample(dr.zeros(mi.UInt32, 2), x, True).wi)
 
     np.testing.assert_allclose(toward(3.0, 1), np.tile(where[0][:, None], 2), rtol=1e-6)
     np.testing.assert_array_equal(toward(3.0, 1), toward(3.0, 2))
@@ -185,14 +185,14 @@ def test_rows_of_single_lights_are_mitsubas_in_any_placement(kind, rng):
     field_x = tuple(mi.Float(c.astype(np.float32)) for c in x)
     loaded = mi.load_dict(emitter(kind))
     table = scene_lights.rows([(loaded, kind)], 1).table(frame)
-    wi, irradiance, distance = table.sample(dr.zeros(mi.UInt32, 400), field_x, True)
+    light = table.sample(dr.zeros(mi.UInt32, 400), field_x, True)
     d, weight, dist = towards(loaded, np.array(frame.point_to_world(field_x)))
-    np.testing.assert_allclose(np.array(frame.direction_to_world(wi)), d, atol=2e-6)
+    np.testing.assert_allclose(np.array(frame.direction_to_world(light.wi)), d, atol=2e-6)
     # The spot's ramp between 4° and 16° divides float32 angles by 0.2.
-    np.testing.assert_allclose(np.array(irradiance), weight, rtol=1e-4, atol=1e-5 * weight.max())
+    np.testing.assert_allclose(np.array(light.irradiance), weight, rtol=1e-4, atol=1e-5 * weight.max())
     assert weight.min() < 0.5 * weight.max() or kind == "directional"
     if kind != "directional":
-        np.testing.assert_allclose(np.array(distance) * frame.length, dist, rtol=1e-5)
+        np.testing.assert_allclose(np.array(light.distance) * frame.length, dist, rtol=1e-5)
 
 
 def one_texel() -> dict:

@@ -24,7 +24,7 @@ class Share:
     def __init__(self, share: float):
         self.share = share
 
-    def tau(self, x, wi, distance, index, active):
+    def tau(self, x, wi, distance, index, active, sun=None):
         return dr.full(type(x[0]), self.share, dr.width(x[0]))
 
 

@@ -19,7 +19,7 @@ class Spoilt:
     def __init__(self, method):
         self.method = method
 
-    def tau(self, x, wi, distance, index, active):
+    def tau(self, x, wi, distance, index, active, sun=None):
         return self.method.tau(x, wi, distance, index, active) * (0.8 + 0.28 * dr.sin(50 * x[0]))
 
 

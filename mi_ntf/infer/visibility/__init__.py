@@ -1,11 +1,7 @@
-"""How much of a light reaches a point: one file a method, all behind one call.
+"""Visibility methods: the transmittance of a field between points and lights, one file a method.
 
-    tau(x, wi, distance, index, active) → τ in [0, 1]
-
-`x` shading point and `wi` unit vector towards the light (3-tuples, field coordinates); `distance` to the light, field
-units, infinite for directional lights; `index` the light's row in the table, of one drawn at random 1 if it is a sun
-(:data:`mi_ntf.infer.visibility.marched_suns.DRAWN`), else 0. `active` masks lanes whose result is unused. Construction
-does the work that depends on the lights alone.
+All methods have the interface :class:`mi_ntf.infer.types.Visibility`. Their construction does the work that depends on
+the field and the lights alone.
 """
 
 from . import (
@@ -24,9 +20,9 @@ REGISTRY = {
     for module in (raymarch, transmittance_volume, neural_transmittance, transmittance_map, transmittance_atlas,
                    ray_network, visibility_mlp, none)
 }
-"""Name → :class:`mi_ntf.infer.visibility.method.Method`. What is not in here does not exist."""
+"""Name → :class:`mi_ntf.infer.visibility.method.Method` of all methods."""
 
 
 def names() -> tuple[str, ...]:
-    """Every name that users may type."""
+    """Return the legal values of the property `visibility`."""
     return (*REGISTRY, "auto")

@@ -1,39 +1,59 @@
 """Interface of a visibility method: its construction, and the lights that it serves.
 
-Every method's file ends with its own :class:`Method`; :data:`mi_ntf.infer.visibility.REGISTRY` lists them.
+The file of each method ends with its own :class:`Method`; :data:`mi_ntf.infer.visibility.REGISTRY` lists them.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import ModuleType
 from typing import Any, Protocol
 
 import numpy as np
 
+from ...core.architecture import Header
+from ..grid import Density, GridField
 from ..lights import LightTable
-
-COARSEST, FINE_MAPS = 192, 4
-"""Texels along a side of the maps of many lights, at least; number of lights whose maps are as fine as the voxels."""
+from ..network import NetworkField
+from ..skin import Softness
+from ..tuning import FINE_MAPS, MIN_MAP_RESOLUTION
+from ..types import Visibility
 
 
 def resolution_for(lights: int, voxels: int) -> int:
-    """Return the texels along a side of the maps of so many lights, where the user names none.
+    """Return the default number of texels along a side of the maps of so many lights.
 
     Texels are as fine as the field's voxels, of which there are `voxels` across its sphere, for up to ``FINE_MAPS``
     lights. More lights share as many texels.
     """
-    return max(COARSEST, int(voxels * min(1, FINE_MAPS / max(lights, 1)) ** 0.5))
+    return max(MIN_MAP_RESOLUTION, int(voxels * min(1, FINE_MAPS / max(lights, 1)) ** 0.5))
 
 
 @dataclass(frozen=True)
 class Options:
-    """`step`: length of the camera march's cells, field units; `map_resolution`: texels along a map's side;
-    `map_source`: ``field`` or ``network``; `map_components`: logistics a texel that the field's march is fitted by, 1
-    or 2 (the network has its own number); `half`: in half precision; `map_memory`: MiB that the maps or volumes of one
-    part of the lights may take; `map_file`: EXR of `mi-ntf bake` that holds the maps, or none; `cache`: maps are kept
-    for the next frame and on disk (:mod:`mi_ntf.render.maps.map_cache`)."""
+    """Options of a visibility method.
+
+    Parameters
+    ----------
+    step
+        Length of the camera march's cells, field units.
+    map_resolution
+        Texels along a map's side.
+    map_source
+        ``field`` or ``network``.
+    map_components
+        Logistics per texel that are fitted to the field's march, 1 or 2; the network has its own number.
+    half
+        Store half precision.
+    map_memory
+        Largest size of the maps or volumes of one run of lights, MiB.
+    map_file
+        EXR of `mi-ntf bake` that holds the maps, or "".
+    cache
+        Keep maps for the next frame and on disk (:mod:`mi_ntf.render.maps.map_cache`).
+    """
 
     step: float
-    map_resolution: int = COARSEST
+    map_resolution: int = MIN_MAP_RESOLUTION
     map_source: str = "field"
     map_components: int = 1
     half: bool = False
@@ -42,13 +62,45 @@ class Options:
     cache: bool = False
 
 
+class Field(Protocol):
+    """A field file in both representations, with the softness of its skins."""
+
+    @property
+    def header(self) -> Header:
+        """Header of the file."""
+
+    @property
+    def network(self) -> NetworkField:
+        """The networks."""
+
+    @property
+    def grid(self) -> GridField:
+        """The baked voxels."""
+
+    @property
+    def softness(self) -> Softness:
+        """Softness of the skins."""
+
+
+class Medium(Protocol):
+    """A field in a scene."""
+
+    @property
+    def field(self) -> Field:
+        """The field."""
+
+    @property
+    def source(self) -> Density:
+        """Density of the voxels or of the networks, as the medium was told."""
+
+
 class Keep(Protocol):
     """Cache of a method's maps, in memory and on disk.
 
     Parameters
     ----------
     make
-        Makes the map: ``make()`` computes the texels, ``make(values)`` takes those that were kept.
+        Makes the map: ``make()`` computes the texels, ``make(values)`` takes stored ones.
     channels
         Numbers of a texel; a light has the square of ``map_resolution`` texels.
     step
@@ -60,46 +112,68 @@ class Keep(Protocol):
     """
 
     def __call__(self, make: Callable[..., Any], *, channels: int, step: float, directions: LightTable | None = None,
-                 options: Options | None = None, make_part: Callable[[np.ndarray], Any] | None = None) -> Any: ...
+                 options: Options | None = None, make_part: Callable[[np.ndarray], Any] | None = None) -> Any:
+        """Return the map."""
+
+
+class Build(Protocol):
+    """Constructor of a visibility method in the medium's field coordinates; None: no shadows.
+
+    `table`: lights for which per-light tables are made; None for methods that serve sampled lights. A method whose
+    lookups draw random numbers has an attribute ``stream``, an opaque seed that the renderer sets.
+    """
+
+    def __call__(self, medium: Any, table: Any, options: Options, dj: ModuleType, keep: Any, /) -> Visibility | None:
+        """Return the method."""
 
 
 @dataclass(frozen=True)
 class Method:
-    """
-    name         what users type
-    summary      what it does, a sentence
-    build        ``(medium, table, options, dj, keep)`` → an object with ``tau``, in the medium's field coordinates, and
-                 with ``stream``, an opaque seed that the renderer sets, where lookups draw numbers.
-                 `table`: the :class:`mi_ntf.infer.lights.LightTable` that what is held per light is made for; None:
-                 the others. `keep`: a :class:`Keep`
-    rays         ``(lights, resolution)`` → number of rays, each marched or asked for once, that fill what is held for a
-                 field; `lights` of the table, `resolution` texels along a side of their maps
-    numbers      ``(medium, table, options)`` → what is held for each of the squared ``map_resolution`` rays of a light,
-                 in float32 numbers
-    per_field    `rays` and `numbers` are of all that is held for a field, whatever the lights
-    dials        properties of the integrator that it reads
-    resolution   ``(lights, voxels)`` → texels along a side where the user names none
-    drawn        name of the method that serves lights which are drawn at random, and all other rays; "": itself
-    derivatives  whether places of lights have derivatives
-    automatic    true if ``auto`` may take it under a limit
-    needs        ``(medium)`` → whether the field can serve it
+    """A visibility method.
+
+    Parameters
+    ----------
+    name
+        Value of the property `visibility`.
+    summary
+        One sentence for users.
+    build
+        See :class:`Build`.
+    rays
+        ``(lights, resolution)`` → number of rays, each marched or queried once, that fill the tables of a field;
+        `lights` of the light table, `resolution` texels along a side of their maps.
+    numbers
+        ``(medium, table, options)`` → float32 numbers for each of the squared ``map_resolution`` rays of a light.
+    per_field
+        `rays` and `numbers` count all tables of a field, independently of the lights.
+    dials
+        Properties of the integrator that the method reads.
+    resolution
+        ``(lights, voxels)`` → default number of texels along a side.
+    sampled
+        Name of the method that serves sampled lights and all other rays; "": itself.
+    derivatives
+        Derivatives by the places of lights are supported.
+    automatic
+        ``auto`` may choose the method under a limit.
+    needs
+        ``(medium)`` → True if the method can serve the field.
     """
 
     name: str
     summary: str
-    build: Callable[..., Any]
+    build: Build
     rays: Callable[[int, int], int] = lambda lights, resolution: 0
     numbers: Callable[[Any, Any, Options], int] | None = None
     per_field: bool = False
     dials: tuple[str, ...] = ()
     resolution: Callable[[int, int], int] = resolution_for
-    drawn: str = ""
+    sampled: str = ""
     derivatives: bool = False
     automatic: bool = False
-    needs: Callable[[Any], bool] = lambda medium: True
+    needs: Callable[[Medium], bool] = lambda medium: True
 
     @property
-    def for_drawn(self) -> str:
-        """Name of the method that serves drawn lights where this one serves the table's."""
-        return self.drawn or self.name
-
+    def for_sampled(self) -> str:
+        """Name of the method that serves sampled lights where this one serves the table's."""
+        return self.sampled or self.name

@@ -1,23 +1,26 @@
-"""``neural_transmittance``: the ray network, asked once for each ray of an atlas, and remembered.
+"""``neural_transmittance``: the ray network, evaluated once for each ray of an atlas.
 
-What is learned: the transmittance along any whole ray, as logistics (Shafiei et al. 2021; method.md, section 4). What
-is remembered: its answers for the rays of :mod:`mi_ntf.infer.visibility.transmittance_atlas`, three million of them.
-What it costs: those queries once per field, then an atlas lookup per point and light.
+The network gives the transmittance along any whole ray as logistics (Shafiei et al. 2021; method.md, section 4). Its
+outputs for the three million rays of :mod:`mi_ntf.infer.visibility.transmittance_atlas` are stored once per field. A
+point and light then cost a lookup in the atlas.
 """
 
 from dataclasses import replace
+from types import ModuleType
 
+from ..lights import LightTable
 from . import transmittance_atlas
-from .method import Method
+from .method import Keep, Medium, Method, Options
 
 
-def build(medium, table, options, dj, keep):
-    """See :class:`mi_ntf.infer.visibility.method.Method`."""
+def build(medium: Medium, table: LightTable | None, options: Options, dj: ModuleType,
+          keep: Keep) -> transmittance_atlas.TransmittanceAtlas:
+    """Build the method, see :class:`mi_ntf.infer.visibility.method.Method`."""
     return transmittance_atlas.build(medium, table, replace(options, map_source="network"), dj, keep)
 
 
-def numbers(medium, lights, options) -> int:
-    """float32 numbers of all maps."""
+def numbers(medium: Medium, lights: LightTable | None, options: Options) -> int:
+    """Return the size of all maps, in float32 numbers."""
     return transmittance_atlas.numbers(medium, lights, replace(options, map_source="network"))
 
 

@@ -1,10 +1,13 @@
 """``none``: nothing casts or receives shadows."""
 
-from .method import Method
+from types import ModuleType
 
-METHOD = Method(
-    name="none",
-    summary="no shadows",
-    build=lambda medium, table, options, dj, keep: None,
-    derivatives=True,
-)
+from ..lights import LightTable
+from .method import Keep, Medium, Method, Options
+
+
+def build(medium: Medium, table: LightTable | None, options: Options, dj: ModuleType, keep: Keep) -> None:
+    """Return None, which stands for no shadows."""
+
+
+METHOD = Method(name="none", summary="no shadows", build=build, derivatives=True)

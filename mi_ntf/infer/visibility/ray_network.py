@@ -1,22 +1,29 @@
 """``ray_network``: one query of the ray network per point and light (Shafiei et al. 2021; method.md, section 4)."""
 
+from types import ModuleType
+
 import drjit as dr
 
 from ...core import mixture, spheres
-from .. import ops, profile
-from .method import Method, Options
+from .. import ops, tuning
+from ..lights import LightTable
+from ..network import NetworkField
+from ..profile import DepthProfile
+from ..types import Float, Mask, UInt32, Vector
+from .method import Keep, Medium, Method, Options
 
 
 class RayNetwork:
-    """`field`: a :class:`mi_ntf.infer.network.NetworkField`; `profile`: a
-    :class:`mi_ntf.infer.profile.DepthProfile` of the same field."""
+    """The ray network of `field`; `profile` marches through the same field."""
 
-    def __init__(self, field, profile):
+    def __init__(self, field: NetworkField, profile: DepthProfile):
         self.field, self.profile = field, profile
 
-    def tau(self, x, wi, distance, index, active):
-        """The ray's τ at x; for a light inside the sphere, over its value at the light, which is where τ is 1. What
-        lies behind such a light is kept from the network's eyes."""
+    def tau(self, x: Vector, wi: Vector, distance: Float, index: UInt32, active: Mask, sun: Mask = None) -> Float:
+        """Return the ray's τ at x; for a light inside the sphere, divided by its value at the light.
+
+        The network's inputs then leave out the matter behind the light.
+        """
         here = spheres.coordinate(x, wi)
         light = here + distance
         hit, h, mix = self.field.ray_mixture(x, wi, lambda o, d: self.profile(o, d, begin=light))
@@ -28,9 +35,10 @@ class RayNetwork:
         return dr.select(hit & (light > -h), dr.exp(-depth), 1)
 
 
-def build(medium, table, options: Options, dj, keep) -> RayNetwork:
-    """See :class:`mi_ntf.infer.visibility.method.Method`."""
-    return RayNetwork(medium.field.network, profile.of(medium, options.step * profile.FOR_NETWORKS, dj))
+def build(medium: Medium, table: LightTable | None, options: Options, dj: ModuleType, keep: Keep) -> RayNetwork:
+    """Build the method, see :class:`mi_ntf.infer.visibility.method.Method`."""
+    step = dr.opaque(dj.Float, options.step * tuning.NETWORK_STEP)
+    return RayNetwork(medium.field.network, DepthProfile(medium.source, step))
 
 
 METHOD = Method(

@@ -1,5 +1,7 @@
-"""``transmittance_volume``: per light, τ tabulated along the rays of its map, m × m × n (NRF, Bi et al. 2020, after
-deep shadow maps, Lokovic and Veach 2000)."""
+"""``transmittance_volume``: per light, τ tabulated along the rays of its map, m × m × n.
+
+Source: NRF (Bi et al. 2020), after deep shadow maps (Lokovic and Veach 2000).
+"""
 
 import math
 from types import ModuleType
@@ -11,25 +13,24 @@ from ...core import spheres
 from ...core.errors import MiNtfError
 from .. import ops
 from ..bundle import density_where, safe_inverse
+from ..grid import Density
 from ..lights import LightTable
+from ..tuning import MIN_MAP_RESOLUTION, VOLUME_ENTRIES
+from ..types import Array, Float, Mask, UInt32, Vector
 from .light_rays import LightRays
-from .method import COARSEST, Method, Options
+from .method import Keep, Medium, Method, Options
 from .raymarch import MAX_OPTICAL_DEPTH
-
-ENTRIES = 1.5
-"""Entries of a ray for each cell of the camera's march: τ is linear between them, and skins are as thin."""
 
 
 class TransmittanceVolume:
-    """Tables of all lights of a table, `resolution`² rays of `depths` entries each.
+    """Tables of τ for all lights of a table, `resolution`² rays of `depths` entries each.
 
-    `volume`: a :class:`mi_ntf.infer.grid.Volume`. The entries of a ray divide t' ∈ [−R, R] evenly, R the hull's radius;
-    entry j holds τ at the *far* edge of the j-th cell from the light, so light that has passed no cell yet is 1. A
-    lookup is trilinear: τ linear along each of the four nearest rays, bilinear between them. Memory: 4 m² n bytes a
-    light.
+    The entries of a ray divide t' ∈ [−R, R] evenly, R the radius of the hull of `volume`. Entry j holds τ at the *far*
+    edge of the j-th cell from the light, so light that has passed no cell yet is 1. A lookup is trilinear: τ linear
+    along each of the four nearest rays, bilinear between them. Memory: 4 m² n bytes a light.
     """
 
-    def __init__(self, lights: LightTable, resolution: int, depths: int, volume, dj: ModuleType):
+    def __init__(self, lights: LightTable, resolution: int, depths: int, volume: Density, dj: ModuleType):
         self.dj, self.depths, self.volume, hull = dj, depths, volume, volume.hull
         self.rays = LightRays(lights, hull, resolution, dj)
         if lights.count * resolution**2 * depths >= 1 << 32:
@@ -46,12 +47,12 @@ class TransmittanceVolume:
             self._march(*self.rays.all_rays(first, min(chunk, lights.count - first)))
             dr.eval(self.values)
 
-    def tau(self, x, wi, distance, index, active):
-        """Trilinear τ; 1 where light meets nothing."""
-        inside, _, found = self.rays.nearest(index, x, wi, distance, active)
+    def tau(self, x: Vector, wi: Vector, distance: Float, index: UInt32, active: Mask, sun: Mask = None) -> Float:
+        """Return trilinear τ; 1 where light meets nothing."""
+        inside, _, nearest = self.rays.nearest(index, x, wi, distance, active)
         inverse, last = dr.rcp(self._cell), self.dj.Float(self._n) - 1
-        result = 0
-        for weight, texel, t in found:
+        result: Float = 0
+        for weight, texel, t in nearest:
             # Entry j is the far edge of cell j, t = R − (j + 1) Δ.
             place = dr.clip((self._radius - t) * inverse - 1, -1, last)
             j = dr.floor(place)
@@ -62,18 +63,21 @@ class TransmittanceVolume:
             result += weight * dr.lerp(here, beyond, place - j)
         return dr.select(inside, result, 1)
 
-    def _march(self, texel, o, d, end):
-        """Fill the rays `texel`: σ at the middle of each cell, or of its part on this side of the light at `end`; asked
-        for in occupied space alone, and up to MAX_OPTICAL_DEPTH: what lies behind is dark whatever it holds."""
+    def _march(self, texel: UInt32, o: Vector, d: Vector, end: Float) -> None:
+        """Fill the rays `texel` with τ, up to MAX_OPTICAL_DEPTH.
+
+        σ is taken at the middle of each cell in occupied space, or of the cell's part on this side of the light at
+        `end`.
+        """
         hit, m, h = spheres.chord(ops, o, d)
         inverse = safe_inverse(d)
 
-        def body(j, depth, active):
+        def body(j: UInt32, depth: Float, active: Mask) -> tuple[Array, ...]:
             near = self._radius - self.dj.Float(j) * self._cell
             length = dr.clip(end - near + self._cell, 0, self._cell)
             t = near - self._cell + 0.5 * length
             place = self.volume.place(tuple(mi + t * di for mi, di in zip(m, d, strict=True)))
-            # Entries behind all light are written still: they begin as 1.
+            # Entries behind the last light are written too, since all entries begin as 1.
             matter = active & (dr.abs(t) < h) & (depth < MAX_OPTICAL_DEPTH)
             matter &= self.volume.clear_distance(place, inverse) <= 0
             depth = depth + density_where(matter, self.volume, place) * length
@@ -82,16 +86,16 @@ class TransmittanceVolume:
 
         zero = dr.zeros(self.dj.Float, dr.width(texel))
         state = (dr.zeros(self.dj.UInt32, dr.width(texel)), zero, hit & (self._n > 0))
-        dr.while_loop(state=state, cond=lambda j, depth, active: active, body=body, label="transmittance volume")
+        ops.while_loop(state=state, cond=lambda j, depth, active: active, body=body, label="transmittance volume")
 
 
 def depths(options: Options) -> int:
-    """Entries of a ray."""
-    return math.ceil(ENTRIES * 2 / options.step)
+    """Return the number of entries of a ray."""
+    return math.ceil(VOLUME_ENTRIES * 2 / options.step)
 
 
-def build(medium, table, options: Options, dj, keep) -> TransmittanceVolume:
-    """See :class:`mi_ntf.infer.visibility.method.Method`."""
+def build(medium: Medium, table: LightTable, options: Options, dj: ModuleType, keep: Keep) -> TransmittanceVolume:
+    """Build the method, see :class:`mi_ntf.infer.visibility.method.Method`."""
     return TransmittanceVolume(table, options.map_resolution, depths(options), medium.source, dj)
 
 
@@ -102,6 +106,6 @@ METHOD = Method(
     rays=lambda lights, resolution: lights * resolution**2,
     numbers=lambda medium, table, options: depths(options),
     dials=("map_resolution", "map_memory"),
-    resolution=lambda lights, voxels: COARSEST,  # its memory grows with the third power
-    drawn="raymarch",
+    resolution=lambda lights, voxels: MIN_MAP_RESOLUTION,  # memory grows with the third power
+    sampled="raymarch",
 )

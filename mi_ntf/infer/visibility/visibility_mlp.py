@@ -1,5 +1,9 @@
-"""``visibility_mlp``: NeRV's network of a point and a direction (Srinivasan et al. 2021), the baseline: a query per
-point and light, not monotone along a ray."""
+"""``visibility_mlp``: NeRV's network of a point and a direction (Srinivasan et al. 2021), the baseline.
+
+It takes a query per point and light, and is not monotone along a ray.
+"""
+
+from types import ModuleType
 
 import drjit as dr
 
@@ -7,27 +11,29 @@ from ...core import spheres
 from ...core.architecture import NO_VISIBILITY
 from ...core.errors import MiNtfError
 from .. import ops
-from .method import Method, Options
+from ..lights import LightTable
+from ..network import NetworkField
+from ..types import Float, Mask, UInt32, Vector
+from .method import Keep, Medium, Method, Options
 
 SHORT = 1e-5
-"""Ways through less of the sphere pass nothing: of a light or a point on it, rounding decides on which side it is."""
+"""Shortest length inside the sphere that counts, field units; it absorbs the rounding of points on the sphere."""
 
 
 class VisibilityMLP:
-    """`field`: a :class:`mi_ntf.infer.network.NetworkField` with the baseline's network (`mi-ntf train
-    --visibility-mlp`); MiNtfError if it has none.
+    """The baseline's network of `field`; raises MiNtfError if it has none (`mi-ntf train --visibility-mlp`).
 
-    The network knows directions, no distances: a light inside the sphere is dimmed by what lies behind it as well, as
-    in the original.
+    The network knows directions, no distances: a light inside the sphere is also dimmed by the matter behind it, as in
+    the original.
     """
 
-    def __init__(self, field):
+    def __init__(self, field: NetworkField):
         if not field.has_visibility:
             raise MiNtfError(NO_VISIBILITY)
         self.field = field
 
-    def tau(self, x, wi, distance, index, active):
-        """The network's τ from `x`, or from where its ray enters the sphere, to where it leaves."""
+    def tau(self, x: Vector, wi: Vector, distance: Float, index: UInt32, active: Mask, sun: Mask = None) -> Float:
+        """Return the network's τ from `x`, or the place where its ray enters the sphere, to where it leaves."""
         hit, m, h = spheres.chord(ops, x, wi)
         here = spheres.coordinate(x, wi)
         t = dr.maximum(here, -h)
@@ -36,8 +42,8 @@ class VisibilityMLP:
         return dr.select(hit & (way > SHORT), tau, 1)
 
 
-def build(medium, table, options: Options, dj, keep) -> VisibilityMLP:
-    """See :class:`mi_ntf.infer.visibility.method.Method`."""
+def build(medium: Medium, table: LightTable | None, options: Options, dj: ModuleType, keep: Keep) -> VisibilityMLP:
+    """Build the method, see :class:`mi_ntf.infer.visibility.method.Method`."""
     return VisibilityMLP(medium.field.network)
 
 

@@ -7,7 +7,7 @@ from a map file or from the cache if possible.
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import mitsuba as mi
 import numpy as np
@@ -15,6 +15,7 @@ import numpy as np
 from ...core.errors import MiNtfError
 from ...infer.lights import LightTable
 from ...infer.texels import DTYPES
+from ...infer.types import Visibility
 from ...infer.visibility import REGISTRY
 from ...infer.visibility.marched_suns import MarchedSuns
 from ...infer.visibility.method import Options
@@ -72,7 +73,7 @@ def size_per_field(name: str, medium: NRFMedium, table: LightTable, options: Opt
     return 4 * method.numbers(medium, table, options) if method.numbers and method.per_field else 0
 
 
-def build(name: str, medium: NRFMedium, table: LightTable | None, options: Options):
+def build(name: str, medium: NRFMedium, table: LightTable | None, options: Options) -> Visibility | None:
     """Build a visibility method for `medium`, in its field coordinates.
 
     Parameters
@@ -110,7 +111,15 @@ def build(name: str, medium: NRFMedium, table: LightTable | None, options: Optio
         return method.build(medium, table, options, mi, keep)
 
 
-def with_suns(lookup, suns: np.ndarray, medium: NRFMedium, table: LightTable | None, options: Options
+def march(medium: NRFMedium, table: LightTable | None, options: Options) -> Visibility:
+    """Return the method ``raymarch``, which serves any light."""
+    return cast(Visibility, build("raymarch", medium, table, options))
+
+
+def with_suns(lookup: Visibility, suns: np.ndarray | None, medium: NRFMedium, table: LightTable | None, options: Options
               ) -> MarchedSuns:
-    """Return the visibility method `lookup` with rays marched to the lights for which the mask `suns` (n,) is True."""
-    return MarchedSuns(lookup, build("raymarch", medium, table, options), suns, mi)
+    """Return the visibility method `lookup` with rays marched to suns.
+
+    `suns`: mask (n,) of the rows of the light table; None for sampled lights.
+    """
+    return MarchedSuns(lookup, march(medium, table, options), suns, mi)

@@ -1,94 +1,128 @@
-"""The ``ntf`` emitter."""
+"""Light with the shadow of a field (``ntf``, an emitter).
+
+=============== ======= ======== =========== ======================== ==================================================
+parameter       type    default  range       flags                    meaning
+=============== ======= ======== =========== ======================== ==================================================
+(nested)        emitter required             exposed, differentiable  the light: any emitter, or another ``ntf`` for a
+                                                                      second field; ``area`` if this emitter stands
+                                                                      inside the shape that shines
+(nested)        medium  required                                      the ``nrf`` medium that casts the shadow, nested
+                                                                      or by ``<ref>``
+visibility      string  auto     see meaning                          ``raymarch``, ``transmittance_atlas``,
+                                                                      ``neural_transmittance``, ``ray_network``,
+                                                                      ``visibility_mlp``, ``none``; for lights of one
+                                                                      point or direction also ``transmittance_map``,
+                                                                      ``transmittance_volume``. ``auto`` is
+                                                                      ``transmittance_map`` for those and
+                                                                      ``transmittance_atlas`` for others.
+sampling_weight float   1        0 to 10³⁰                            as for any emitter: its share of the samples of
+                                                                      all emitters. 0 is allowed for lights of one point
+                                                                      or direction, and switches them off.
+=============== ======= ======== =========== ======================== ==================================================
+
+An integrator that samples this emitter receives the radiance of the nested light times the field's transmittance from
+the lit point to the light. A field thus casts its shadow on ordinary surfaces under stock ``path``, ``direct`` and
+``prb``. The shadow depends on the lit point, which emitter sampling alone knows. BSDF samples that hit the light
+therefore have no weight, and gloss needs more samples than under the bare light. The camera sees the bare environment
+or area light.
+
+Pictures are differentiable with respect to what stock integrators support: the light's power and place, and the
+surfaces. The shadows of moving lights and surfaces are marched then, unless `visibility` is ``none``. ``prb`` has no
+derivative with respect to the place of a light of one point or direction, and is refused there.
+
+The ``nrf`` integrator takes the bare light if the medium is in the scene, since it casts the shadows of fields itself.
+Stock ``volpath`` casts them, too, if the medium fills a shape in the scene: give it the bare light.
+
+Does not support: the field's shadow on reflections in mirrors (delta BSDFs); importance sampling by position (particle
+tracers).
+
+.. code-block:: xml
+
+    <emitter type="ntf">
+        <emitter type="point"> <point name="position" x="1.5" y="2.6" z="2.7"/> </emitter>
+        <medium type="nrf"> <string name="filename" value="scenes/statue/field.safetensors"/> </medium>
+    </emitter>
+
+.. code-block:: python
+
+    {
+        "type": "ntf",
+        "light": {"type": "point", "position": [1.5, 2.6, 2.7]},
+        "field": {"type": "nrf", "filename": "scenes/statue/field.safetensors"},
+    }
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TypeVar, cast
 
 import drjit as dr
 import mitsuba as mi
 
 from ...core.errors import MiNtfError
+from ...infer.types import Array, Color3, Float, Mask, Visibility
 from ...infer.visibility import REGISTRY, names, outside
-from ...infer.visibility.marched_suns import DRAWN
 from ...infer.visibility.method import Options, resolution_for
 from ..lights import environment, light_checks, light_rows, scene_lights
-from ..lights.emitter_samples import SHARP
+from ..lights.emitter_samples import SHARP, fully_sampled
 from ..maps import building
+from ..scene.media import NRFMedium
 from . import properties
+
+T = TypeVar("T")
 
 STEP = 2 / 384
 NEVER = 1e18
-"""Density that emitter sampling claims for every direction, 1/sr: beside it, the power heuristic gives light that a
-BSDF-sampled ray finds no weight. Its square is still a float32."""
+"""Density of every direction that emitter sampling reports, in 1/sr. The power heuristic then gives no weight to light
+on rays of BSDF samples. Its square is still a float32."""
 
 
 def emitter_class() -> type:
-    """The plugin class for the current variant."""
+    """Return the plugin class for the current variant."""
 
     class NTFEmitter(mi.Emitter):
-        """A light seen through a field (``ntf``).
+        __doc__ = __doc__
 
-        =============== ======= ====================================================================================
-        parameter       type    meaning
-        =============== ======= ====================================================================================
-        (nested)        emitter the light: any emitter, another ``ntf`` for a second field; ``area`` where this emitter
-                                stands inside the shape that shines
-        (nested)        medium  the ``nrf`` medium in its way, nested or by ``<ref>``
-        visibility      string  ``raymarch``, ``transmittance_atlas``, ``neural_transmittance``, ``ray_network``,
-                                ``visibility_mlp``, ``none``; of lights that are one point or direction also
-                                ``transmittance_map``, ``transmittance_volume``; ``auto`` is ``transmittance_map`` for
-                                those and ``transmittance_atlas`` for others (default: auto)
-        sampling_weight float   as of any emitter: share of the samples drawn from all (default: 1)
-        =============== ======= ====================================================================================
-
-        Whatever samples this emitter receives the nested light's radiance times the field's transmittance from the lit
-        point to the light, so that a field casts its shadow on ordinary surfaces under stock ``path``, ``direct`` and
-        ``prb``. Light reaches surfaces by emitter sampling alone, which knows the lit point; BSDF samples that hit the
-        light weigh nothing, so gloss needs more samples than under the bare light. The camera sees an environment or
-        area light as it is.
-
-        Pictures can be differentiated by what stock integrators know derivatives of: the light's power and place, and
-        the surfaces. The shadows of what moves are marched for it, whatever `visibility` is, unless ``none``. Where
-        place is that of a light of one point or direction, ``prb`` knows no derivative and is refused.
-
-        The ``nrf`` integrator takes the nested light bare where the medium is in the scene, since it casts the shadows
-        of fields itself. Stock ``volpath`` does too if the medium fills a shape there: give it the bare light.
-
-        Does not support: the field's shadow on what mirrors (delta BSDFs) reflect; importance sampling by position
-        (particle tracers).
-        """
-
-        def __init__(self, props):
+        def __init__(self, props: mi.Properties) -> None:
             read = properties.Reader(props, "ntf emitter", properties.EMITTER, nested=True)
             self.visibility = read.choice("visibility", "auto", names())
             read.number("sampling_weight", 1.0, 0.0, 1e30)
             nested = [value for _, value in props.objects()]
-            other = [o for o in nested if not (isinstance(o, mi.Emitter) or getattr(o, "is_nrf", False))]
+            lights = [o for o in nested if isinstance(o, mi.Emitter)]
+            media = [o for o in nested if getattr(o, "is_nrf", False)]
+            other = [o for o in nested if o not in lights + media]
             if other:
                 raise MiNtfError(f"ntf emitter: it has no place for a nested {other[0].class_name()}; it takes a light "
                                  "and an nrf medium")
-            self.inner = _single([o for o in nested if isinstance(o, mi.Emitter)], "emitter", "a light to wrap")
-            self.medium = _single([o for o in nested if getattr(o, "is_nrf", False)], "medium", "an nrf medium")
+            self.inner: mi.Emitter = _single(lights, "emitter", "a light to wrap")
+            self.medium = cast(NRFMedium, _single(media, "medium", "an nrf medium"))
             mi.Emitter.__init__(self, props)
             # An environment's flags let the camera see it; the shape that shines asks for those of its emitter.
             self.m_flags = int(self.inner.flags())
             self.m_needs_sample_2 = self.m_needs_sample_3 = False
-            self.bare = self._drawn_still = False
+            self.bare = self._sampled_at_rest = False
             self._prepare()
 
-        def _prepare(self):
-            light_checks.check(self.inner, scene_lights.kind(self.inner), drawn=True)
+        def _prepare(self) -> None:
+            light_checks.check(self.inner, scene_lights.kind(self.inner), sampled=True)
             environment.check_unscaled(self.inner)
             if not self.sampling_weight() and not mi.has_flag(self.inner.flags(), mi.EmitterFlags.Delta):
                 raise MiNtfError("ntf emitter: sampling_weight is 0, so that BSDF samples alone would find the light, "
                                  "which know nothing of the field's shadow; give it a weight above 0")
-            self._drawn = environment.drawable(self.inner)
+            self._fully_sampled = fully_sampled(self.inner)
             self._method = _visibility(self.visibility, self.inner, self.medium)
-            self._march = building.build("raymarch", self.medium, None, Options(STEP))
+            self._march = building.march(self.medium, None, Options(STEP))
 
-        def sample_direction(self, it, sample, active=True):
+        def sample_direction(self, it: mi.Interaction3f, sample: mi.Point2f, active: Mask = True
+                             ) -> tuple[mi.DirectionSample3f, Color3]:
             inner = self.attached()
-            self._drawn_still = not _attached_place(inner)
-            ds, weight = (inner if self.bare else self._drawn).sample_direction(it, sample, active)
+            self._sampled_at_rest = not _attached_place(inner)
+            ds: Array
+            weight: Color3
+            ds, weight = (inner if self.bare else self._fully_sampled).sample_direction(it, sample, active)
             if _is_far(inner):
-                # The nested light never learns the scene's size: it believes in a unit sphere and would end shadow rays
-                # there.
+                # The nested light does not know the scene's size. It would end shadow rays at a unit sphere.
                 frame = self.medium.frame
                 reach = dr.norm(it.p - mi.Point3f(frame.origin.tolist())) + frame.length
                 ds.dist = dr.maximum(ds.dist, 1000 * reach)
@@ -99,65 +133,65 @@ def emitter_class() -> type:
             ds.delta = dr.ones(mi.Bool, dr.width(ds.pdf))
             return ds, weight * self._tau(it, ds, active & (ds.pdf > 0))
 
-        def _tau(self, it, ds, active):
+        def _tau(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: Mask) -> Float:
             if self._method is None:
                 return mi.Float(1)
             frame = self.medium.frame
-            distance = mi.Float(dr.inf) if _is_far(self.inner) else ds.dist / frame.length
+            distance: Float = mi.Float(dr.inf) if _is_far(self.inner) else ds.dist / frame.length
             x, d = frame.point_to_field(it.p), frame.direction_to_field(ds.d)
-            sun = ds.pdf > SHARP  # never that of one light, whose map has the number 0
-            # Maps and networks belong to the light's former place, so attached places are marched.
+            sun = ds.pdf > SHARP
+            # Maps and networks belong to fixed places, so rays with gradients are marched.
             method = self._march if dr.grad_enabled(x, d, distance) else self._method
-            return outside.tau(method, x, d, distance, mi.UInt32(sun), active)
+            return outside.tau(method, x, d, distance, mi.UInt32(0), active, sun)
 
-        def attached(self):
-            """The nested light; one with a surface shines from the shape that this emitter belongs to."""
+        def attached(self) -> mi.Emitter:
+            """Return the nested light; one with a surface shines from the shape to which this emitter belongs."""
             shape = self.get_shape()
             if shape is not None and self.inner.get_shape() is None:
                 self.inner.set_shape(shape)
             return self.inner
 
-        def pdf_direction(self, it, ds, active=True):
+        def pdf_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: Mask = True) -> Float:
             if self.bare:
                 return self.attached().pdf_direction(it, ds, active)
-            hit = mi.Float(0 if mi.has_flag(self.inner.flags(), mi.EmitterFlags.Delta) else NEVER)
-            return dr.select(active, hit, 0)
+            density = mi.Float(0 if mi.has_flag(self.inner.flags(), mi.EmitterFlags.Delta) else NEVER)
+            return dr.select(active, density, 0)
 
-        def eval_direction(self, it, ds, active=True):
+        def eval_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: Mask = True) -> Color3:
             place = _attached_place(self.inner)
-            if place and self._drawn_still:
+            if place and self._sampled_at_rest:
                 raise MiNtfError(f"ntf emitter: gradients by {place} of its light: prb leaves them out; render with "
                                  "direct or path, or detach it")
-            value = self.attached().eval_direction(it, ds, active)
+            value: Color3 = self.attached().eval_direction(it, ds, active)
             return value if self.bare else value * self._tau(it, ds, active)
 
-        def eval(self, si, active=True):
+        def eval(self, si: mi.SurfaceInteraction3f, active: Mask = True) -> Color3:
             return self.attached().eval(si, active)
 
-        def bbox(self):
+        def bbox(self) -> mi.ScalarBoundingBox3f:
             return self.attached().bbox()
 
-        def traverse(self, callback):
+        def traverse(self, callback: mi.TraversalCallback) -> None:
             mi.Emitter.traverse(self, callback)
             callback.put("emitter", self.inner, mi.ParamFlags.Differentiable)
 
-        def parameters_changed(self, keys):
+        def parameters_changed(self, keys: Sequence[str] = ()) -> None:
             mi.Emitter.parameters_changed(self, keys)
             self._prepare()
 
-        def to_string(self):
+        def to_string(self) -> str:
             return f"NTFEmitter[\n  visibility = {self.visibility},\n  emitter = {self.inner}\n]"
 
     return NTFEmitter
 
 
-def _visibility(name: str, inner, medium):
-    """The method of this `name`, made for the light `inner` behind `medium`; None for ``none``."""
+def _visibility(name: str, inner: mi.Emitter, medium: NRFMedium) -> Visibility | None:
+    """Return the visibility method `name` for the light `inner` behind `medium`; None for ``none``."""
     one, table = _is_one(inner), None
-    # The shadow of one light is sharp: its own map sees it better, and is made in a moment.
+    # A light of one place has a sharp shadow, for which its own map is best.
     auto = "transmittance_map" if one else "transmittance_atlas"
     method = auto if name == "auto" else name
-    if REGISTRY[method].drawn:
+    if REGISTRY[method].sampled:
         kind = scene_lights.kind(inner)
         if not one:
             raise MiNtfError(
@@ -166,17 +200,19 @@ def _visibility(name: str, inner, medium):
             )
         table = scene_lights.rows([(inner, kind)], 1).table(medium.frame)
     options = Options(STEP, resolution_for(1, medium.field.grid.resolution), cache=True)
-    found = building.build(method, medium, table, options)
-    return building.with_suns(found, DRAWN, medium, table, options) if REGISTRY[method].per_field and not one else found
+    visibility = building.build(method, medium, table, options)
+    if visibility and REGISTRY[method].per_field and not one:
+        return building.with_suns(visibility, None, medium, table, options)
+    return visibility
 
 
-def _is_one(inner) -> bool:
+def _is_one(inner: mi.Emitter) -> bool:
     """Return True if a light shines from one point or direction."""
     return light_rows.kind(inner).single and scene_lights.is_discrete(inner)
 
 
-def _attached_place(inner) -> str:
-    """Name of the parameter that moves a light of one point or direction, if it carries gradients; else nothing."""
+def _attached_place(inner: mi.Emitter) -> str:
+    """Return the name of the parameter that moves a light of one point or direction, if it carries gradients."""
     if not mi.has_flag(inner.flags(), mi.EmitterFlags.Delta):
         return ""
     attached = (key for key, value in mi.traverse(inner)
@@ -184,12 +220,13 @@ def _attached_place(inner) -> str:
     return next(attached, "")
 
 
-def _is_far(emitter) -> bool:
+def _is_far(emitter: mi.Emitter) -> bool:
     """Return True for lights at infinity: environments and directional lights."""
     return bool(mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite))
 
 
-def _single(objects: list, kind: str, what: str):
+def _single(objects: Sequence[T], kind: str, role: str) -> T:
+    """Return the only one of `objects`. Raises MiNtfError if there are none or several."""
     if len(objects) != 1:
-        raise MiNtfError(f"ntf emitter: found {len(objects)} nested {kind} objects, needs exactly one: {what}")
+        raise MiNtfError(f"ntf emitter: found {len(objects)} nested {kind} objects, needs exactly one: {role}")
     return objects[0]
