@@ -1,4 +1,4 @@
-"""`python -m mi_ntf` is the command `mi-ntf`."""
+"""Entry point of `python -m mi_ntf`, the command `mi-ntf`."""
 
 import sys
 

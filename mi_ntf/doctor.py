@@ -1,6 +1,6 @@
-"""`mi-ntf doctor`: what this machine has, what it lacks, and the command that mends it.
+"""`mi-ntf doctor`: checks of this machine, and the command that repairs each fault.
 
-Everything that may abort the process (a bad LLVM does) is tried in a child process.
+Checks that may abort the process, as an unfit LLVM does, run in a child process.
 """
 
 import ctypes
@@ -11,9 +11,8 @@ import platform
 import subprocess
 import sys
 import sysconfig
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from mi_ntf import __version__
 from mi_ntf.jobs.options import cores
@@ -53,7 +52,12 @@ print(".".join(map(str, dr.detail.cuda_version())))
 
 @dataclass(frozen=True)
 class Check:
-    """Result of one check. `needed`: rendering is impossible without it. `remedy`: empty if nothing is to be done."""
+    """Result of one check.
+
+    needed  True if rendering is impossible without it
+    found   state of the machine
+    remedy  what to do, "" if nothing
+    """
 
     name: str
     ok: bool
@@ -62,41 +66,44 @@ class Check:
     remedy: str = ""
 
 
-def examine() -> dict[str, Any]:
-    """Run all checks and return the results as plain data.
+@dataclass(frozen=True)
+class Report:
+    """All checks of this machine. `ok` is True if every needed check passed."""
 
-    Keys: `ok` (every needed check passed), `version`, `checks` (list of the fields of :class:`Check`)."""
+    ok: bool
+    version: str
+    checks: list[Check]
+
+
+def examine() -> Report:
+    """Run all checks."""
     checks = [check_python(), check_cores(), *check_mitsuba(), check_llvm(), check_cuda()]
     checks += [check_bridge(), check_libpython()]
     checks += [check_extra(name) for name in EXTRAS]
-    return {
-        "ok": all(check.ok for check in checks if check.needed),
-        "version": __version__,
-        "checks": [asdict(check) for check in checks],
-    }
+    return Report(all(check.ok for check in checks if check.needed), __version__, checks)
 
 
-def print_table(report: dict[str, Any]) -> None:
-    """Print the findings, faults with their remedy below."""
+def print_table(report: Report) -> None:
+    """Print all checks, and the remedies of faults below."""
     from rich.console import Console
     from rich.table import Table
 
     console = Console()
-    table = Table(title=f"mi-ntf {report['version']}", title_justify="left", show_header=False, box=None)
+    table = Table(title=f"mi-ntf {report.version}", title_justify="left", show_header=False, box=None)
     table.add_column()
     table.add_column()
     table.add_column(overflow="fold")
-    for check in report["checks"]:
-        mark = "[green]✔" if check["ok"] else "[red]✘" if check["needed"] else "[yellow]–"
-        table.add_row(mark, check["name"], check["found"])
+    for check in report.checks:
+        mark = "[green]✔" if check.ok else "[red]✘" if check.needed else "[yellow]–"
+        table.add_row(mark, check.name, check.found)
     console.print(table)
-    for check in report["checks"]:
-        if check["remedy"]:  # never wrapped, so that commands can be copied
-            console.print(f"{check['name']}: {check['remedy']}", soft_wrap=True, markup=False, highlight=False)
+    for check in report.checks:
+        if check.remedy:  # never wrapped, so that commands can be copied
+            console.print(f"{check.name}: {check.remedy}", soft_wrap=True, markup=False, highlight=False)
 
 
 def check_python() -> Check:
-    """The interpreter that runs this."""
+    """Check the version of the running interpreter."""
     minimum = ".".join(map(str, PYTHON_MINIMUM))
     ok = sys.version_info >= PYTHON_MINIMUM
     return Check(
@@ -109,7 +116,7 @@ def check_python() -> Check:
 
 
 def check_cores() -> Check:
-    """Cores of this process. With one, Mitsuba alone waits for ever when it reads or writes an EXR file."""
+    """Check that this process has two cores. With one, Mitsuba hangs when it reads or writes an EXR file."""
     count = cores()
     remedy = (
         "mi-ntf and scenes with its plugins use two threads by themselves; render other scenes with `mitsuba -t 3` "
@@ -131,7 +138,7 @@ def check_mitsuba() -> list[Check]:
 
 
 def check_llvm() -> Check:
-    """Dr.Jit's LLVM back end runs a kernel with a minimum."""
+    """Check that Dr.Jit's LLVM back end runs a kernel."""
     code, lines, error = _probe(_LLVM_PROBE)
     version = lines[0] if lines else ""
     path = lines[1] if len(lines) > 1 else "path unknown"
@@ -150,7 +157,7 @@ def check_llvm() -> Check:
 
 
 def check_cuda() -> Check:
-    """A GPU is welcome and not needed."""
+    """Check that Dr.Jit's CUDA back end runs a kernel. It is optional."""
     code, lines, _ = _probe(_CUDA_PROBE)
     return Check("CUDA", code == 0, False, lines[0] if code == 0 and lines else "not available; LLVM is used")
 
@@ -172,7 +179,7 @@ def check_bridge() -> Check:
 
 
 def check_libpython() -> Check:
-    """With a shared libpython the stock program runs Python inside; without it, it hands over to `mi-ntf render`."""
+    """Check for a shared libpython, by which the stock program runs Python. Without it, `mi-ntf render` takes over."""
     name = f"libpython{sys.version_info.major}.{sys.version_info.minor}.so.1.0"
     library = Path(sysconfig.get_config_var("LIBDIR") or "") / name
     shared = library.is_file()
@@ -193,7 +200,7 @@ def check_libpython() -> Check:
 
 
 def check_extra(extra: str) -> Check:
-    """Modules of one optional extra, by presence alone: nothing is imported."""
+    """Check that the modules of an optional extra are there, without importing them."""
     missing = [module for module in EXTRAS[extra] if importlib.util.find_spec(module) is None]
     remedy = pip_install(f"[{extra}]") if missing else ""
     return Check(
@@ -202,7 +209,7 @@ def check_extra(extra: str) -> Check:
 
 
 def pip_install(extras: str, *options: str) -> str:
-    """The command that installs this package again, from the checkout if it lies in one."""
+    """Return the command that installs this package again, from the checkout if it lies in one."""
     checkout = Path(__file__).resolve().parents[1]
     source = f"-e '{checkout}{extras}'" if (checkout / "pyproject.toml").is_file() else f"'mi-ntf{extras}'"
     return " ".join([sys.executable, "-m pip install", *options, source])
@@ -216,7 +223,7 @@ def _version(package: str) -> str:
 
 
 def _probe(code: str) -> tuple[int, list[str], str]:
-    """Run Python code in a child: exit status, words of its output, the line that names the fault."""
+    """Run Python code in a child process. Returns its exit status, the words of its output, and its error message."""
     child = subprocess.run(
         [sys.executable, "-c", code],
         capture_output=True,
@@ -225,6 +232,6 @@ def _probe(code: str) -> tuple[int, list[str], str]:
         env={**os.environ, "PYTHONWARNINGS": "ignore"},
     )
     errors = child.stderr.strip().splitlines()
-    named = [line for line in errors if "error" in line.lower()]
-    reason = (named or errors or [f"the process ended with status {child.returncode}"])[-1]
+    messages = [line for line in errors if "error" in line.lower()]
+    reason = (messages or errors or [f"the process ended with status {child.returncode}"])[-1]
     return child.returncode, child.stdout.split(), reason

@@ -1,4 +1,4 @@
-"""`mi-ntf export`: a field's surface as a mesh, with what it reflects, for Blender and other programs.
+"""`mi-ntf export`: a field's surface as a mesh with its reflectance, for Blender and other programs.
 
 A PLY file has for each vertex, in this order:
 
@@ -9,14 +9,14 @@ A PLY file has for each vertex, in this order:
     roughness                   as Blender's Principled BSDF has it: α = roughness²
     specular                    weight of the specular lobe
 
-Source of the names: Blender's `io/ply/importer/ply_import_data.cc` (what is none of the standard names becomes a float
-attribute of its name) and Mitsuba's plugin `ply`, which has no place for single numbers and says so.
+Source of the names: Blender's `io/ply/importer/ply_import_data.cc`, where other than standard names become float
+attributes, and Mitsuba's plugin `ply`, which ignores attributes of a single number and warns about them.
 """
 
 import importlib.util
+from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from mi_ntf.infer.network import NetworkField
 from mi_ntf.infer.surface import RESOLUTIONS, Surface, surface
 
 SUFFIXES = (".ply", ".obj", ".glb", ".stl")
-"""OBJ and GLB have colours, STL the shape alone."""
+"""Endings of files. OBJ and GLB have colours, STL has the shape alone."""
 
 _SHAPE = """<shape type="ply">
     <string name="filename" value="{file}"/>
@@ -52,12 +52,37 @@ _SHAPE = """<shape type="ply">
 """
 
 
-def export(field: Path, output: Path, resolution: int = 256, level: float | None = None) -> dict[str, Any]:
-    """Write the surface of a field file as a mesh, whose kind is that of `output`'s suffix.
+@dataclass(frozen=True)
+class MeshFile:
+    """Figures of a mesh: its `size` is in scene units, `roughness` and `specular` are means over the vertices."""
 
-    `resolution`: voxels per side of the field's unit sphere; `level`: density of the surface, 1/(unit-sphere radius),
-    found where None (:func:`mi_ntf.infer.surface.surface`). Returns ``file``, ``vertices``, ``faces``, ``level``,
-    ``size``: its sides in scene units, and the means of ``roughness`` and ``specular``. Raises MiNtfError.
+    file: str
+    vertices: int
+    faces: int
+    level: float
+    size: list[float]
+    roughness: float
+    specular: float
+
+
+def export(field: Path, output: Path, resolution: int = 256, level: float | None = None) -> MeshFile:
+    """Write the surface of a field file as a mesh, in the format of `output`'s suffix.
+
+    Parameters
+    ----------
+    field
+        Field file.
+    output
+        Mesh to write.
+    resolution
+        Voxels per side of the field's unit sphere.
+    level
+        Density of the surface, 1/(unit-sphere radius). None chooses it (:func:`mi_ntf.infer.surface.surface`).
+
+    Raises
+    ------
+    MiNtfError
+        If an argument is out of range, or the field has no surface.
     """
     field, output = Path(field), Path(output)
     if output.suffix.lower() not in SUFFIXES:
@@ -66,53 +91,54 @@ def export(field: Path, output: Path, resolution: int = 256, level: float | None
         raise MiNtfError(f"--resolution is {resolution}, expected {RESOLUTIONS[0]} to {RESOLUTIONS[1]} voxels per side")
     if level is not None and not 0 < level < np.inf:
         raise MiNtfError(f"--level is {level:g}, expected a positive density, 1/(radius of the field's sphere)")
-    _libraries()
+    _check_libraries()
     files.check(output)
     header, tensors = field_file.load(field)
     dj = module("llvm_ad_rgb")
-    found = surface(NetworkField(header, tensors, dj), resolution, level, dj)
-    vertices = found.vertices * header.similarity.radius + np.array(header.similarity.center)
-    files.write(output, _encoded(found, vertices, output.suffix.lower()))
-    return {"file": str(output), "vertices": len(vertices), "faces": len(found.faces), "level": found.level,
-            "size": np.ptp(vertices, axis=0).round(6).tolist(),
-            "roughness": float(found.roughness.mean()), "specular": float(found.specular.mean())}
+    mesh = surface(NetworkField(header, tensors, dj), resolution, level, dj)
+    vertices = mesh.vertices * header.similarity.radius + np.array(header.similarity.center)
+    files.write(output, _encoded(mesh, vertices, output.suffix.lower()))
+    return MeshFile(str(output), len(vertices), len(mesh.faces), mesh.level, np.ptp(vertices, axis=0).round(6).tolist(),
+                    float(mesh.roughness.mean()), float(mesh.specular.mean()))
 
 
-def mitsuba_shape(mesh: Path, made: dict[str, Any], to_world: np.ndarray) -> str:
+def mitsuba_shape(path: Path, mesh: MeshFile, to_world: np.ndarray) -> str:
     """Return the ``<shape>`` of a PLY file for Mitsuba's stock integrators.
 
     Parameters
     ----------
-    mesh
+    path
         The file as the XML names it.
-    made
-        What :func:`export` returned for it; roughness and specular weight are the same all over the mesh, since the
-        plugin ``ply`` has no place for single numbers.
+    mesh
+        Result of :func:`export`. Its mean roughness and specular weight hold all over the mesh, because the plugin
+        ``ply`` has no attributes of a single number.
     to_world
         (4, 4) matrix from the capture's coordinates to the scene's.
     """
-    return _SHAPE.format(file=escape(str(mesh)), place=" ".join(f"{value:.9g}" for value in to_world.ravel()),
-                         specular=made["specular"], alpha=made["roughness"] ** 2)
+    return _SHAPE.format(file=escape(str(path)), place=" ".join(f"{value:.9g}" for value in to_world.ravel()),
+                         specular=mesh.specular, alpha=mesh.roughness**2)
 
 
-def _libraries() -> None:
+def _check_libraries() -> None:
     missing = [name for name in ("skimage", "scipy", "trimesh") if importlib.util.find_spec(name) is None]
     if missing:
         raise MiNtfError(f"meshes need scikit-image, SciPy and trimesh, and {', '.join(missing)} is missing: "
                          "pip install 'mi-ntf[mesh]'")
 
 
-def _encoded(found: Surface, vertices: np.ndarray, suffix: str) -> Any:
-    """The file's contents."""
+def _encoded(surface: Surface, vertices: np.ndarray, suffix: str) -> bytes | str:
+    """Return the contents of the file."""
     import trimesh
 
-    # Colours of glTF are linear, those of the others are shown as they are.
-    colours = found.albedo if suffix == ".glb" else encode(np, found.albedo)
+    # Colours of glTF are linear, those of the other formats are sRGB.
+    colours = surface.albedo if suffix == ".glb" else encode(np, surface.albedo)
     alpha = np.ones((len(vertices), 1))
-    mesh = trimesh.Trimesh(vertices, found.faces, vertex_normals=found.normals, process=False,
+    mesh = trimesh.Trimesh(vertices, surface.faces, vertex_normals=surface.normals, process=False,
                            vertex_colors=np.round(255 * np.concatenate([colours, alpha], 1)).astype(np.uint8))
     if suffix == ".ply":
         names = ("albedo_r", "albedo_g", "albedo_b", "roughness", "specular")
-        values = (*found.albedo.T, found.roughness, found.specular)
+        values = (*surface.albedo.T, surface.roughness, surface.specular)
         mesh.vertex_attributes.update(dict(zip(names, map(np.ascontiguousarray, values), strict=True)))
-    return mesh.export(file_type=suffix[1:])
+    contents = mesh.export(file_type=suffix[1:])
+    assert isinstance(contents, bytes | str)  # not a dict, as for other formats
+    return contents

@@ -1,17 +1,19 @@
 """`mi-ntf render`: the stock program `mitsuba` in Python, for machines without a C++ compiler.
 
-It takes the stock program's flags and does what `src/mitsuba/mitsuba.cpp` of Mitsuba 3.9.1 does:
-parse, instantiate, render without developing, let the film write the file. Flags of its own: ``--watch``, and those of
-another environment (:mod:`mi_ntf.render.scene.environment_option`).
+It follows `src/mitsuba/mitsuba.cpp` of Mitsuba 3.9.1: parse, instantiate, render without developing, let the film write
+the file. The stock program has no ``--watch``, and no options for the environment
+(:mod:`mi_ntf.render.scene.environment_option`).
 """
+
+from __future__ import annotations
 
 import argparse
 import ctypes
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -21,18 +23,19 @@ from mi_ntf import bridge
 from mi_ntf.core import files
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.core.variants import VARIANTS, enough_threads
+from mi_ntf.render import log
 from mi_ntf.render.scene import scene_file
 from mi_ntf.render.scene.environment_option import Environment
 from mi_ntf.watch import TEV, Tev, printed, watch
 
-MTIME = 2.0
+CLOCK_DELAY = 2.0
 """Seconds that a file system's clock may be behind."""
 
 
 def parser() -> argparse.ArgumentParser:
-    """The stock program's command line."""
+    """Return the parser of the stock program's command line and of further options."""
     p = argparse.ArgumentParser(
-        prog="mi-ntf render", description="Render Mitsuba scenes; same flags as the program `mitsuba`, and some more."
+        prog="mi-ntf render", description="Render Mitsuba scenes with the flags of the program `mitsuba` and some more."
     )
     p.add_argument("scenes", nargs="+", metavar="SCENE.xml")
     p.add_argument(
@@ -50,14 +53,15 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("-S", action="store_true", dest="print_ir", help="print the intermediate representation")
     p.add_argument("-V", type=int, dest="width", metavar="WIDTH", help="vector width of LLVM kernels, a power of two")
     p.add_argument("-W", action="count", default=0, dest="wavefront", help="wavefronts in place of a megakernel")
-    own = p.add_argument_group("not of the program `mitsuba`")
-    own.add_argument("--env", type=Path, metavar="FILE", help="latitude-longitude image in place of the environment's")
-    own.add_argument("--env-rotate", type=float, default=0.0, metavar="DEG",
-                     help="turn the environment about the world's up axis, further than the scene does")
-    own.add_argument("--env-scale", type=float, default=1.0, metavar="S", help="factor of the environment's radiance")
-    own.add_argument("--watch", action="store_true",
-                     help="render again when a file of the scene changes, until Ctrl-C; sends pictures to tev")
-    own.add_argument("--tev", default=TEV, metavar="HOST:PORT", help=f"where tev may listen (default {TEV})")
+    extra = p.add_argument_group("options that the program `mitsuba` does not have")
+    extra.add_argument("--env", type=Path, metavar="FILE",
+                       help="latitude-longitude image in place of the environment's")
+    extra.add_argument("--env-rotate", type=float, default=0.0, metavar="DEG",
+                       help="turn the environment about the world's up axis, in addition to the scene")
+    extra.add_argument("--env-scale", type=float, default=1.0, metavar="S", help="factor of the environment's radiance")
+    extra.add_argument("--watch", action="store_true",
+                       help="render again when a file of the scene changes, until Ctrl-C; sends pictures to tev")
+    extra.add_argument("--tev", default=TEV, metavar="HOST:PORT", help=f"address of tev (default {TEV})")
     return p
 
 
@@ -79,37 +83,54 @@ def main(arguments: Sequence[str]) -> None:
         p.error(f"--watch takes one scene, found {len(args.scenes)}")
     _apply_settings(args)
     environment = Environment(args.env, args.env_rotate, args.env_scale)
-    common: dict[str, Any] = {"sensor_index": args.sensor, "output": args.output and Path(args.output),
-                              "environment": environment}
+    output = Path(args.output) if args.output else None
+    render = partial(render_file, parameters=parameters, sensor_index=args.sensor, output=output,
+                     environment=environment)
     if args.watch:
-        _watch(Path(args.scenes[0]), parameters, args.tev, common)
+        _watch(Path(args.scenes[0]), output, render, args.tev)
         return
     for scene in args.scenes:
-        render_file(Path(scene), parameters, **common)
+        render(Path(scene))
 
 
-def _watch(scene: Path, parameters: dict[str, str], address: str, options: dict[str, Any]) -> None:
-    """Render `scene` again and again, see :mod:`mi_ntf.watch`."""
+def _watch(scene: Path, output: Path | None, render: Callable[..., mi.Film], address: str) -> None:
+    """Render `scene` after each change of its files, see :mod:`mi_ntf.watch`."""
     tev = Tev(address, printed)
     if not scene.is_file():
         raise MiNtfError(f"scene {scene} does not exist")
 
-    def render(seen: Callable[[Path], None]) -> None:
-        film = render_file(scene, parameters, seen=seen, **options)
-        tev.show(str((options["output"] or scene).resolve().with_suffix(".exr")), film.bitmap())
+    def render_and_show(note: Callable[[Path], None]) -> None:
+        film = render(scene, note=note)
+        tev.show(str((output or scene).resolve().with_suffix(".exr")), film.bitmap())
 
-    watch(render, printed)
+    watch(render_and_show, printed)
 
 
 def render_file(path: Path, parameters: dict[str, str], *, sensor_index: int = 0, output: Path | None = None,
-                environment: Environment | None = None, seen: Callable[[Path], None] | None = None) -> Any:
-    """Render one scene file in the current variant, write the image with the film, and return the film.
+                environment: Environment | None = None, note: Callable[[Path], None] | None = None) -> mi.Film:
+    """Render a scene file in the current variant, write the image, and return the film.
 
-    `parameters` are the values of `$key` in the scene, `environment` is laid over its own, `seen` is called with each
-    file before it is read. The image goes to `output` or, by default, beside the scene; the film sets the extension.
-    Raises MiNtfError if the scene cannot be rendered.
+    Parameters
+    ----------
+    path
+        Scene file.
+    parameters
+        Values of $names in the scene.
+    sensor_index
+        Sensor to render.
+    output
+        Image to write; by default it is beside the scene. The film sets the extension.
+    environment
+        Change of the scene's environment.
+    note
+        Function that is called with each file before it is read.
+
+    Raises
+    ------
+    MiNtfError
+        If the scene cannot be rendered.
     """
-    scene = scene_file.load(path, parameters, environment, seen)
+    scene = scene_file.load(path, parameters, environment, note)
     if not 0 <= sensor_index < len(scene.sensors()):
         raise MiNtfError(f"{path} has {len(scene.sensors())} sensors, so there is no sensor {sensor_index}")
     if scene.integrator() is None:
@@ -117,20 +138,20 @@ def render_file(path: Path, parameters: dict[str, str], *, sensor_index: int = 0
 
     sensor = scene.sensors()[sensor_index]
     scene_file.render_to_film(scene, sensor)
-    begun = time.time()
+    begin = time.time()
     sensor.film().write(str(output or path))
     written = (output or path).with_suffix(".exr")  # of EXR films
-    if written.is_file() and written.stat().st_mtime > begun - MTIME:
+    if written.is_file() and written.stat().st_mtime > begin - CLOCK_DELAY:
         _annotate(written, getattr(scene.integrator(), "achieved", {}))
-    return sensor.film()
+    film: mi.Film = sensor.film()
+    return film
 
 
-def _annotate(path: Path, achieved: dict) -> None:
-    """Write what came of the limits of an ``nrf`` integrator into the header of the EXR `path`, as JSON under
-    ``mi_ntf``; pixels stay as they are. The stock program has no place for it."""
+def _annotate(path: Path, achieved: Mapping[str, object]) -> None:
+    """Write the results of an ``nrf`` integrator's limits into the header of an EXR file, as JSON under ``mi_ntf``."""
     if not achieved:
         return
-    # What is not a number is none in JSON.
+    # JSON has no NaN and no infinity.
     text = json.dumps(json.loads(json.dumps(achieved), parse_constant=lambda _: None))
     with OpenEXR.File(str(path), separate_channels=True) as file:
         header = {name: value for name, value in file.header().items() if name != "channels"}
@@ -139,7 +160,7 @@ def _annotate(path: Path, achieved: dict) -> None:
 
 
 def _apply_settings(args: argparse.Namespace) -> None:
-    """Variant, plugins, threads, log level, search path, Dr.Jit flags and vector width."""
+    """Set log level, variant, plugins, threads, search path, Dr.Jit flags and vector width."""
     level = min(args.verbose, 2)
     mi.set_log_level((mi.LogLevel.Info, mi.LogLevel.Debug, mi.LogLevel.Trace)[level])
     dr.set_log_level((dr.LogLevel.Error, dr.LogLevel.Warn, dr.LogLevel.Info)[level])
@@ -154,8 +175,7 @@ def _apply_settings(args: argparse.Namespace) -> None:
             f"`mi-ntf doctor` names the remedy ({error})"
         ) from error
     variant = str(mi.variant())
-    log: Any = mi.Log  # an object in the stub
-    log(mi.LogLevel.Info, f'Rendering using the "{variant}" variant.')
+    log.info(f'Rendering using the "{variant}" variant.')
     bridge.register_all(variant)
 
     if args.threads is not None:
@@ -186,8 +206,7 @@ def _apply_settings(args: argparse.Namespace) -> None:
 
 
 def _set_vector_width(width: int) -> None:
-    """Let LLVM kernels handle `width` numbers at a time. Python has no function for it, so that of Dr.Jit's library is
-    called."""
+    """Set the vector width of LLVM kernels, by the C++ function of Dr.Jit's library, since Python has none."""
     if width < 1 or width & (width - 1):
         raise MiNtfError(f"-V {width}: the vector width must be a power of two, such as 8")
     if not str(mi.variant()).startswith("llvm"):

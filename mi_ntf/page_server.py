@@ -1,21 +1,38 @@
-"""Pages in a browser that this machine alone serves (viser, the extra ``view``), to who knows their address."""
+"""Pages in a browser, served by viser (extra ``view``) to those who know their address."""
 
 import http
 import secrets
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 from urllib.parse import urlsplit
 
 from mi_ntf.core.errors import MiNtfError
 
+if TYPE_CHECKING:
+    import viser
+    from websockets.asyncio.server import ServerConnection
+    from websockets.http11 import Request, Response
 
-def serve(label: str, host: str = "127.0.0.1", port: int = 8080):
-    """``(server, address)`` of a page called `label`, at `port` or the next one that is free. Raises MiNtfError where
-    the extra is missing or the address is not this machine's.
+Gate: TypeAlias = "Callable[[ServerConnection, Request], Response | None]"
+"""Function that answers a request, or returns None to let it pass."""
 
-    The address ends in a random token. Requests without it are refused, and so are those of pages of other servers,
+
+def serve(label: str, host: str = "127.0.0.1", port: int = 8080) -> tuple["viser.ViserServer", str]:
+    """Serve a page called `label` at `port` or the next free one.
+
+    The address ends in a random token. Requests without it are refused, and so are requests of pages of other servers,
     which a browser lets connect to this machine.
+
+    Returns
+    -------
+    server, address
+        The running server, and the address of its page.
+
+    Raises
+    ------
+    MiNtfError
+        If the extra is missing, or `host` is no address of this machine.
     """
     try:
         import viser
@@ -23,18 +40,18 @@ def serve(label: str, host: str = "127.0.0.1", port: int = 8080):
         raise MiNtfError("a view needs the package viser; run pip install 'mi-ntf[view]'") from None
 
     class Server(viser.ViserServer):
-        """viser offers whoever looks a public address, by way of a company's machines: not here."""
+        """Server without viser's public share link, which goes through machines of a company."""
 
         def request_share_url(self, verbose: bool = True) -> None:
-            """Disable the public share link of viser."""
+            """Do nothing, in place of asking for the link."""
 
     token = secrets.token_urlsafe(16)
     try:
-        with _requests_pass(_gate(token)) as guarded:
+        with _guarded(_gate(token)) as started:
             server = Server(host=host, port=port, label=label, verbose=False)
     except OSError as error:
         raise MiNtfError(f"cannot serve at {host}:{port} ({error}); choose another --host or --port") from None
-    if not guarded:
+    if not started:
         server.stop()
         raise MiNtfError(f"viser {viser.__version__} starts its server in an unknown way, which would answer any page "
                          "of the browser; run pip install 'viser==1.1.1'")
@@ -43,12 +60,13 @@ def serve(label: str, host: str = "127.0.0.1", port: int = 8080):
     return server, f"http://{'localhost' if host == '0.0.0.0' else host}:{server.get_port()}/{token}"
 
 
-def _gate(token: str) -> Callable[[Any, Any], Any]:
-    """Return a function ``(connection, request)`` that answers requests without `token` or of a foreign origin.
+def _gate(token: str) -> Gate:
+    """Return the gate that refuses requests without `token`, or of a foreign origin.
 
-    It returns their refusal. For all others it returns None and removes the token, the first part of their path."""
+    For all others it removes the token, the first part of the request's path.
+    """
 
-    def refuse(connection: Any, request: Any) -> Any:
+    def refuse(connection: "ServerConnection", request: "Request") -> "Response | None":
         origin = request.headers.get("Origin")
         if origin is not None and urlsplit(origin).netloc != request.headers.get("Host"):
             return connection.respond(http.HTTPStatus.FORBIDDEN, f"Pages of {origin} may not connect to this one.\n")
@@ -62,20 +80,21 @@ def _gate(token: str) -> Callable[[Any, Any], Any]:
 
 
 @contextmanager
-def _requests_pass(refuse: Callable[[Any, Any], Any]) -> Iterator[list]:
-    """Let `refuse` see each request to servers that the package websockets starts within the context.
+def _guarded(gate: Gate) -> Iterator[list[object]]:
+    """Put `gate` before each server that the package websockets starts within the context.
 
-    The context's value is a list with an entry for each such server. viser has no option for this purpose."""
+    The context's value is a list with an entry for each such server. viser has no option for this purpose.
+    """
     from websockets.asyncio import server
 
     serve: Any = server.serve
-    started: list = []
+    started: list[object] = []
 
-    def guarded(*args: Any, process_request: Callable[[Any, Any], Any], **options: Any) -> Any:
+    def guarded_serve(*args: object, process_request: Gate, **options: object) -> object:
         started.append(options)
-        return serve(*args, process_request=lambda *request: refuse(*request) or process_request(*request), **options)
+        return serve(*args, process_request=lambda *request: gate(*request) or process_request(*request), **options)
 
-    server.serve = guarded  # type: ignore[assignment,misc]
+    server.serve = guarded_serve  # type: ignore[assignment,misc]
     try:
         yield started
     finally:

@@ -1,4 +1,4 @@
-"""`mi-ntf swap`: a mesh scene as XML, written anew with a field in place of its meshes. Works on XML alone."""
+"""`mi-ntf swap`: copy of a scene in which a field replaces the meshes. It works on XML alone."""
 
 import os
 import re
@@ -8,6 +8,7 @@ from xml.etree import ElementTree as ET
 from xml.parsers import expat
 
 from mi_ntf.core import files
+from mi_ntf.core.architecture import Similarity
 from mi_ntf.core.errors import MiNtfError, shown
 from mi_ntf.core.field_file import load_header
 
@@ -15,25 +16,40 @@ _PARAMETER = re.compile(r"(?<!\\)\$(\w+)")
 _CAMEL = re.compile(r"(?<=[a-z])[A-Z]+")
 _DEPTHS = dict.fromkeys(("path", "volpath", "volpathmis", "ptracer"), -1) | dict.fromkeys(
     ("prb", "prb_basic", "prb_projective", "prbvolpath"), 6)
-"""`max_depth` of Mitsuba's integrators where it is not given: −1, no limit, or 6. That of ``nrf`` is 2."""
+"""Default `max_depth` of Mitsuba's integrators; −1 is no limit. The default of ``nrf`` is 2."""
 _AOVS = {"depth": "depth", "albedo": "albedo", "sh_normal": "normal", "geo_normal": "normal"}
-"""Types of Mitsuba's integrator ``aov`` and the outputs of ``nrf`` that stand for them."""
+"""Output of ``nrf`` for each type of Mitsuba's integrator ``aov``."""
 
 
 def swap(scene: Path, field: Path, out: Path) -> list[str]:
-    """Write `out`: the scene `scene` with all shapes but emitters and sensors replaced by the field `field`.
+    """Write a copy of a scene in which a field replaces all shapes but emitters and sensors.
 
-    The field sits in one bounding ``sphere`` with a ``null`` BSDF; centre and radius, in scene units, are those of the
-    capture. The integrator becomes ``nrf`` with ``<default name="visibility" value="auto"/>``. It keeps `max_depth`, be
-    it written or the old integrator's own default, `hide_emitters`, and those channels of ``aov`` that ``nrf`` has.
+    The field sits in one bounding ``sphere`` with a ``null`` BSDF, with the centre and radius of the capture. The
+    integrator becomes ``nrf`` with ``<default name="visibility" value="auto"/>``. It keeps `hide_emitters`, the
+    channels of ``aov`` that ``nrf`` has, and `max_depth`, also where it was the old integrator's default.
 
-    Sensors, films, emitters, parameters and includes stay; an include that holds shapes or the integrator is inlined,
-    with ``$parameters`` in its name at their defaults. BSDFs and textures that nothing uses any more are dropped. Paths
-    are rewritten for `out`'s folder, whose files come before those of the same name in the working folder. Comments are
-    lost.
+    Sensors, films, emitters, parameters and includes stay. An include that holds shapes or the integrator is inlined,
+    with the defaults of ``$parameters`` in its name. Unused BSDFs and textures, and comments, are dropped. Paths are
+    rewritten for `out`'s folder, which is searched before the working folder.
 
-    Returns sentences about what else was left out.
-    Raises :class:`MiNtfError` where `scene` is no Mitsuba XML, has no shape to replace, or an include is missing.
+    Parameters
+    ----------
+    scene
+        XML file of the mesh scene.
+    field
+        Field file.
+    out
+        XML file to write.
+
+    Returns
+    -------
+    list of str
+        Sentences about other things that were left out.
+
+    Raises
+    ------
+    MiNtfError
+        If `scene` is no Mitsuba XML or has no shape to replace, or an include is missing.
     """
     scene, field, out = Path(scene), Path(field), Path(out)
     similarity = load_header(field).similarity
@@ -43,8 +59,7 @@ def swap(scene: Path, field: Path, out: Path) -> list[str]:
     defaults = {d.get("name", ""): d.get("value", "") for d in root.iter("default")}
     inline(root, scene, scene.parent, defaults, lambda content: bool(_replaceable(content)) or
            content.find("integrator") is not None)
-    place = _remove_shapes(root, scene)
-    root.insert(place, _bounding_sphere(similarity, os.path.relpath(field, out.parent)))
+    root.insert(_remove_shapes(root, scene), _bounding_sphere(similarity, os.path.relpath(field, out.parent)))
     notes = _replace_integrator(root, defaults)
     _drop_unused(root, scene.parent, defaults)
     move_paths(root, scene.parent, out.parent, defaults, root.find("shape/medium[@type='nrf']/string"))
@@ -56,18 +71,21 @@ def swap(scene: Path, field: Path, out: Path) -> list[str]:
 
 
 def parse(path: Path) -> ET.Element:
-    """The <scene> of an XML file, names of properties as Mitsuba has them since version 2. Raises MiNtfError where
-    there is none, or where the file declares entities: Mitsuba knows none, and a few lines of them fill the memory."""
+    """Return the <scene> of an XML file, with names of properties as in Mitsuba since version 2.
+
+    Raises MiNtfError if there is none, or if the file declares entities. Mitsuba does not read entities, and a few
+    lines of them can fill the memory.
+    """
     if not path.is_file():
         raise MiNtfError(f"scene {path} does not exist; give the XML file of a mesh scene")
 
     def refuse(name: str, *_: object) -> None:
         raise MiNtfError(f"{path} declares the entity {shown(name)}, which Mitsuba does not read; write its text")
 
-    content, first = path.read_bytes(), expat.ParserCreate()
-    first.EntityDeclHandler = refuse
+    content, checker = path.read_bytes(), expat.ParserCreate()
+    checker.EntityDeclHandler = refuse
     try:
-        first.Parse(content, True)
+        checker.Parse(content, True)
         root = ET.fromstring(content)
     except (expat.ExpatError, ET.ParseError) as error:
         raise MiNtfError(f"{path} is not XML ({error}); give the XML file of a Mitsuba scene") from None
@@ -78,8 +96,7 @@ def parse(path: Path) -> ET.Element:
 
 
 def _rename(root: ET.Element) -> None:
-    """Names of properties in a file for Mitsuba 0.6 or older, as ``maxDepth``, become those of later versions, as
-    ``max_depth``, by Mitsuba's own rule."""
+    """Rename properties of files for Mitsuba 0.6 and older, as ``maxDepth`` to ``max_depth``, by Mitsuba's rule."""
     if not re.match(r"[01]\.", root.get("version", "")):
         return
     for element in root.iter():
@@ -88,7 +105,7 @@ def _rename(root: ET.Element) -> None:
 
 
 def _resolve(include: ET.Element, source: Path, folder: Path, defaults: dict[str, str]) -> Path:
-    """The file that `include` of the scene file `source` names, parameters at their defaults.
+    """Return the file that `include` of the scene file `source` names, with the defaults of parameters.
 
     Mitsuba looks beside the including file first, then in the folder of the main scene.
     """
@@ -101,33 +118,44 @@ def _resolve(include: ET.Element, source: Path, folder: Path, defaults: dict[str
 
 
 def substitute(text: str, defaults: dict[str, str]) -> str:
-    """`text` with the values of its $parameters."""
+    """Return `text` with the values of its $parameters."""
     return _PARAMETER.sub(lambda m: defaults.get(m[1], m[0]), text)
 
 
 def inline(root: ET.Element, source: Path, folder: Path, defaults: dict[str, str],
-           wanted: Callable[[ET.Element], bool]) -> None:
-    """Replace those includes of `root`, the scene file `source`, whose content (or what it includes) is `wanted`, by
-    their content. `folder`: the main scene's; `defaults`: its $parameters, to which theirs are added."""
+           is_needed: Callable[[ET.Element], bool]) -> None:
+    """Replace includes by their content where `is_needed` is true of it.
+
+    Parameters
+    ----------
+    root, source
+        Content and path of the including file.
+    folder
+        Folder of the main scene.
+    defaults
+        Values of $parameters of the main scene. Those of the includes are added.
+    is_needed
+        Function of the content of an include, after its own includes are inlined.
+    """
     for include in root.findall("include"):
         path = _resolve(include, source, folder, defaults)
         content = parse(path)
         for d in content.iter("default"):
             defaults.setdefault(d.get("name", ""), d.get("value", ""))
-        inline(content, path, folder, defaults, wanted)
+        inline(content, path, folder, defaults, is_needed)
         position = list(root).index(include)
-        if wanted(content):
+        if is_needed(content):
             root.remove(include)
             for offset, child in enumerate(content):
                 root.insert(position + offset, child)
         else:
-            # From here on relative to the main scene's folder, wherever the including file was.
+            # The include moves from `source` to the main scene, so its path becomes relative to that folder.
             name = include.get("filename", "")
             include.set("filename", os.path.relpath(source.parent / name, folder) if not os.path.isabs(name) else name)
 
 
 def _replaceable(root: ET.Element) -> list[ET.Element]:
-    """Top-level shapes that neither emit nor measure."""
+    """Return the top-level shapes that are neither emitters nor sensors."""
     lights = {e.get("id") for e in root.findall("emitter")} - {None}
     return [
         s
@@ -139,20 +167,20 @@ def _replaceable(root: ET.Element) -> list[ET.Element]:
 
 
 def _remove_shapes(root: ET.Element, scene: Path) -> int:
-    """Remove what the field replaces; returns the place of the first."""
+    """Remove the shapes that the field replaces, and return the index of the first among the root's children."""
     shapes = _replaceable(root)
     if not shapes:
         raise MiNtfError(
             f"{scene} has no shape that a field could replace (emitters stay); give the scene that "
             "`mi-ntf capture` photographed"
         )
-    place = list(root).index(shapes[0])
+    index = list(root).index(shapes[0])
     for shape in shapes:
         root.remove(shape)
-    return place
+    return index
 
 
-def _bounding_sphere(similarity, filename: str) -> ET.Element:
+def _bounding_sphere(similarity: Similarity, filename: str) -> ET.Element:
     shape = ET.Element("shape", type="sphere")
     x, y, z = (repr(c) for c in similarity.center)
     ET.SubElement(shape, "point", name="center", x=x, y=y, z=z)
@@ -164,8 +192,10 @@ def _bounding_sphere(similarity, filename: str) -> ET.Element:
 
 
 def _replace_integrator(root: ET.Element, defaults: dict[str, str]) -> list[str]:
-    """Put the ``nrf`` integrator where the old one stood, and the default of its parameter at the top. Returns what
-    cannot be kept, in sentences."""
+    """Put the ``nrf`` integrator in place of the old one, and the default of its parameter at the top.
+
+    Returns sentences about what cannot be kept.
+    """
     new = ET.Element("integrator", type="nrf")
     ET.SubElement(new, "string", name="visibility", value="$visibility")
     old = root.findall("integrator")
@@ -187,12 +217,12 @@ def _replace_integrator(root: ET.Element, defaults: dict[str, str]) -> list[str]
         if default.get("name") == "visibility":
             root.remove(default)
     root.insert(0, ET.Element("default", name="visibility", value="auto"))
-    left = f"left out {', '.join(unknown)} of the integrator aov: nrf has {', '.join(dict.fromkeys(_AOVS.values()))}"
-    return [left] if unknown else []
+    note = f"left out {', '.join(unknown)} of the integrator aov: nrf has {', '.join(dict.fromkeys(_AOVS.values()))}"
+    return [note] if unknown else []
 
 
 def _outputs(aov: list[ET.Element], defaults: dict[str, str]) -> tuple[list[str], list[str]]:
-    """Outputs of ``nrf`` for the channels of the integrators `aov`, and the channels that have none."""
+    """Return the outputs of ``nrf`` for the channels of the integrators `aov`, and the channels that have none."""
     texts = [substitute(e.get("value", ""), defaults) for i in aov for e in i.findall("string[@name='aovs']")]
     channels = [word for text in texts for word in re.split(r"[,\s]+", text) if word]
     kinds = [channel.rpartition(":")[2] for channel in channels]
@@ -201,7 +231,7 @@ def _outputs(aov: list[ET.Element], defaults: dict[str, str]) -> tuple[list[str]
 
 
 def _drop_unused(root: ET.Element, folder: Path, defaults: dict[str, str]) -> None:
-    """Drop definitions that nothing refers to, until none is left. Includes may refer to them as well."""
+    """Drop definitions that neither the scene nor its includes refer to, until all are used."""
     included = [parse(_resolve(i, folder / "scene.xml", folder, defaults)) for i in root.findall("include")]
     while True:
         used = {r.get("id") for tree in (root, *included) for r in tree.iter("ref")}
@@ -214,26 +244,28 @@ def _drop_unused(root: ET.Element, folder: Path, defaults: dict[str, str]) -> No
 
 
 def move_paths(root: ET.Element, old: Path, new: Path, defaults: dict[str, str],
-               but: ET.Element | None = None) -> None:
-    """Make relative paths, written for the folder `old`, right for the folder `new`; that of the element `but` is."""
+               moved: ET.Element | None = None) -> None:
+    """Rewrite relative paths of the folder `old` for the folder `new`, except that of the element `moved`."""
     if old.resolve() == new.resolve():
-        _look_here_first(root)
+        _search_here_first(root)
         return
     nodes = [(e, "value") for e in root.iter("string") if e.get("name") == "filename"]
     nodes += [(e, "filename") for e in root.iter() if e.tag in ("include", "spectrum")]
     nodes += [(e, "value") for e in root.iter("path")]
     for element, attribute in nodes:
         value = element.get(attribute, "")
-        # What is not there is found by a <path>, which is moved itself.
-        if element is not but and not os.path.isabs(value) and (old / substitute(value, defaults)).exists():
+        # Other files are found by a <path>, which is rewritten itself.
+        if element is not moved and not os.path.isabs(value) and (old / substitute(value, defaults)).exists():
             element.set(attribute, Path(os.path.relpath(old / value, new)).as_posix())
     if root.find("include") is not None:
         # Mitsuba looks for the files that an include names in the main scene's folder, so that folder stays known.
         root.insert(0, ET.Element("path", value=Path(os.path.relpath(old, new)).as_posix()))
-    _look_here_first(root)
+    _search_here_first(root)
 
 
-def _look_here_first(root: ET.Element) -> None:
-    """Mitsuba looks in the working folder first, where another field may have the name of this one; the last path that
-    is added comes before all."""
+def _search_here_first(root: ET.Element) -> None:
+    """Add the scene's folder as last path, which Mitsuba searches first.
+
+    Otherwise it would search the working folder first, where another field may have the same name.
+    """
     root.insert(len(root.findall("path")), ET.Element("path", value="."))

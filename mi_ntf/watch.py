@@ -1,9 +1,7 @@
 """`mi-ntf render --watch`: render again whenever a file of the scene changes, and show the picture in tev if it runs.
 
-Files are looked at five times a second rather than by the system's notices (inotify): a scene has a dozen, and notices
-do not come from network file systems, where clusters keep theirs.
-
-The protocol of tev, the viewer of https://github.com/Tom94/tev, is spoken by its author's package `tevclient`.
+Files are polled, since the system's notices (inotify) do not come from network file systems. Pictures are sent by the
+package `tevclient` of the author of tev (https://github.com/Tom94/tev).
 """
 
 import socket
@@ -11,39 +9,45 @@ import sys
 import time
 import traceback
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mi_ntf.core import errors, interruption
 from mi_ntf.core.errors import MiNtfError
 
-INTERVAL = 0.2
-"""Seconds between two looks at the files."""
-TEV = "127.0.0.1:14158"
-"""Where tev listens unless it is told otherwise."""
-TEV_TIMEOUT = 5.0
-"""Seconds after which a viewer that does not take its picture is left alone."""
+if TYPE_CHECKING:
+    import mitsuba as mi
 
-Stamps = dict[Path, tuple | None]
+INTERVAL = 0.2
+"""Seconds between two checks of the files."""
+TEV = "127.0.0.1:14158"
+"""Default address of tev."""
+TEV_TIMEOUT = 5.0
+"""Seconds that tev may take to receive a picture."""
+
+Stamp = tuple[int, int, int] | None
+"""Time of change, size and inode of a file. None if it does not exist."""
+Stamps = dict[Path, Stamp]
 
 
 def watch(render: Callable[[Callable[[Path], None]], None], say: Callable[[str], None]) -> None:
-    """Call `render`, again after every change of the files that it read, until Ctrl-C, which returns.
+    """Call `render`, and again after every change of the files that it read, until Ctrl-C.
 
-    `render(seen)` calls `seen(path)` for each file before it reads it. What it raises is said and waits for the next
-    change, of the files of the last round that ended well, too.
+    `render(note)` calls `note(path)` for each file before it reads it. Its errors are printed by `say`. After an error,
+    the files of the last successful round are watched, too.
     """
     files: Stamps = {}
     with interruption.noticed() as stopped:
         while not stopped.is_set():
             fresh: Stamps = {}
-            begun = time.perf_counter()
+            begin = time.perf_counter()
             try:
-                render(lambda path, fresh=fresh: fresh.setdefault(path, _stamp(path)))  # type: ignore[misc]
+                render(partial(_note, fresh))
                 files = fresh
-                say(f"{time.perf_counter() - begun:.1f} s; watching {len(files)} files, Ctrl-C ends")
+                say(f"{time.perf_counter() - begin:.1f} s; watching {len(files)} files, Ctrl-C ends")
             except KeyboardInterrupt:
                 return
             except Exception as error:
@@ -59,8 +63,12 @@ def watch(render: Callable[[Callable[[Path], None]], None], say: Callable[[str],
                 return
 
 
+def _note(stamps: Stamps, path: Path) -> None:
+    stamps.setdefault(path, _stamp(path))
+
+
 def _changed(files: Stamps) -> Stamps:
-    """Wait until some of `files` differ from their stamps and all have come to rest; their new stamps."""
+    """Wait until some of `files` differ from their stamps and none changes any more, and return the new stamps."""
     last = files
     while True:
         now = {path: _stamp(path) for path in files}
@@ -70,8 +78,7 @@ def _changed(files: Stamps) -> Stamps:
         time.sleep(INTERVAL)
 
 
-def _stamp(path: Path) -> tuple | None:
-    """Tells one state of a file from another; None where there is none."""
+def _stamp(path: Path) -> Stamp:
     try:
         stat = path.stat()
     except OSError:
@@ -80,25 +87,28 @@ def _stamp(path: Path) -> tuple | None:
 
 
 class Tev:
-    """Pictures for a running tev at `address` ("HOST:PORT"). Pixels are sent, not a path: tev may run elsewhere, at the
-    other end of `ssh -R 14158:127.0.0.1:14158`. Raises MiNtfError where `address` is none."""
+    """Connection to a running tev at `address` ("HOST:PORT").
 
-    def __init__(self, address: str, say: Callable[[str], None]):
+    Pixels are sent, not a path, because tev may run on another machine, at the end of `ssh -R 14158:127.0.0.1:14158`.
+    Raises MiNtfError for a malformed `address`.
+    """
+
+    def __init__(self, address: str, say: Callable[[str], None]) -> None:
         host, _, port = address.rpartition(":")
         if not host or not port.isdecimal() or not 0 < int(port) < 65536:
             raise MiNtfError(f"--tev is {address!r}, expected HOST:PORT, as {TEV}")
-        self._address, self._say, self._shown, self._told = (host, int(port)), say, set[str](), set[str]()
+        self._address, self._say = (host, int(port)), say
+        self._shown, self._said = set[str](), set[str]()
 
-    def show(self, name: str, bitmap: Any) -> bool:
-        """Send a Mitsuba bitmap under `name`, all channels; whether tev took it. Where none listens, that is no
-        fault."""
+    def show(self, name: str, bitmap: "mi.Bitmap") -> bool:
+        """Send all channels of a bitmap under `name`. Return False if tev does not listen or take the picture."""
         if not self._listens():
             return False
         try:
             import tevclient
         except ImportError:
-            return self._tell("tev listens; it is sent pictures after `pip install 'mi-ntf[watch]'`")
-        names = [field.name for field in bitmap.struct_()]
+            return self._say_once("tev listens; it is sent pictures after `pip install 'mi-ntf[watch]'`")
+        names = [field.name for field in bitmap.struct_()]  # type: ignore[attr-defined]  # not in the stub
         pixels = np.array(bitmap, np.float32).reshape(bitmap.height(), bitmap.width(), len(names))
         timeout = socket.getdefaulttimeout()
         try:
@@ -107,7 +117,7 @@ class Tev:
                 tev.create_image(name, bitmap.width(), bitmap.height(), names, grab_focus=name not in self._shown)
                 tev.update_image(name, pixels, names)
         except OSError as error:
-            return self._tell(f"tev did not take the picture ({error})")
+            return self._say_once(f"tev did not take the picture ({error})")
         finally:
             socket.setdefaulttimeout(timeout)
         self._shown.add(name)
@@ -121,14 +131,13 @@ class Tev:
             return False
         return True
 
-    def _tell(self, text: str) -> bool:
-        """Say it once."""
-        if text not in self._told:
-            self._told.add(text)
+    def _say_once(self, text: str) -> bool:
+        if text not in self._said:
+            self._said.add(text)
             self._say(text)
         return False
 
 
 def printed(text: str) -> None:
-    """A line on the terminal, at once, apart from Mitsuba's own."""
+    """Print a line on standard error at once."""
     print(f"mi-ntf: {text}", file=sys.stderr, flush=True)

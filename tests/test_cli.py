@@ -251,5 +251,5 @@ def test_doctor_survives_a_missing_llvm(tmp_path: Path):
 def test_doctor_prints_a_remedy_on_one_line(capsys):
     remedy = "a command " + "that is long " * 20 + "and whole"
     check = doctor.Check("thing", False, True, "broken", remedy)
-    doctor.print_table({"version": "1", "ok": False, "checks": [vars(check)]})
+    doctor.print_table(doctor.Report(False, "1", [check]))
     assert f"thing: {remedy}" in capsys.readouterr().out

@@ -44,7 +44,7 @@ def stack(mesh: dict, *names: str) -> np.ndarray:
 def statue(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("mesh") / "statue.ply"
     report = export(STATUE, path, resolution=192)
-    assert report["level"] == 10 and report["vertices"] > 50_000
+    assert report.level == 10 and report.vertices > 50_000
     return path
 
 
@@ -128,8 +128,8 @@ def test_kinds_of_files_hold_the_same_surface(tmp_path: Path, suffix: str):
     path = tmp_path / f"mesh{suffix}"
     report = export(STATUE, path, resolution=64)
     mesh = trimesh.load(path, process=False, force="mesh")
-    np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), report["size"], atol=1e-4)
-    assert len(mesh.faces) == report["faces"] and mesh.volume > 0
+    np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), report.size, atol=1e-4)
+    assert len(mesh.faces) == report.faces and mesh.volume > 0
     if suffix != ".stl":
         plain = export(STATUE, tmp_path / "same.ply", resolution=64) and read(tmp_path / "same.ply")
         names = ("albedo_r", "albedo_g", "albedo_b") if suffix == ".glb" else ("red", "green", "blue")
@@ -158,7 +158,7 @@ def test_hollows_are_filled_behind_thin_spots_too_and_crumbs_are_left_out():
 
 def test_thin_matter_has_a_surface_too(tmp_path: Path):
     report = export(SCENES / "cloud/field.safetensors", tmp_path / "c.ply", resolution=64)
-    assert 1 < report["level"] < 5
+    assert 1 < report.level < 5
     with pytest.raises(MiNtfError, match=r"no density of 50 in the field, the highest is [2-9]\.\d+; give a lower"):
         export(SCENES / "cloud/field.safetensors", tmp_path / "c.ply", resolution=64, level=50)
 

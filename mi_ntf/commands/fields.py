@@ -1,7 +1,7 @@
 """Commands that make and describe fields: capture, inspect, train, export, info."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated
 
@@ -145,13 +145,13 @@ class Train:
             raise UsageError("give --minutes or --steps, not both")
         estimate = self.flash_offset == "estimate"
         offset = None if estimate else parse_offset(self.flash_offset)
-        reading = {"size": self.size, "masks": self.masks, "background": self.background, "flash_offset": offset}
         from mi_ntf.train import train
 
         report = train(self.dataset, self.output, preset=self.preset, minutes=self.minutes, steps=self.steps,
                        seed=self.seed, tensorboard=self.tensorboard, field=self.field, ntf=self.ntf,
                        augmentation=not self.no_augmentation, colour_loss=not self.no_colour_loss,
-                       reading=reading, estimate=estimate, gains=not self.no_gains,
+                       reading={"size": self.size, "masks": self.masks, "background": self.background,
+                                "flash_offset": offset}, estimate=estimate, gains=not self.no_gains,
                        visibility_mlp=self.visibility_mlp, bounces=not self.no_bounces,
                        fresnel=not self.no_fresnel, view=self.view)
         if report:  # under torchrun, only the first process has one
@@ -187,7 +187,8 @@ class Export:
         """Write the mesh and print its figures."""
         from mi_ntf.export import export
 
-        print_report(export(self.field_file, self.output, self.resolution, self.level), self.json, print_pairs)
+        mesh = export(self.field_file, self.output, self.resolution, self.level)
+        print_report(asdict(mesh), self.json, print_pairs)
 
 
 @dataclass

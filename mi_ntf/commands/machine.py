@@ -18,7 +18,7 @@ class Doctor:
 
         report = examine()
         print_report(report, self.json, print_table)
-        return 0 if report["ok"] else 1
+        return 0 if report.ok else 1
 
 
 @dataclass
