@@ -7,9 +7,9 @@ from pathlib import Path
 
 import mitsuba as mi
 import pytest
+from helpers.variants import VARIANT
 
 import mi_ntf
-
 from mi_ntf.infer.visibility import names
 from mi_ntf.render.plugins import properties
 
@@ -54,9 +54,13 @@ def test_every_name_has_a_row(heading, legal):
 def test_examples_load_and_agree(reference, monkeypatch):
     """The XML and the dictionary of each example make the same object."""
     monkeypatch.chdir(ROOT)
+    mi.set_variant(VARIANT)
     mi_ntf.register()
-    for xml, dictionary in reference.EXAMPLES.values():
-        from_xml, from_dict = mi.load_string(_versioned(xml)), mi.load_dict(ast.literal_eval(dictionary))
+    found = [reference.examples(reference.docstring(file)) for file in reference.PLUGINS.values()]
+    assert sum(map(bool, found)) == 3
+    for example in filter(None, found):
+        from_xml = mi.load_string(_versioned(example["xml"]))
+        from_dict = mi.load_dict(ast.literal_eval(example["python"]))
         assert type(from_xml) is type(from_dict)
         assert _described(from_xml) == _described(from_dict)
 
@@ -75,4 +79,6 @@ def test_tables_become_markdown(reference):
     """Long cells go on below, blank ones stay, signs of Markdown's own are kept."""
     text = "A ``b``.\n\n== ==== =====\nx  kind value\n== ==== =====\none     a | b\n        c\n(2)d    e\n== ==== ====="
     lines = ["| x | kind | value |", "| --- | --- | --- |", r"| `one` |  | a \| b c |", "| (2) | d | e |"]
-    assert reference.markdown(text).splitlines() == ["A `b`.", "", *lines]
+    code = "\n\n.. code-block:: xml\n\n    <a>\n        ``b``\n    </a>"
+    blocks = ["", "```xml", "<a>", "    ``b``", "</a>", "```"]
+    assert reference.markdown(text + code).splitlines() == ["A `b`.", "", *lines, *blocks]

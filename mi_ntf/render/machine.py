@@ -1,4 +1,4 @@
-"""The machine that renders, in words."""
+"""Description of the machine that renders."""
 
 import ctypes
 import platform
@@ -18,16 +18,16 @@ def machine() -> str:
 
 
 def graphics_card() -> str:
-    """Return the name of the CUDA device that Dr.Jit computes on, or a neutral one if there is none."""
+    """Return the name of Dr.Jit's CUDA device, or ``CUDA device`` if there is none."""
     name = ctypes.create_string_buffer(256)
     device = ctypes.c_int()
     try:
         driver = ctypes.CDLL("libcuda.so.1")
-        found = (driver.cuInit(0) or driver.cuDeviceGet(ctypes.byref(device), 0)
+        known = (driver.cuInit(0) or driver.cuDeviceGet(ctypes.byref(device), 0)
                  or driver.cuDeviceGetName(name, len(name), device)) == 0
     except (OSError, AttributeError):  # no driver, or no such function in it
-        found = False
-    return name.value.decode(errors="replace").strip() if found and name.value else "CUDA device"
+        known = False
+    return name.value.decode(errors="replace").strip() if known and name.value else "CUDA device"
 
 
 def processor() -> str:

@@ -1,13 +1,15 @@
-"""The user's cache: ``$XDG_CACHE_HOME/mi-ntf``, by default ``~/.cache/mi-ntf``. What is made once is found there again.
+"""The user's cache on disk: ``$XDG_CACHE_HOME/mi-ntf``, by default ``~/.cache/mi-ntf``.
 
 An entry is a file of named arrays (safetensors), ``KIND/KEY.safetensors``: ``fields`` (baked volumes), ``patches``
-(between which light bounces) and ``maps`` (transmittance). Its key depends on everything that its content does, the
-program text included (:func:`key`); a hash of its content shows damage. The environment variable ``MI_NTF_CACHE``
-switches: ``on`` (default), ``memory`` (no files), ``off``.
+(between which light bounces) and ``maps`` (transmittance). Its key covers all inputs of its content, the program text
+included (:func:`key`). A hash of its content shows damage. The environment variable ``MI_NTF_CACHE`` is ``on``
+(default), ``memory`` (no files) or ``off``.
 
-What is lost there costs time alone. So nothing here raises but for a wrong ``MI_NTF_CACHE``: a folder that cannot be
-read or written is one warning, and the render goes on.
+Loss of an entry costs time alone. Nothing here raises, except for a wrong ``MI_NTF_CACHE``. A folder that cannot be
+read or written causes one warning, and the render continues.
 """
+
+from __future__ import annotations
 
 import hashlib
 import os
@@ -23,23 +25,24 @@ import safetensors.numpy
 
 from ..core import files
 from ..core.errors import MiNtfError
+from . import log
 
 LARGEST_FILE = 512 << 20
+"""Bytes of the largest entry that is written."""
 FOLDER_LIMIT = 2 << 30
-"""Bytes: larger entries are not written; those used longest ago go when the folder is full."""
+"""Bytes of all entries, above which the least recently used ones are removed."""
 KINDS = ("fields", "patches", "maps")
 _SEAL = "seal"
 _film = False
 _warned: set[Path | None] = set()
-"""Folders that a warning was given for."""
+"""Folders for which a warning was given."""
 
 
 def mode() -> str:
-    """Return ``on``, ``memory`` or ``off``."""
-    name = "MI_NTF_MAP_CACHE" if "MI_NTF_CACHE" not in os.environ else "MI_NTF_CACHE"  # its name in earlier builds
-    value = os.environ.get(name, "on")
+    """Return the value of ``MI_NTF_CACHE``. Raises MiNtfError if it is another than ``on``, ``memory`` and ``off``."""
+    value = os.environ.get("MI_NTF_CACHE", "on")
     if value not in ("on", "memory", "off"):
-        raise MiNtfError(f'environment variable {name} is "{value}", expected on, memory or off')
+        raise MiNtfError(f'environment variable MI_NTF_CACHE is "{value}", expected on, memory or off')
     return value
 
 
@@ -57,7 +60,7 @@ def switched(value: str) -> Iterator[None]:
 
 
 def folder() -> Path | None:
-    """Return the cache's folder, which need not exist; None for users without a home."""
+    """Return the cache's folder, which need not exist; None if the user has no home."""
     base = os.environ.get("XDG_CACHE_HOME")
     try:
         return Path(base or Path.home() / ".cache") / "mi-ntf"
@@ -65,55 +68,55 @@ def folder() -> Path | None:
         return None
 
 
-def key(*facts) -> str:
-    """Return the key of what is made from the `facts`: arrays, or anything whose ``repr`` tells its value.
+def key(*inputs: object) -> str:
+    """Return the key of an entry with these inputs: arrays, or objects whose ``repr`` is their value.
 
-    The program text that makes entries, the libraries and the variant are part of it.
+    The program text that makes entries, the libraries and the variant are part of the key.
     """
     digest = hashlib.sha256(repr((_program(), _libraries(), mi.variant())).encode())
-    for fact in facts:
-        if isinstance(fact, np.ndarray):
-            digest.update(np.ascontiguousarray(fact).data)
+    for value in inputs:
+        if isinstance(value, np.ndarray):
+            digest.update(np.ascontiguousarray(value).data)
         else:
-            digest.update(repr(fact).encode())
+            digest.update(repr(value).encode())
     return digest.hexdigest()
 
 
 @lru_cache(maxsize=1)
 def _program() -> str:
-    """Return a hash of the modules that entries come from: none outlives a change of theirs."""
+    """Return a hash of the modules that compute entries, so that no entry outlives a change of them."""
     package = Path(__file__).parents[1]
     digest = hashlib.sha256()
-    for room in ("core", "infer", "render/transport"):
-        for file in sorted((package / room).rglob("*.py")):
+    for folder_name in ("core", "infer", "render/transport"):
+        for file in sorted((package / folder_name).rglob("*.py")):
             digest.update(file.read_bytes())
     return digest.hexdigest()
 
 
-def _libraries() -> tuple:
-    """Return the versions of what runs the program in the current variant."""
+def _libraries() -> tuple[object, ...]:
+    """Return the versions of the libraries, and of the compiler of the current variant."""
     compiler = dr.detail.cuda_version if str(mi.variant()).startswith("cuda") else dr.detail.llvm_version
-    versions = mi.__version__, dr.__version__, np.__version__  # type: ignore[attr-defined]  # not in the stubs
-    return *versions, compiler()
+    return *(vars(library)["__version__"] for library in (mi, dr, np)), compiler()
 
 
-def kept(kind: str, name: str, make: Callable[[], dict[str, np.ndarray]], placed=False) -> dict[str, np.ndarray]:
-    """Return the arrays of entry `name` of `kind`: from the disk, else of ``make()``, which are then kept there.
+def cached(kind: str, name: str, make: Callable[[], dict[str, np.ndarray]], placed: bool = False
+           ) -> dict[str, np.ndarray]:
+    """Return the arrays of entry `name` of `kind`; call `make` and store its result if the entry is missing.
 
-    `placed`: they depend on where things are in the scene (:func:`film`).
+    `placed`: the arrays depend on places in the scene (:func:`film`).
     """
     on_disk = mode() == "on"
-    found = read(kind, name) if on_disk else None
-    if found is None:
-        found = make()
+    arrays = read(kind, name) if on_disk else None
+    if arrays is None:
+        arrays = make()
         if on_disk:
-            write(kind, name, found, placed)
-    return found
+            write(kind, name, arrays, placed)
+    return arrays
 
 
 @contextmanager
 def film() -> Iterator[None]:
-    """Within, no entry is written that depends on places: what moves in a film would leave one for each frame."""
+    """Write no entry within the block that depends on places, since moving objects would leave one for each frame."""
     global _film
     before, _film = _film, True
     try:
@@ -123,7 +126,7 @@ def film() -> Iterator[None]:
 
 
 def read(kind: str, name: str) -> dict[str, np.ndarray] | None:
-    """Return the arrays of an entry; None where it is missing, unreadable or not what was written."""
+    """Return the arrays of an entry; None if it is missing, unreadable or damaged."""
     path = _path(kind, name)
     if path is None or not path.is_file():
         return None
@@ -134,7 +137,7 @@ def read(kind: str, name: str) -> dict[str, np.ndarray] | None:
     except OSError as error:
         _warn(f"cannot read {path} ({error.strerror or error})")
         return None
-    except Exception:  # of a damaged file, whatever the library makes of it
+    except Exception:  # the library raises many kinds for a damaged file
         return None
     if seal != _seal_of(kind, name, arrays):
         return None
@@ -144,22 +147,23 @@ def read(kind: str, name: str) -> dict[str, np.ndarray] | None:
 
 
 def write(kind: str, name: str, arrays: dict[str, np.ndarray], placed: bool = False) -> None:
-    """Keep `arrays` as entry `name` of `kind`, unless they are larger than ``LARGEST_FILE``; `placed`: as in
-    :func:`kept`."""
+    """Write `arrays` as entry `name` of `kind`, unless they exceed ``LARGEST_FILE``; see :func:`cached`."""
     if (placed and _film) or sum(array.nbytes for array in arrays.values()) > LARGEST_FILE:
         return
     arrays = {k: np.ascontiguousarray(array) for k, array in arrays.items()}
     content = safetensors.numpy.save(arrays, {_SEAL: _seal_of(kind, name, arrays)})
     if _write(_path(kind, name), content):
-        with suppress(OSError):  # of other processes that tidy up as well
+        with suppress(OSError):  # other processes may remove entries at the same time
             _tidy()
 
 
 def entries() -> Iterator[tuple[str, Path, os.stat_result]]:
     """Yield the kind, the file and its status of every entry on the disk."""
-    where = folder()
-    for kind in KINDS if where else ():
-        for path in sorted((where / kind).glob("*")):  # type: ignore[operator]
+    base = folder()
+    if base is None:
+        return
+    for kind in KINDS:
+        for path in sorted((base / kind).glob("*")):
             with suppress(OSError):
                 yield kind, path, path.stat()
 
@@ -175,8 +179,8 @@ def clear() -> int:
 
 
 def _path(kind: str, name: str) -> Path | None:
-    where = folder()
-    return where and where / kind / f"{name}.safetensors"
+    base = folder()
+    return base and base / kind / f"{name}.safetensors"
 
 
 def _seal_of(kind: str, name: str, arrays: dict[str, np.ndarray]) -> str:
@@ -188,8 +192,8 @@ def _seal_of(kind: str, name: str, arrays: dict[str, np.ndarray]) -> str:
     return digest.hexdigest()
 
 
-def _write(path: Path | None, content) -> bool:
-    """Write a file; return True if that could be done."""
+def _write(path: Path | None, content: bytes) -> bool:
+    """Write a file; return True on success."""
     if path is None:
         _warn("the user has no home folder")
         return False
@@ -203,7 +207,7 @@ def _write(path: Path | None, content) -> bool:
 
 
 def _tidy() -> None:
-    """Remove the entries used longest ago until the folder is within its limit."""
+    """Remove the least recently used entries until the folder is within its limit."""
     total = 0
     for _, path, status in sorted(entries(), key=lambda entry: entry[2].st_mtime, reverse=True):
         total += status.st_size
@@ -213,9 +217,7 @@ def _tidy() -> None:
 
 def _warn(reason: str) -> None:
     """Warn once for each folder."""
-    where = folder()
-    if where not in _warned:
-        _warned.add(where)
-        text = (f"mi_ntf keeps nothing for later renders: {reason}. XDG_CACHE_HOME names another folder, "
-                "MI_NTF_CACHE=memory does without.")
-        mi.Log(mi.LogLevel.Warn, text)  # type: ignore[operator]  # an object in the stub
+    if folder() not in _warned:
+        _warned.add(folder())
+        log.warn(f"mi_ntf keeps nothing for later renders: {reason}. XDG_CACHE_HOME names another folder, "
+                 "MI_NTF_CACHE=memory does without.")

@@ -14,8 +14,9 @@ from . import (
     transmittance_volume,
     visibility_mlp,
 )
+from .method import Method
 
-REGISTRY = {
+REGISTRY: dict[str, Method] = {
     module.METHOD.name: module.METHOD
     for module in (raymarch, transmittance_volume, neural_transmittance, transmittance_map, transmittance_atlas,
                    ray_network, visibility_mlp, none)

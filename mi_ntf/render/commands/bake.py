@@ -1,68 +1,86 @@
-"""``mi-ntf bake``: the transmittance maps of a scene, written to a file."""
+"""The command ``mi-ntf bake``, which writes the transmittance maps of a scene to a file."""
+
+from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable
 from pathlib import Path
+from typing import TypedDict, cast
 
 import mitsuba as mi
 
 from ...core import files
 from ...core.errors import MiNtfError
 from ...core.variants import VARIANTS
+from ...infer.lights import LightTable
 from ...infer.visibility import REGISTRY
+from ...infer.visibility.method import Options
+from ...infer.visibility.transmittance_atlas import TransmittanceAtlas
+from ...infer.visibility.transmittance_map import TransmittanceMap
 from ..lights import scene_lights
 from ..maps import building, map_cache, map_file
 from ..plugins.registration import load_scene
 from ..scene import loaded
-from ..scene.media import find_media
+from ..scene.media import NRFMedium, find_media
 from ..scene.settings import Settings
 
 
-def bake(scene: Path, output: Path, parameters: dict[str, str]) -> dict:
-    """Write the maps of all lights of `scene` (with `parameters` for its $names), made with the settings of its ``nrf``
-    integrator; those of the field's own directions where its `visibility` is ``transmittance_atlas`` or
-    ``neural_transmittance``. Returns ``file``, ``lights``, ``resolution``, ``components`` and ``bytes``.
+class MapFile(TypedDict):
+    """Description of a map file: its path, number of lights, texels along a side, logistics per texel and size."""
 
-    Raises MiNtfError where the scene has several media, or no lights that maps can be made for.
+    file: str
+    lights: int
+    resolution: int
+    components: int
+    bytes: int
+
+
+def bake(scene: Path, output: Path, parameters: dict[str, str]) -> MapFile:
+    """Write the maps of all lights of a scene, made with the settings of its ``nrf`` integrator.
+
+    If its `visibility` is ``transmittance_atlas`` or ``neural_transmittance``, the maps are those of the field's own
+    directions. `parameters`: values of the scene's $names. Raises MiNtfError if the scene has several media, or no
+    lights for which maps can be made.
     """
     files.check(output)
-    described = load_scene(scene, parameters)
-    integrator, media = described.integrator(), find_media(described)
+    loaded_scene = load_scene(scene, parameters)
+    settings, media = loaded_scene.integrator().context.settings, find_media(loaded_scene)
     if len(media) != 1:
         raise MiNtfError(f"{scene} has {len(media)} nrf media, and a map file belongs to one; bake them one by one")
     (medium,) = media
-    known = REGISTRY.get(integrator.visibility)
-    if known and known.per_field:
-        atlas = building.build(known.name, medium, None, _options(integrator))
-        return _written(output, medium, atlas.maps.lights, atlas.options, [atlas.maps])
-    table = scene_lights.Lights(described, media, 0, integrator.environment_lights).table(medium.frame)
+    method = REGISTRY.get(settings.visibility)
+    if method and method.per_field:
+        atlas = cast(TransmittanceAtlas, building.build(method.name, medium, None, _options(settings)))
+        return _write(output, medium, atlas.maps.lights, atlas.options, [atlas.maps])
+    table = scene_lights.Lights(loaded_scene, media, 0, settings.environment_lights).table(medium.frame)
     if not table.count:
         raise MiNtfError(f"{scene} has no lights that maps can be made for (point, spot, directional, environment)")
-    options = _options(building.resolved(Settings.of(integrator), table.count, media))
+    options = _options(building.resolved(settings, table.count, media))
     runs = [table.part(*run) for run in building.parts("transmittance_map", media, table, options)]
-    return _written(output, medium, table, options,
-                    (building.build("transmittance_map", medium, run, options) for run in runs))
+    return _write(output, medium, table, options,
+                  (cast(TransmittanceMap, building.build("transmittance_map", medium, run, options)) for run in runs))
 
 
-def bake_fields(path: Path, parameters: dict[str, str]) -> dict:
-    """Put the voxels of a field file, or of all field files of a scene, into the files (`mi-ntf bake --baked`).
+def bake_fields(path: Path, parameters: dict[str, str]) -> dict[str, dict[str, str | int]]:
+    """Write the voxels of a field file, or of all field files of a scene, into the files (`mi-ntf bake --baked`).
 
     Returns file → ``voxels`` and ``bytes``. Raises MiNtfError.
     """
     if path.suffix != ".safetensors":
         media = find_media(load_scene(path, parameters))
-        wanted = {m.path: m.field.grid.resolution for m in media}
-    else:
-        if mi.variant() is None:
-            mi.set_variant(*VARIANTS)
-        wanted = {str(path): None}
-    return {file: loaded.add_baked(Path(file), n) for file, n in wanted.items()}
+        resolutions = {m.path: m.field.grid.resolution for m in media}
+        return {file: loaded.add_baked(Path(file), n) for file, n in resolutions.items()}
+    if mi.variant() is None:
+        mi.set_variant(*VARIANTS)
+    return {str(path): loaded.add_baked(path)}
 
 
-def _options(settings) -> building.Options:
+def _options(settings: Settings) -> Options:
     return dataclasses.replace(building.options(settings), map_file="", cache=False)
 
 
-def _written(output: Path, medium, table, options, maps) -> dict:
+def _write(output: Path, medium: NRFMedium, table: LightTable, options: Options, maps: Iterable[TransmittanceMap]
+           ) -> MapFile:
     map_file.write(output, medium, table, options, maps)
     return {"file": str(output), "lights": table.count, "resolution": options.map_resolution,
             "components": map_cache.components(medium, options), "bytes": output.stat().st_size}

@@ -22,6 +22,7 @@ from ..scene.media import find_media, ordinary_shapes
 from ..scene.settings import Settings
 from ..transport import candidates, choosing
 from ..transport.composition import Composition
+from ..transport.context import RenderContext
 
 Report: TypeAlias = dict[str, Any]
 """Part of the report, as it is written to JSON."""
@@ -79,15 +80,15 @@ def explain(scene: Path, parameters: dict[str, str], measure: bool = False) -> R
                          "maps or volumes": _memory_of_maps(composition)},
     }
     if measure:
-        report["measured"] = _measured(loaded, integrator, spp)
+        report["measured"] = _measured(loaded, integrator, integrator.context, spp)
     return report
 
 
-def _measured(scene: mi.Scene, integrator: mi.Integrator, spp: int) -> Report:
+def _measured(scene: mi.Scene, integrator: mi.Integrator, context: RenderContext, spp: int) -> Report:
     """Render twice, since the first time may compile kernels, and build everything anew each time."""
     with user_cache.switched("off"):
         timing.once(scene, integrator, spp, 1)
-        integrator.context.patches = None
+        context.patches = None
         return timing.once(scene, integrator, spp, 0)[1]
 
 

@@ -92,9 +92,14 @@ environments; ``timed_sunsky``; environments whose `to_world` shears or, among s
     {"type": "nrf", "visibility": "transmittance_map", "max_depth": 4}
 """
 
+from __future__ import annotations
+
+from typing import Any, NoReturn
+
 import mitsuba as mi
 
 from ...core.errors import MiNtfError, root
+from ...infer.types import Array
 from ...infer.visibility import names
 from ..scene.settings import Limits, Settings
 from ..transport import aovs, rendering
@@ -108,56 +113,36 @@ def integrator_class() -> type:
     class NRFIntegrator(mi.SamplingIntegrator):
         __doc__ = __doc__
 
-        def __init__(self, props):
-            read = properties.Reader(props, "nrf integrator", properties.INTEGRATOR)
-            settings = Settings(
-                visibility=read.choice("visibility", "auto", names()),
-                map_source=read.choice("map_source", "field", ("field", "network")),
-                samples=read.whole("samples", 384, 8, 8192),
-                light_samples=read.whole("light_samples", 0, 0, 65536),
-                environment_lights=read.whole("environment_lights", 512, 1, 65536),
-                map_resolution=read.whole("map_resolution", 0, 0, 4096),
-                map_components=read.whole("map_components", 1, 1, 2),
-                map_memory=read.number("map_memory", 1024.0, 0.0, 2.0**24),
-                map_file=read.text("map_file", ""),
-                max_depth=read.whole("max_depth", 2, -1, 1 << 20),
-                bounces=read.choice("bounces", "auto", ("auto", "paths", "radiosity")),
-                unbiased=read.flag("unbiased", False),
-                hide_emitters=read.flag("hide_emitters", False),
-                frames=read.whole("frames", 1, 1, 1 << 20))
-            limits = Limits(noise=read.number("noise_threshold", 0.0, 0.0, 1e6),
-                            error=read.number("max_error", 0.0, 0.0, 1e6),
-                            seconds=max(read.number("time_budget", 0.0), 0.0))
-            # The clock of Mitsuba's own timeout would start with the construction of the plugin.
-            self.context = RenderContext(settings, limits, read.number("timeout", -1.0),
-                                         aovs.parse(read.text("aovs", "")))
-            props["timeout"] = -1.0
+        def __init__(self, props: mi.Properties) -> None:
+            self.context = _context(properties.Reader(props, "nrf integrator", properties.INTEGRATOR))
+            props["timeout"] = -1.0  # Mitsuba's own clock would start with the construction of the plugin
             mi.SamplingIntegrator.__init__(self, props)
 
-        def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        def render(self, scene: mi.Scene, sensor: mi.Sensor | int = 0, seed: Array = 0, spp: int = 0,
+                   develop: bool = True, evaluate: bool = True) -> Array:
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             try:
                 return rendering.render(self.context, scene, sensor, seed, spp, develop, self.should_stop)
             except RuntimeError as error:
                 raise root(error) from None
 
-        def sample(self, *_):
+        def sample(self, *_: Any) -> NoReturn:
             raise MiNtfError("nrf integrator: it renders whole pictures and cannot stand inside another one, such "
                              "as aov or moment; make it the scene's own, and ask it for channels by its property "
                              '"aovs" (depth, normal, albedo, …)')
 
-        def aov_names(self):
-            """Return the names of the further channels of the last render, which tells the number of lights."""
+        def aov_names(self) -> list[str]:
+            """Return the names of the further channels of the last render."""
             lights = self.context.light_count
             known = [name for name in self.context.aovs if name not in aovs.OF_LIGHTS or lights]
             return aovs.channel_names(tuple(known), lights)
 
         @property
-        def achieved(self):
+        def achieved(self) -> dict[str, Any]:
             """Result of the last render (:class:`mi_ntf.render.transport.context.RenderContext`)."""
             return self.context.achieved
 
-        def to_string(self):
+        def to_string(self) -> str:
             context = self.context
             limits = context.limits
             values = vars(context.settings) | {
@@ -167,3 +152,29 @@ def integrator_class() -> type:
             return "NRFIntegrator[\n" + ",\n".join(lines) + "\n]"
 
     return NRFIntegrator
+
+
+def _context(read: properties.Reader) -> RenderContext:
+    """Return the state of an integrator with these properties."""
+    settings = Settings(
+        visibility=read.choice("visibility", "auto", names()),
+        map_source=read.choice("map_source", "field", ("field", "network")),
+        samples=read.whole("samples", 384, 8, 8192),
+        light_samples=read.whole("light_samples", 0, 0, 65536),
+        environment_lights=read.whole("environment_lights", 512, 1, 65536),
+        map_resolution=read.whole("map_resolution", 0, 0, 4096),
+        map_components=read.whole("map_components", 1, 1, 2),
+        map_memory=read.number("map_memory", 1024.0, 0.0, 2.0**24),
+        map_file=read.text("map_file", ""),
+        max_depth=read.whole("max_depth", 2, -1, 1 << 20),
+        bounces=read.choice("bounces", "auto", ("auto", "paths", "radiosity")),
+        unbiased=read.flag("unbiased", False),
+        hide_emitters=read.flag("hide_emitters", False),
+        frames=read.whole("frames", 1, 1, 1 << 20),
+    )
+    limits = Limits(
+        noise=read.number("noise_threshold", 0.0, 0.0, 1e6),
+        error=read.number("max_error", 0.0, 0.0, 1e6),
+        seconds=max(read.number("time_budget", 0.0), 0.0),
+    )
+    return RenderContext(settings, limits, read.number("timeout", -1.0), aovs.parse(read.text("aovs", "")))

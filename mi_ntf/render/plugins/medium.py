@@ -1,14 +1,64 @@
-"""The ``nrf`` medium."""
+"""Trained reflectance field inside a bounding shape (``nrf``, a medium).
+
+=============== ========= ======== ============= =======================================================================
+parameter       type      default  range         meaning
+=============== ========= ======== ============= =======================================================================
+filename        string    required a path        field file (``.safetensors``, written by ``mi-ntf train``)
+to_world        transform identity similarity    placement after `scale`: rotation, translation, uniform scale
+scale           float     1        10⁻¹² to 10¹² scene units per capture unit
+representation  string    grid     grid, network ``grid``: baked voxels; ``network``: the networks, exact and slower
+resolution      integer   by field 16 to 1024    voxels per side of the baked grid; by default twice the finest density
+                                                 plane, 192 to 512
+sample_emitters boolean   true                   as for any medium; for stock volumetric integrators
+=============== ========= ======== ============= =======================================================================
+
+No parameter is exposed to ``mi.traverse``.
+
+The medium fills the sphere around the captured object, whose centre and radius in capture units are in the file. It
+belongs inside one bounding shape with a ``null`` BSDF that encloses the object. Extinction is in inverse scene units.
+Every collision scatters (the single-scattering albedo is 1), with the field's reflectance as phase function. Media may
+overlap: the ``nrf`` integrator adds their densities. Stock volumetric integrators know one medium at a time and are no
+reference there.
+
+Does not support: several bounding shapes for one medium; shearing or non-uniform transforms; spectral extinction.
+Source: neural reflectance fields, Bi et al. 2020.
+
+.. code-block:: xml
+
+    <shape type="sphere">
+        <point name="center" x="0.101624" y="0.794786" z="0.000442"/> <float name="radius" value="1.002768"/>
+        <bsdf type="null"/>
+        <medium type="nrf" name="interior">
+            <string name="filename" value="scenes/statue/field.safetensors"/>
+        </medium>
+    </shape>
+
+.. code-block:: python
+
+    {
+        "type": "sphere",
+        "center": [0.101624, 0.794786, 0.000442],
+        "radius": 1.002768,
+        "bsdf": {"type": "null"},
+        "interior": {"type": "nrf", "filename": "scenes/statue/field.safetensors"},
+    }
+"""
+
+from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import drjit as dr
 import mitsuba as mi
 
 from ...core.architecture import MAX_LOG_DENSITY
 from ...core.errors import MiNtfError
-from ...infer.grid import NetworkVolume
+from ...infer.grid import Density, NetworkVolume
 from ...infer.shade import Reflectance
+from ...infer.skin import Softness
+from ...infer.types import Color3, Float, Mask, Ray, Vector, Vector3
+from .. import log
 from ..scene import loaded
 from ..scene.frame import SCALES, Frame
 from . import properties
@@ -16,61 +66,43 @@ from . import properties
 REPRESENTATIONS = ("grid", "network")
 
 
-def _reflectance(source, softness, fresnel: bool):
-    """The :class:`mi_ntf.infer.shade.Reflectance` of field points, as a function. The phase function keeps it, and must
-    not keep the medium, which keeps the phase function: nothing would ever let go of the two."""
+def _reflectance(source: Density, softness: Softness, fresnel: bool) -> Callable[[Vector], Reflectance]:
+    """Return the reflectance of field points as a function.
 
-    def reflectance(x):
+    The phase function holds it rather than the medium, which holds the phase function. The two would never be freed.
+    """
+
+    def reflectance(x: Vector) -> Reflectance:
         return Reflectance(*source.reflectance(x), softness(x), fresnel)
 
     return reflectance
 
 
 def medium_class(phase_class: type) -> type:
-    """The plugin class for the current variant; `phase_class`: the variant's ``nrf`` phase function."""
+    """Return the plugin class for the current variant; `phase_class`: the variant's ``nrf`` phase function."""
 
     class NRFMedium(mi.Medium):
-        """A trained reflectance field inside a bounding shape (``nrf``).
-
-        ================ ========= ====================================================================================
-        parameter        type      meaning
-        ================ ========= ====================================================================================
-        filename         string    field file (``.safetensors``, written by ``mi-ntf train``)
-        to_world         transform placement after `scale`; rotation, translation, uniform scale (default: identity)
-        scale            float     scene units per capture unit, > 0 (default: 1)
-        representation   string    ``grid``: baked voxels; ``network``: the networks, exact and slower (default: grid)
-        resolution       integer   voxels per side of the baked grid, 16 to 1024 (default: by the field, 192 or more)
-        sample_emitters  boolean   as of any medium: for stock volumetric integrators (default: true)
-        ================ ========= ====================================================================================
-
-        The medium fills the sphere around the captured object (the file's similarity: centre and radius in capture
-        units). It belongs inside one bounding shape with a ``null`` BSDF that encloses the object. Extinction is in
-        inverse scene units; every collision scatters (single-scattering albedo 1) with the field's reflectance as phase
-        function. Media may overlap: the ``nrf`` integrator adds their densities. Stock volumetric integrators know one
-        medium at a time, and are no reference there.
-
-        Does not support: several bounding shapes for one medium; shearing or non-uniform transforms; spectral
-        extinction. Source: neural reflectance fields, Bi et al. 2020.
-        """
+        __doc__ = __doc__
 
         is_nrf = True
 
-        def __init__(self, props):
+        def __init__(self, props: mi.Properties) -> None:
             read = properties.Reader(props, "nrf medium", properties.MEDIUM)
             name = read.text("filename", "")
             if not name:
                 raise MiNtfError(
                     'nrf medium: "filename" is missing; add <string name="filename" value="field.safetensors"/>'
                 )
-            path = str(mi.file_resolver().resolve(name))
+            path = log.resolve(name)
             to_world = read.placement("to_world")
             scale = read.number("scale", 1.0, *SCALES)
             self.representation = read.choice("representation", "grid", REPRESENTATIONS)
-            resolution = read.whole("resolution", None, 16, 1024)
+            resolution = read.whole("resolution", 0, 16, 1024) or None
             read.flag("sample_emitters", True)
             self.field = loaded.load(path, resolution)
-            grid, bound = self.field.grid, math.exp(MAX_LOG_DENSITY)  # the networks are bounded by their clipping alone
-            self.source = grid if self.representation == "grid" else NetworkVolume(self.field.network, grid, bound)
+            grid, bound = self.field.grid, math.exp(MAX_LOG_DENSITY)  # clipping alone bounds the networks
+            self.source: Density = (
+                grid if self.representation == "grid" else NetworkVolume(self.field.network, grid, bound))
             architecture = self.field.header.architecture
             self.reflectance = _reflectance(self.source, self.field.softness, architecture.fresnel)
             self.frame = Frame(self.field.header.similarity, to_world, scale)
@@ -85,28 +117,29 @@ def medium_class(phase_class: type) -> type:
             self._density_unit = dr.opaque(mi.Float, 1 / self.frame.length)
             self._majorant = dr.opaque(mi.Float, max(self.source.majorant, 1e-3) / self.frame.length)
             low, high = self.source.bounds
-            self._low, self._high = (mi.Point3f(*map(float, side)) for side in (low, high))
+            self._low, self._high = (mi.Vector3f(*map(float, side)) for side in (low, high))
             dr.make_opaque(self._low, self._high)
 
-        def extinction(self, p):
-            """σ_t at the scene point `p`, 1/scene unit."""
+        def extinction(self, p: Vector3) -> Float:
+            """Return σ_t at the scene points `p`, in 1/scene unit."""
             return self.source.density(self.frame.point_to_field(p)) * self._density_unit
 
-        def intersect_aabb(self, ray):
-            o = mi.Vector3f(*self.frame.point_to_field(ray.o))
-            inverse = dr.rcp(mi.Vector3f(*self.frame.direction_to_field(ray.d))) * self.frame.length
+        def intersect_aabb(self, ray: Ray) -> tuple[Mask, Float, Float]:
+            o: Vector3 = mi.Vector3f(*self.frame.point_to_field(ray.o))
+            inverse: Vector3 = dr.rcp(mi.Vector3f(*self.frame.direction_to_field(ray.d))) * self.frame.length
             t1, t2 = (self._low - o) * inverse, (self._high - o) * inverse
             near, far = dr.max(dr.minimum(t1, t2)), dr.min(dr.maximum(t1, t2))
             return (near <= far) & (far >= 0), near, far
 
-        def get_majorant(self, mei, active=True):
+        def get_majorant(self, mei: mi.MediumInteraction3f, active: Mask = True) -> Color3:
             return mi.Spectrum(self._majorant)
 
-        def get_scattering_coefficients(self, mei, active=True):
+        def get_scattering_coefficients(self, mei: mi.MediumInteraction3f, active: Mask = True
+                                        ) -> tuple[Color3, Color3, Color3]:
             sigma = dr.minimum(self.extinction(mei.p), self._majorant)
             return mi.Spectrum(sigma), mi.Spectrum(self._majorant - sigma), mi.Spectrum(sigma)
 
-        def to_string(self):
+        def to_string(self) -> str:
             return (
                 f"NRFMedium[\n  filename = {self.path},\n  representation = {self.representation},\n"
                 f"  center = {self.frame.origin.tolist()},\n  radius = {self.frame.length}\n]"

@@ -1,9 +1,14 @@
-"""The properties of the three plugins, read strictly: names, types and ranges are those of the docstrings, or one error
-says which name, what was found there and what belongs there."""
+"""Strict reading of the plugins' properties.
+
+Names, types and ranges are those of the plugins' docstrings. An error names the property, its value and the values that
+are allowed.
+"""
+
+from __future__ import annotations
 
 import difflib
 import math
-from typing import NoReturn
+from typing import NoReturn, TypeVar, cast
 
 import mitsuba as mi
 import numpy as np
@@ -17,15 +22,17 @@ INTEGRATOR = (
     "noise_threshold", "max_error", "time_budget", "frames", "timeout",
 )
 EMITTER = ("visibility", "sampling_weight")
-"""Names that the plugins know; those that Mitsuba's own part of them reads are among them."""
+"""Names of the properties, including those that Mitsuba's base classes read."""
 
+T = TypeVar("T")
 _SIMPLE = {"Bool": "the boolean", "Integer": "the integer", "Float": "the number", "String": "the text"}
 
 
-def is_medium(props) -> bool:
+def is_medium(props: mi.Properties) -> bool:
     """Return True if `props` are those of the medium ``nrf`` rather than the integrator's.
 
-    Mitsuba has one constructor for a name and tells it no kind. A medium always has a field file, perhaps misspelt.
+    Mitsuba has one constructor for a name, whatever the kind of plugin. A medium always has a field file, perhaps
+    misspelt.
     """
     if props.id() in ("interior", "exterior"):  # from Python; in XML this name is not handed on
         return True
@@ -33,19 +40,26 @@ def is_medium(props) -> bool:
 
 
 class Reader:
-    """Values of `props` for the plugin that messages call `plugin`; `legal`: the names that it has.
+    """Values of the properties of a plugin.
 
-    Raises MiNtfError where `props` holds another name. With `nested`, objects may have any, as Mitsuba makes them up.
+    Parameters
+    ----------
+    plugin
+        Name of the plugin in messages.
+    legal
+        Names of its properties. Other names raise MiNtfError.
+    nested
+        Nested objects are allowed; their names are arbitrary.
     """
 
-    def __init__(self, props, plugin: str, legal: tuple[str, ...], nested: bool = False):
+    def __init__(self, props: mi.Properties, plugin: str, legal: tuple[str, ...], nested: bool = False) -> None:
         self._props, self._plugin = props, plugin
         for name in props.keys():
             if name not in legal and not (nested and self._kind(name) == "Object"):
                 raise self._unknown(name, legal)
 
     def text(self, name: str, default: str) -> str:
-        """A string."""
+        """Return a string."""
         return self._value(name, default, ("String",), "text")
 
     def choice(self, name: str, default: str, legal: tuple[str, ...]) -> str:
@@ -55,35 +69,35 @@ class Reader:
         return value if value in legal else self._refuse(name, expected)
 
     def flag(self, name: str, default: bool) -> bool:
-        """A boolean."""
+        """Return a boolean."""
         return self._value(name, default, ("Bool",), "a boolean, true or false")
 
-    def whole(self, name: str, default: int | None, low: int, high: int) -> int | None:
-        """An integer in [`low`, `high`], or the default."""
+    def whole(self, name: str, default: int, low: int, high: int) -> int:
+        """Return an integer in [`low`, `high`], or the default."""
         expected = f"an integer, {low} to {high}"
         value = self._value(name, default, ("Integer",), expected)
-        return value if value is None or low <= value <= high else self._refuse(name, expected)
+        return value if name not in self._props or low <= value <= high else self._refuse(name, expected)
 
     def number(self, name: str, default: float, low: float = -math.inf, high: float = math.inf) -> float:
-        """A finite number in [`low`, `high`]."""
+        """Return a finite number in [`low`, `high`]."""
         expected = "a finite number" + (f", {low:g} to {high:g}" if math.isfinite(low) else "")
         value = self._value(name, default, ("Integer", "Float"), expected)
         return float(value) if math.isfinite(value) and low <= value <= high else self._refuse(name, expected)
 
     def placement(self, name: str) -> np.ndarray:
-        """(4, 4) float64, finite, of a transform; the identity where it is left out."""
+        """Return the (4, 4) finite float64 matrix of a transform, by default the identity."""
         transform = self._value(name, mi.ScalarTransform4f(), ("Transform",), "a transform")
         matrix = np.array(transform.matrix, np.float64)
         return matrix if np.isfinite(matrix).all() else self._refuse(name, "finite numbers")
 
-    def _value(self, name: str, default, kinds: tuple[str, ...], expected: str):
+    def _value(self, name: str, default: T, kinds: tuple[str, ...], expected: str) -> T:
         if name not in self._props:
             return default
         kind = self._kind(name)
         if kind in kinds:
-            return self._props[name]
-        found = f"{_SIMPLE[kind]} {self._shown(name)}" if kind in _SIMPLE else f"of type {kind.lower()}"
-        raise MiNtfError(f"{self._plugin}: {name} is {found}, expected {expected}")
+            return cast(T, self._props[name])
+        actual = f"{_SIMPLE[kind]} {self._shown(name)}" if kind in _SIMPLE else f"of type {kind.lower()}"
+        raise MiNtfError(f"{self._plugin}: {name} is {actual}, expected {expected}")
 
     def _kind(self, name: str) -> str:
         return self._props.type(name).name
@@ -97,7 +111,8 @@ class Reader:
 
     def _unknown(self, name: str, legal: tuple[str, ...]) -> MiNtfError:
         if self._kind(name) == "Object":
-            return MiNtfError(f"{self._plugin}: it has no place for the nested {self._props[name].class_name()} "
+            nested = cast(mi.Object, self._props[name])
+            return MiNtfError(f"{self._plugin}: it has no place for the nested {nested.class_name()} "
                               f'"{name}"; remove it')
         meant = _nearest(name, legal)
         guess = f', did you mean "{meant}"?' if meant else "."
@@ -107,5 +122,5 @@ class Reader:
 
 
 def _nearest(name: str, legal: tuple[str, ...]) -> str | None:
-    """The one of `legal` that `name` was probably meant to be."""
+    """Return the name of `legal` that `name` probably misspells."""
     return next(iter(difflib.get_close_matches(name, legal, n=1)), None)

@@ -1,28 +1,30 @@
 """Errors of the plugins as users of ``mitsuba.render`` see them."""
 
 import functools
-from typing import Any
+from collections.abc import Callable
+from typing import ParamSpec, TypeVar
 
 import mitsuba as mi
 
 from ...core.errors import MiNtfError, root
 
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
+
 
 def show() -> None:
-    """Let ``mitsuba.render`` raise the plugins' errors, and interrupts by the user, themselves.
+    """Let ``mitsuba.render`` raise the plugins' own errors, and the user's interrupts.
 
-    It renders within ``drjit.custom``, which answers anything that Python raises with a RuntimeError of one fixed text
-    and leaves the error as its cause. No integrator gets a word past that, so the function is wrapped, once; all else
-    that it returns or raises stays.
+    It renders within ``drjit.custom``, which replaces each error by a RuntimeError of a fixed text, whose cause is the
+    error. The function is therefore wrapped, once. Other results and errors stay.
     """
-    render: Any = mi.render
-    if not hasattr(render, "__wrapped__"):
-        vars(mi)["render"] = _showing(render)
+    if not hasattr(mi.render, "__wrapped__"):
+        vars(mi)["render"] = _showing(mi.render)
 
 
-def _showing(render):
+def _showing(render: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
     @functools.wraps(render)
-    def shown(*args, **kwargs):
+    def shown(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
         try:
             return render(*args, **kwargs)
         except RuntimeError as error:
