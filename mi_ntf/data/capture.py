@@ -1,10 +1,10 @@
-"""A virtual camera with a flash: photographs any ordinary Mitsuba scene, surfaces or media, into a data set (`schema`).
+"""Virtual camera with a flash: photographs any ordinary Mitsuba scene, surfaces or media, into a data set (`schema`).
 
 Every view has a point light exactly at the camera (collocated capture, method of Bi et al. 2020), or at one place
-beside it, as flashes are. At the camera the light's transmittance is the view's: a medium of density σ dims it twice,
-L = ∫ σ_s f T² I/t² dt. Alpha is the opacity: the share of paths that meet matter. The scene's own sensors and emitters
-are left out; its shapes, media, materials and, where it suits them, its integrator are kept. The one file of `data`
-that uses Mitsuba.
+beside it. At the camera the light's transmittance is the view's: a medium of density σ dims it twice,
+L = ∫ σ_s f T² I/t² dt. Alpha is the opacity, the fraction of paths that meet matter. The scene's own sensors and
+emitters are ignored; its shapes, media, materials and, if suitable, its integrator are used. This is the only file of
+`data` that uses Mitsuba.
 """
 
 import hashlib
@@ -12,16 +12,20 @@ import json
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
 from mi_ntf import jobs
-from mi_ntf.core import files, spheres
+from mi_ntf.core import files
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.core.variants import VARIANTS, enough_threads
 from mi_ntf.data import schema
-from mi_ntf.data.bounds import bounding_sphere
+from mi_ntf.data.estimates import bounding_sphere
+from mi_ntf.data.poses import camera_to_world, view_directions
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 DISTANCE = 3.2  # camera to object's centre, in radii of the bounding sphere
 MARGIN = 1.04   # bounding sphere over the object's extent: room for a soft surface in the field
@@ -29,26 +33,12 @@ SURFACE_INTEGRATORS = {"PathIntegrator", "DirectIntegrator"}
 VOLUME_INTEGRATORS = {"VolumetricPathIntegrator", "VolpathMisIntegratorImpl"}  # class names of volpath and volpathmis
 
 
-def view_directions(count: int, rng: np.random.Generator) -> np.ndarray:
-    """Unit directions (count, 3) from the object to the cameras: a Fibonacci lattice, turned at random."""
-    q, r = np.linalg.qr(rng.normal(size=(3, 3)))
-    lattice = spheres.fibonacci(count, 0.5) * (1, -1, 1)
-    return lattice @ (q * np.sign(np.diag(r))).T
+def _load(path: Path) -> "tuple[list[mi.Shape], mi.Integrator]":
+    """Return the scene's shapes that emit no light, and an integrator that sees them.
 
-
-def camera_to_world(position: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """OpenGL camera-to-world (4, 4) of a camera at `position` that looks at `target`, y up (z at the poles)."""
-    back = (position - target) / np.linalg.norm(position - target)
-    right = np.cross((0.0, 1.0, 0.0) if abs(back[1]) < 0.99 else (0.0, 0.0, 1.0), back)
-    right /= np.linalg.norm(right)
-    c2w = np.eye(4)
-    c2w[:3, :] = np.stack([right, np.cross(back, right), back, position], -1)
-    return c2w
-
-
-def _load(path: Path):
-    """The scene's shapes that emit no light, and an integrator that sees them: its own where it is a path tracer, for
-    media a volumetric one, else `path` or `volpath` of depth 6."""
+    The integrator is the scene's own if it is a path tracer, a volumetric one for media; else `path` or `volpath` of
+    depth 6.
+    """
     import drjit as dr
     import mitsuba as mi
 
@@ -80,9 +70,12 @@ def _load(path: Path):
     return sorted(shapes, key=lambda shape: (_fingerprint(shape), shape.id())), integrator  # Mitsuba's order is chance
 
 
-def _outline(shapes: list) -> np.ndarray:
-    """Points (P, 3) whose hull holds every shape: the vertices of meshes, points all over spheres (within 0.5 %), the
-    box corners of everything else. Media count by the shapes that bound them."""
+def _outline(shapes: "list[mi.Shape]") -> np.ndarray:
+    """Return points (P, 3) whose hull contains every shape.
+
+    They are the vertices of meshes, points all over spheres (within 0.5 %), and the box corners of all other shapes.
+    Media count by the shapes that bound them.
+    """
     import mitsuba as mi
 
     points = []
@@ -99,8 +92,8 @@ def _outline(shapes: list) -> np.ndarray:
     return np.concatenate(points).astype(np.float64)
 
 
-def _fingerprint(thing) -> str:
-    """Hash of all parameters of a Mitsuba object (vertices, materials): tells a changed one from the same one."""
+def _fingerprint(thing: "mi.Object") -> str:
+    """Return a hash of all parameters (vertices, materials) of a Mitsuba object."""
     import mitsuba as mi
 
     digest = hashlib.sha256()
@@ -110,59 +103,44 @@ def _fingerprint(thing) -> str:
     return digest.hexdigest()[:16]
 
 
-def _studio(shapes: list, integrator, angle: float, size: int):
-    """Scene of the shapes with a perspective camera (box filter, RGBA) and a point light, both still to be placed."""
+def _studio(shapes: "list[mi.Shape]", integrator: "mi.Integrator", angle: float, size: int) -> "mi.Scene":
+    """Return a scene of the shapes with a perspective camera (box filter, RGBA) and a point light, not yet placed."""
     import mitsuba as mi
 
     film = {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgba", "component_format": "float32",
             "rfilter": {"type": "box"}}
-    contents = {f"shape_{i:04d}": shape for i, shape in enumerate(shapes)}
-    return mi.load_dict({
+    scene = mi.load_dict({
         "type": "scene",
         "integrator": integrator,
         "sensor": {"type": "perspective", "fov": float(np.degrees(angle)), "near_clip": 1e-4, "far_clip": 1e6,
                    "film": film, "sampler": {"type": "independent"}},
         "light": {"type": "point", "position": [0, 0, 0], "intensity": {"type": "rgb", "value": [1.0, 1.0, 1.0]}},
-        **contents,
+        **{f"shape_{i:04d}": shape for i, shape in enumerate(shapes)},
     })
+    assert isinstance(scene, mi.Scene)
+    return scene
 
 
-def _open_manifest(out: Path, settings: dict) -> None:
-    """Note the settings in `capture.json`, or hold them against those of the run that this one resumes."""
+def _open_manifest(out: Path, settings: dict[str, object]) -> None:
+    """Write the settings to `capture.json`, or compare them with those of the run that this one resumes."""
     path = out / "capture.json"
-    if path.exists():
-        try:
-            before = {"flash_offset": [0.0, 0.0, 0.0]} | dict(json.loads(path.read_bytes()))  # older ones do not say
-        except (ValueError, TypeError, RecursionError) as error:
-            raise MiNtfError(f"{path}: cannot be read ({error}), so what this folder was captured with is not known; "
-                             "use another folder or delete this one") from None
-        for key, value in settings.items():
-            if before.get(key) != value:
-                raise MiNtfError(f"{path}: this folder was captured with {key} = {before.get(key)}, now {key} = "
-                                 f"{value}; use another folder, delete this one, or give the former value to resume")
+    if not path.exists():
+        files.write(path, json.dumps(settings, indent=1) + "\n")
         return
-    files.write(path, json.dumps(settings, indent=1) + "\n")
-
-
-def _plan(counts: dict[str, int], center: np.ndarray, radius: float, offset: np.ndarray,
-          seed: int) -> dict[str, list[schema.Frame]]:
-    """The frames of every split; the flash, at `offset` from the lens, has I = pi d^2: a white diffuse surface at the
-    centre that faces it has radiance 1."""
-    rng = np.random.default_rng(seed)
-    distance = DISTANCE * radius
-    beside = offset * (1.0, 1.0, -1.0)
-    intensity = np.full(3, np.pi * float(((beside + np.array([0, 0, distance])) ** 2).sum()))
-    plan = {}
-    for split, count in counts.items():
-        poses = [camera_to_world(center + distance * d, center) for d in view_directions(count, rng)]
-        plan[split] = [schema.Frame(f"{split}/{i:04d}.exr", c2w, c2w[:3, 3] + c2w[:3, :3] @ beside, intensity)
-                       for i, c2w in enumerate(poses)]
-    return plan
+    try:
+        before = {"flash_offset": [0.0, 0.0, 0.0]} | dict(json.loads(path.read_bytes()))  # old files lack this key
+    except (ValueError, TypeError, RecursionError) as error:
+        raise MiNtfError(f"{path}: cannot be read ({error}), so what this folder was captured with is not known; "
+                         "use another folder or delete this one") from None
+    for key, value in settings.items():
+        if before.get(key) != value:
+            raise MiNtfError(f"{path}: this folder was captured with {key} = {before.get(key)}, now {key} = {value}; "
+                             "use another folder, delete this one, or give the former value to resume")
 
 
 @dataclass(frozen=True)
 class Request:
-    """Settings of :func:`capture`. `variant`: Mitsuba's; `object`: the fingerprint of what is photographed."""
+    """Settings of :func:`capture`."""
 
     scene: Path
     out: Path
@@ -172,12 +150,12 @@ class Request:
     spp: int
     seed: int
     flash_offset: tuple[float, float, float]
-    variant: str = ""
-    object: str = ""
+    variant: str = ""  # of Mitsuba
+    object: str = ""  # fingerprint of the studio
 
 
 class Session:
-    """The studio and the frames of a request, and the photographs one by one. Raises MiNtfError."""
+    """Studio and frames of a request, for one process. Raises MiNtfError."""
 
     def __init__(self, request: Request):
         import mitsuba as mi
@@ -195,10 +173,26 @@ class Session:
         if self.offset.shape != (3,) or not np.isfinite(self.offset).all() or self.offset[2] > 0.5 * far:
             raise MiNtfError(f"capture: flash_offset is {request.flash_offset}, must be three finite lengths right,up,"
                              f"forward of the lens, forward at most half of the way to the object ({far:.4g})")
-        counts = {"train": request.views, "val": max(4, request.views // 20), "test": request.test_views}
-        self.plan = _plan(counts, self.center, self.radius, self.offset, request.seed)
+        self.plan = self._plan()
         self.frames = [frame for split in self.plan.values() for frame in split]
         self._params = mi.traverse(self.studio)
+
+    def _plan(self) -> dict[str, list[schema.Frame]]:
+        """Return the frames of every split.
+
+        The flash has I = π d², so a white diffuse surface at the object's centre that faces it has radiance 1.
+        """
+        request, distance = self.request, DISTANCE * self.radius
+        rng = np.random.default_rng(request.seed)
+        beside = self.offset * (1.0, 1.0, -1.0)
+        intensity = np.full(3, np.pi * float(((beside + np.array([0, 0, distance])) ** 2).sum()))
+        plan = {}
+        for split, count in (("train", request.views), ("val", max(4, request.views // 20)),
+                             ("test", request.test_views)):
+            poses = [camera_to_world(self.center + distance * d, self.center) for d in view_directions(count, rng)]
+            plan[split] = [schema.Frame(f"{split}/{i:04d}.exr", c2w, c2w[:3, 3] + c2w[:3, :3] @ beside, intensity)
+                           for i, c2w in enumerate(poses)]
+        return plan
 
     def photograph(self, index: int) -> None:
         """Render and write frame `index`."""
@@ -209,8 +203,8 @@ class Session:
         self._params["light.position"] = mi.Point3f(frame.light_pos.tolist())
         self._params["light.intensity.value"] = mi.Color3f(frame.light_intensity.tolist())
         self._params.update()
-        stream: Any = request.seed * len(self.frames) + index  # a number, where Mitsuba's stub asks for an array
-        image = np.array(mi.render(self.studio, spp=request.spp, seed=stream))
+        seed = cast("mi.UInt32", request.seed * len(self.frames) + index)  # the stub forbids a number
+        image = np.array(mi.render(self.studio, spp=request.spp, seed=seed))
         if bad := np.count_nonzero(~np.isfinite(image).all(-1)):
             raise MiNtfError(f"{request.scene}: {bad} pixels of view {frame.file} are NaN or infinite; look for "
                              "extreme values in its materials and media, or give it another integrator")
@@ -219,31 +213,54 @@ class Session:
         schema.write_exr(path, image)
 
 
-_kept: list[Session] = []
-"""The session of this process, kept from view to view."""
+_sessions: list[Session] = []  # the session of this process, reused from view to view
 
 
 def photograph(task: tuple[Request, int]) -> None:
-    """Write one view, in any process: a request as its session has completed it, and the number of the frame."""
+    """Write one view in any process: a request as its session has completed it, and the number of the frame."""
     request, index = task
-    if not _kept or _kept[0].request != request:
-        _kept[:] = [Session(request)]
-    if _kept[0].request != request:
+    if not _sessions or _sessions[0].request != request:
+        _sessions[:] = [Session(request)]
+    if _sessions[0].request != request:
         raise MiNtfError(f"{request.scene} is not the scene that this capture was begun with; wait for all machines to "
                          "see the same file, or use another folder")
-    _kept[0].photograph(index)
+    _sessions[0].photograph(index)
 
 
 def capture(scene: Path, out: Path, *, views: int = 100, size: int = 128, test_views: int = 20, spp: int = 64,
             seed: int = 0, flash_offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
-            workers: jobs.Workers = jobs.Workers()) -> dict:  # noqa: B008
-    """Photograph `scene` (Mitsuba XML: surfaces, media) into the data set `out`; resumes what an earlier run began.
+            workers: jobs.Workers = jobs.Workers()) -> dict[str, object]:  # noqa: B008
+    """Photograph a scene into a data set. The same call resumes what an earlier run began.
 
-    `views` train, max(4, views // 20) val and `test_views` test photographs of size x size pixels, `spp` paths a pixel.
-    `flash_offset`: right, up and forward from the lens to the flash, scene lengths. `workers`: who renders them.
-    Returns center, radius, the number of images rendered and kept, and the seconds taken. Raises MiNtfError for a scene
-    that cannot be photographed, for a folder that holds a capture with other settings, and for views that fail, after
-    the others.
+    Parameters
+    ----------
+    scene : Path
+        Mitsuba XML file of surfaces and media.
+    out : Path
+        Folder of the data set.
+    views, test_views : int
+        Photographs for training and for tests; max(4, views // 20) are added for validation.
+    size : int
+        Width and height in pixels.
+    spp : int
+        Paths for each pixel.
+    seed : int
+        Seed of views and paths.
+    flash_offset : tuple of float
+        Place of the flash right, up and forward of the lens, in scene lengths.
+    workers : Workers
+        Processes that render the views.
+
+    Returns
+    -------
+    dict
+        "center" and "radius" of the object's sphere, the numbers of images "rendered" and "kept", and "seconds".
+
+    Raises
+    ------
+    MiNtfError
+        If the scene cannot be photographed, if the folder holds a capture with other settings, or, after all others,
+        if views fail.
     """
     for name, value in (("views", views), ("size", size), ("test_views", test_views), ("spp", spp)):
         if value < 1:
@@ -257,15 +274,15 @@ def capture(scene: Path, out: Path, *, views: int = 100, size: int = 128, test_v
     _open_manifest(out, {"scene": Path(scene).name, "object": request.object,
                          "integrator": " ".join(str(session.studio.integrator()).split()), "views": views, "size": size,
                          "test_views": test_views, "spp": spp, "seed": seed, "flash_offset": session.offset.tolist()})
-    left = [index for index, frame in enumerate(frames) if not (out / frame.file).exists()]
-    _kept[:] = [session]
+    missing = [index for index, frame in enumerate(frames) if not (out / frame.file).exists()]
+    _sessions[:] = [session]
     try:
-        jobs.run(photograph, [(request, index) for index in left], workers, title="photographs",
-                 names=[frames[index].file for index in left], folder=out)
+        jobs.run(photograph, [(request, index) for index in missing], workers, title="photographs",
+                 names=[frames[index].file for index in missing], folder=out)
     finally:
-        _kept.clear()
+        _sessions.clear()
     for split, entries in session.plan.items():
-        found = schema.Transforms(session.angle, size, size, session.center, session.radius, entries)
-        schema.write_transforms(out, split, found)
-    return {"center": session.center.tolist(), "radius": session.radius, "rendered": len(left),
-            "kept": len(frames) - len(left), "seconds": time.monotonic() - start}
+        transforms = schema.Transforms(session.angle, size, size, session.center, session.radius, entries)
+        schema.write_transforms(out, split, transforms)
+    return {"center": session.center.tolist(), "radius": session.radius, "rendered": len(missing),
+            "kept": len(frames) - len(missing), "seconds": time.monotonic() - start}

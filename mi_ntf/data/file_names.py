@@ -1,11 +1,13 @@
-"""Names of photographs and masks as data sets write them, and the files on the disk that they mean.
+r"""File names and text encodings as data sets write them, and the files on the disk that they mean.
 
-A name is taken literally first. A photograph that is not there is then looked for with "/" in place of Windows' "\\",
-with its extension in another case, and with any other extension that is read, as far as only one file fits.
+A name is taken literally first. A photograph that is missing is then looked for with "/" in place of Windows' "\",
+with its extension in another case, and with any other extension that is read if only one such file exists.
 """
 
+import json
 from collections.abc import Iterable
 from pathlib import Path
+from typing import TypeGuard
 
 from mi_ntf.core.errors import MiNtfError
 
@@ -13,7 +15,7 @@ SUFFIXES = (".png", ".exr", ".jpg", ".jpeg", ".tif", ".tiff")
 MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 
 
-def is_file_name(name: object) -> bool:
+def is_file_name(name: object) -> TypeGuard[str]:
     """Return True if `name` could be the name of a file and can be shown in one line."""
     if not isinstance(name, str) or not name.isprintable():  # half a character is not printable either
         return False
@@ -22,45 +24,46 @@ def is_file_name(name: object) -> bool:
 
 
 def plain(name: str) -> str:
-    """`name` with "/" between its parts."""
+    """Return `name` with "/" between its parts."""
     return name.replace("\\", "/")
 
 
 def locate(folder: Path, name: str) -> Path:
-    """The photograph `name` in `folder`; where no file fits, the place where it should be. Raises MiNtfError."""
+    """Return the photograph `name` in `folder`, or the path where it should be. Raises MiNtfError if two files fit."""
     place = folder / name
     if place.is_file():
         return place
     place = folder / plain(name)
-    found = on_disk(place)
-    if found is not None or place.suffix.lower() not in SUFFIXES:
-        return found or place
-    others = [other for suffix in SUFFIXES if (other := on_disk(place.with_suffix(suffix)))]
-    if len(others) > 1:
-        raise MiNtfError(f"{place} does not exist, and {' and '.join(other.name for other in others)} lie there; leave "
-                         "the one that is meant")
-    return others[0] if others else place
+    existing = on_disk(place)
+    if existing is not None or place.suffix.lower() not in SUFFIXES:
+        return existing or place
+    candidates = [path for suffix in SUFFIXES if (path := on_disk(place.with_suffix(suffix)))]
+    if len(candidates) > 1:
+        raise MiNtfError(f"{place} does not exist, and {' and '.join(path.name for path in candidates)} lie there; "
+                         "leave the one that is meant")
+    return candidates[0] if candidates else place
 
 
 def on_disk(place: Path) -> Path | None:
-    """`place`, or else the file whose name differs from it by the case of the extension alone."""
+    """Return `place`, or else the file whose name differs from it by the case of the extension alone."""
     suffix = place.suffix
-    for own in dict.fromkeys((suffix, suffix.lower(), suffix.upper(), f".{suffix[1:].capitalize()}")):
-        if suffix and (other := place.with_suffix(own)).is_file():
-            return other
+    for variant in dict.fromkeys((suffix, suffix.lower(), suffix.upper(), f".{suffix[1:].capitalize()}")):
+        if suffix and (path := place.with_suffix(variant)).is_file():
+            return path
     return place if place.is_file() else None
 
 
 def first(places: Iterable[Path]) -> Path | None:
-    """The first of `places` that is on the disk."""
-    return next((found for place in places if (found := on_disk(place))), None)
+    """Return the first of `places` that is on the disk."""
+    return next((path for place in places if (path := on_disk(place))), None)
 
 
 def mask_places(masks: Path, name: str) -> list[Path]:
     """Return the possible paths of the mask of photograph `name` in the folder `masks`.
 
     A mask has the photograph's name as a PNG file, the name that COLMAP writes (name.jpg.png), or another suffix. A
-    leading folder `images` (`images_4`) is left out."""
+    leading folder `images` (`images_4`) is dropped.
+    """
     relative = Path(name)
     if relative.is_absolute() or not relative.name:
         return []
@@ -69,3 +72,23 @@ def mask_places(masks: Path, name: str) -> list[Path]:
     base = masks / relative
     return [base.with_suffix(".png"), base.with_name(base.name + ".png"),
             *(base.with_suffix(suffix) for suffix in MASK_SUFFIXES[1:])]
+
+
+def read_text(path: Path) -> tuple[str, str | None]:
+    """Return ``(text, assumption or None)`` of a file of unknown encoding. Raises OSError and UnicodeDecodeError."""
+    text, note = decode_text(path.read_bytes())
+    return text, note and f"{path}: {note}"
+
+
+def decode_text(raw: bytes) -> tuple[str, str | None]:
+    """Decode UTF-8, UTF-16 or UTF-32, with or without a byte-order mark, or else Latin-1.
+
+    Returns ``(text, assumption or None)``. Raises UnicodeDecodeError.
+    """
+    encoding = json.detect_encoding(raw)  # by byte-order mark and zero bytes
+    try:
+        return raw.decode(encoding), None
+    except UnicodeDecodeError:
+        if not encoding.startswith("utf-8"):
+            raise
+        return raw.decode("latin-1"), "is no UTF-8 and is read as Latin-1"

@@ -1,7 +1,7 @@
-"""Image files as pixels over black, colour spaces explicit.
+"""Image files as pixels over black, with explicit colour spaces.
 
     EXR          linear; alpha premultiplied, as renderers write it; windows and layers: `exr`
-    PNG, JPEG    8 bit, sRGB or what their ICC profile or gAMA says (`colour`); alpha straight (JPEG has none)
+    PNG, JPEG    8 bit, sRGB or the space of their ICC profile or gAMA (`colour`); alpha straight (JPEG has none)
     TIFF         8 bit: as PNG; 16 bit: linear, 65535 is 1, alpha straight; floating point: as EXR
     masks        `masks`
 
@@ -11,11 +11,12 @@ Pillow, OpenEXR and OpenCV are imported where they are needed.
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
 
-from mi_ntf.core import files, ops, srgb
+from mi_ntf.core import ops, srgb
 from mi_ntf.core.errors import MiNtfError, shown
 from mi_ntf.data import colour, exif, exr
 
@@ -24,34 +25,36 @@ LINEAR = srgb.decode(ops, np.arange(256) / 255.0).astype(np.float32)
 
 
 def linear(stored: np.ndarray) -> np.ndarray:
-    """Linear premultiplied RGBA (..., 4) float32 of pixels as data sets hold them (..., 4): 8-bit sRGB levels of the
-    colour over black and 255 alpha, or floating-point numbers that are linear already."""
+    """Return linear premultiplied RGBA (..., 4) float32 of pixels as data sets hold them (..., 4).
+
+    Stored pixels are 8-bit sRGB levels of the colour over black with 255 times alpha, or linear floating-point numbers.
+    """
     if stored.dtype != np.uint8:
         return stored.astype(np.float32)
     return np.concatenate([LINEAR[stored[..., :3]], stored[..., 3:] / np.float32(255)], -1)
 
 
 def levels(pixels: np.ndarray) -> np.ndarray:
-    """The 8-bit levels (..., 4) nearest to linear premultiplied RGBA; the inverse of :func:`linear`."""
+    """Return the 8-bit levels (..., 4) nearest to linear premultiplied RGBA: the inverse of :func:`linear`."""
     color = srgb.encode(ops, pixels[..., :3])
     return np.round(255 * np.concatenate([color, np.clip(pixels[..., 3:], 0, 1)], -1)).astype(np.uint8)
 
 
 class Decoded(NamedTuple):
-    """An image as its file has it."""
+    """Content of an image file."""
 
     rgb: np.ndarray
     """(H, W, 3): 8-bit sRGB levels, or linear float32."""
     alpha: np.ndarray | None
     """(H, W): 8-bit, or float32."""
     straight: bool
-    """The colour is not yet multiplied by alpha."""
+    """True if the colour is not yet multiplied by alpha."""
     assumed: tuple[str, ...] = ()
-    """What was assumed of the file, a clause each."""
+    """Assumptions about the file, a clause each."""
 
 
 def as_linear(image: Decoded, mask: np.ndarray | None = None) -> np.ndarray:
-    """Linear premultiplied RGBA (H, W, 4) float32; alpha is `mask` (H, W) 8-bit if given, else the image's, else 1."""
+    """Return linear premultiplied RGBA (H, W, 4) float32; alpha is the 8-bit `mask` (H, W), or the image's, or 1."""
     pixels = np.empty((*image.rgb.shape[:2], 4), np.float32)
     alpha = image.alpha if mask is None else mask
     for rows in strips(pixels):
@@ -64,7 +67,7 @@ def as_linear(image: Decoded, mask: np.ndarray | None = None) -> np.ndarray:
 
 
 def as_levels(image: Decoded, mask: np.ndarray | None = None) -> np.ndarray:
-    """The 8-bit levels of :func:`as_linear` for an 8-bit image; where alpha is 255 they are the file's."""
+    """Return the 8-bit levels of :func:`as_linear` for an 8-bit image; opaque pixels keep the file's levels."""
     pixels = np.empty((*image.rgb.shape[:2], 4), np.uint8)
     alpha = image.alpha if mask is None else mask
     pixels[..., 3] = 255 if alpha is None else alpha
@@ -74,22 +77,22 @@ def as_levels(image: Decoded, mask: np.ndarray | None = None) -> np.ndarray:
 
 
 def strips(pixels: np.ndarray) -> Iterator[slice]:
-    """Rows of `pixels` (H, W, ...) by some quarter of a million pixels: a look-up takes 8 bytes for each of its own."""
+    """Return slices of rows of `pixels` (H, W, ...), each of about 2^18 pixels, to bound the memory of look-ups."""
     step = max(1, (1 << 18) // pixels.shape[1])
     return (slice(row, row + step) for row in range(0, len(pixels), step))
 
 
 @cache
 def _dimmed() -> np.ndarray:
-    """[alpha, level] (256, 256): the level nearest to the light of a level times alpha."""
+    """Return the table [alpha, level] (256, 256) of the level nearest to the light of a level times alpha."""
     light = LINEAR * (np.arange(256, dtype=np.float32) / 255)[:, None]
     return levels(np.repeat(light[..., None], 4, -1))[..., 0]
 
 
 def read_image(path: Path) -> np.ndarray:
-    """Linear premultiplied RGBA (H, W, 4) float32 of an image file; alpha 1 where it has none.
+    """Return linear premultiplied RGBA (H, W, 4) float32 of an image file; alpha is 1 if it has none.
 
-    Raises MiNtfError where the file is missing, unreadable, of another kind, or holds NaN or infinity.
+    Raises MiNtfError if the file is missing, unreadable, of another kind, or holds NaN or infinity.
     """
     return as_linear(decode(Path(path)))
 
@@ -102,7 +105,7 @@ def check_exists(path: Path) -> None:
 
 
 def decode(path: Path) -> Decoded:
-    """The image in `path`. Raises MiNtfError."""
+    """Return the image in `path`. Raises MiNtfError."""
     check_exists(path)
     reader = {".exr": _read_exr, ".png": _read_srgb, ".jpg": _read_srgb, ".jpeg": _read_srgb, ".tif": _read_tiff,
               ".tiff": _read_tiff}.get(path.suffix.lower())
@@ -134,7 +137,7 @@ def _read_exr(path: Path) -> Decoded:
 
 
 def _read_srgb(path: Path) -> Decoded:
-    """8-bit image, as it is stored: what an Exif orientation turns is found by all photographs (`orientation`)."""
+    """Read an 8-bit image as it is stored, not turned by its Exif orientation."""
     from PIL import Image
 
     with Image.open(path) as image:
@@ -148,16 +151,26 @@ def _read_srgb(path: Path) -> Decoded:
 
 
 def _read_tiff(path: Path) -> Decoded:
-    """8 bits are sRGB; 16 bits, and floating point, are what a raw converter writes that is asked for linear light.
+    """Read a TIFF file: 8 bits are sRGB; 16 bits and floating point are linear, as raw converters write them.
 
-    Pillow would cut 16 bits to 8, and OpenCV multiplies 8 bits by alpha; each reads what it reads well.
+    Pillow would cut 16 bits to 8, and OpenCV multiplies 8 bits by alpha, so each depth has its own library.
     """
-    bits, premultiplied, profile = _tiff_tags(path)
+    from PIL import Image, UnidentifiedImageError
+
+    bits: tuple[int, ...] = ()
+    premultiplied, profile = False, None
+    try:
+        with Image.open(path, formats=("TIFF",)) as image:
+            tags = getattr(image, "tag_v2", {})
+            bits, premultiplied = tags.get(258, (1,)), 1 in tags.get(338, ())  # BitsPerSample, ExtraSamples
+            profile = image.info.get("icc_profile")
+    except UnidentifiedImageError:
+        pass
     if bits and max(bits) <= 8:
         return _read_srgb(path)
     if profile:
         colour.check_linear(profile, path)
-    stored = opencv(f"{path}: TIFF of more than 8 bits").imread(str(path), -1)  # -1: as it is, IMREAD_UNCHANGED
+    stored = opencv(f"{path}: TIFF of more than 8 bits").imread(str(path), -1)  # IMREAD_UNCHANGED
     if stored is None:
         raise ValueError("OpenCV finds no image in it")
     stored = stored[..., None] if stored.ndim == 2 else stored
@@ -170,45 +183,21 @@ def _read_tiff(path: Path) -> Decoded:
     return Decoded(rgb, stored[..., 3] if stored.shape[2] == 4 else None, whole and not premultiplied)
 
 
-def _tiff_tags(path: Path) -> tuple[tuple[int, ...], bool, bytes | None]:
-    """Bits of each sample, whether alpha is associated, and the ICC profile, as far as Pillow knows the file."""
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with Image.open(path) as image:
-            tags = image.tag_v2  # type: ignore[attr-defined]  # a TIFF has them
-            return tuple(tags.get(258, (1,))), 1 in tuple(tags.get(338, ())), image.info.get("icc_profile")
-    except UnidentifiedImageError:
-        return (), False, None
-
-
-def opencv(what: str):
-    """The module `cv2`, or MiNtfError: `what` needs it."""
+def opencv(purpose: str) -> ModuleType:
+    """Return the module `cv2`. Raises the MiNtfError that `purpose` needs it if it is not installed."""
     try:
         import cv2
     except ImportError:
-        raise MiNtfError(f"{what} needs OpenCV, which is not installed: run pip install 'mi-ntf[train]'") from None
+        raise MiNtfError(f"{purpose} needs OpenCV, which is not installed: run pip install 'mi-ntf[train]'") from None
     return cv2
 
 
 def size_of(path: Path) -> tuple[int, int] | None:
-    """(width, height) in pixels as the head of an image file says it; None where only reading the whole would tell."""
+    """Return (width, height) in pixels from an image file's header, or None if the header does not tell."""
     try:
         if path.suffix.lower() == ".exr":
             return exr.size(path)
-        head = exif.head(path)
-        return head and head.size
-    except Exception:  # told when it is read
+        header = exif.read_header(path)
+        return header and header.size
+    except Exception:  # reading the pixels raises the error
         return None
-
-
-def write_exr(path: Path, rgba: np.ndarray) -> None:
-    """Write linear premultiplied RGBA (H, W, 4) as EXR, whole or not at all: in half precision, in single where a value
-    is beyond it."""
-    import OpenEXR
-
-    dtype = np.float32 if np.abs(rgba).max() > np.finfo(np.float16).max else np.float16
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with OpenEXR.File(header, {"RGBA": np.ascontiguousarray(rgba, dtype=dtype)}) as file:
-        with files.replacing(path) as temporary:
-            file.write(str(temporary))

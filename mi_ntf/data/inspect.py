@@ -1,26 +1,44 @@
-"""`mi-ntf inspect`: a data set before training, as a page to look at and as numbers."""
+"""`mi-ntf inspect`: a data set before training, as a page and as numbers."""
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from mi_ntf.core import files
-from mi_ntf.data import assumptions, inspect_figures, measures, orientation
-from mi_ntf.data.measures import percent
+from mi_ntf.data import assumptions, inspect_figures, measures
+from mi_ntf.data.measures import Numbers, Splits, percent
 from mi_ntf.data.page import Page
-from mi_ntf.data.readers import FORMS, load_dataset
-from mi_ntf.data.schema import Found, Split, View
+from mi_ntf.data.readers import find_form, load_dataset
+from mi_ntf.data.schema import DataSet, View
 
 THUMBNAILS = 12
-POINTS = 2000
+POINTS = 2000  # of the reconstructed points, in the figure of the cameras
 
 
-def inspect(folder: Path, out: Path | None = None, **options) -> dict:
-    """Read the data set in `folder` with `options` of :func:`load_dataset`, write the page and return the numbers.
+def inspect(folder: Path, out: Path | None = None, **options: Any) -> Numbers:
+    """Read the data set in `folder`, write the page and return the numbers.
 
-    `out`, the page, is DIR-inspect.html in the current folder unless given. Keys of the result: "folder", "form",
-    "said" (what the reader told), "assumed" (the assumptions among that), "warnings", "page", "views" (one mapping a
-    photograph) and those of :func:`measures.numbers`. Raises MiNtfError.
+    Parameters
+    ----------
+    folder : Path
+        Folder of the data set.
+    out : Path, optional
+        File of the page, DIR-inspect.html in the current folder by default.
+    **options
+        Options of :func:`load_dataset`. Those that are None are ignored.
+
+    Returns
+    -------
+    dict
+        "folder", "form", "said" (sentences of the reader), "assumed" (the assumptions among them), "warnings", "page",
+        "views" (one mapping for each photograph) and the keys of :func:`measures.numbers`.
+
+    Raises
+    ------
+    MiNtfError
+        If the data set has a fault, or the page cannot be written.
     """
     folder = Path(folder)
     out = Path(f"{folder.resolve().name}-inspect.html") if out is None else Path(out)
@@ -28,74 +46,71 @@ def inspect(folder: Path, out: Path | None = None, **options) -> dict:
     said: list[str] = []
     splits = load_dataset(folder, said.append, **{k: v for k, v in options.items() if v is not None})
     rows = measures.measure(splits)
-    found = measures.numbers(splits, rows)
-    form, reader = next((form, reader) for form, is_there, reader in FORMS if is_there(folder))
-    found = {"folder": str(folder), "form": form, "said": said, "assumed": assumptions.said(said), **found,
-             "warnings": measures.warnings(found, rows), "page": str(out), "views": [_plain(row) for row in rows]}
-    _page(folder, reader(folder), splits, rows, found).write(out)
-    return found
+    numbers = measures.numbers(splits, rows)
+    form, _ = find_form(folder)
+    data = {"folder": str(folder), "form": form.name, "said": said,
+            "assumed": [text for text in said if text.startswith(assumptions.PREFIX)], **numbers,
+            "warnings": measures.warnings(numbers, rows), "page": str(out),
+            "views": [{key: _plain(value) for key, value in row._asdict().items()} for row in rows]}
+    _page(folder, form.read(folder), splits, rows, data).write(out)
+    return data
 
 
-def print_table(found: dict) -> None:
-    """The result of :func:`inspect` for a reader."""
-    for text in found["said"]:
-        print(text)
-    table = summary(found)
-    width = max(len(what) for what, _ in table)
-    for what, value in table:
-        print(f"{what:<{width}}  {value}")
-    for text in found["warnings"]:
-        print(f"warning: {text}")
-    print(found["page"])
+def print_table(data: Numbers) -> None:
+    """Print the result of :func:`inspect` for a reader."""
+    table = summary(data)
+    width = max(len(key) for key, _ in table)
+    print(*data["said"], *(f"{key:<{width}}  {value}" for key, value in table),
+          *(f"warning: {text}" for text in data["warnings"]), data["page"], sep="\n")
 
 
-def summary(found: dict) -> list[tuple[str, str]]:
-    """The numbers of the whole data set as pairs of texts."""
-    ratio, balance = found["brightness"]["ratio"], found["white_balance"]
-    length = found["distance"]["median"] * found["sphere"]["radius"]
+def summary(data: Numbers) -> list[tuple[str, str]]:
+    """Return the numbers of the whole data set as pairs of texts."""
+    ratio, balance = data["brightness"]["ratio"], data["white_balance"]
+    length = data["distance"]["median"] * data["sphere"]["radius"]
     return [
-        ("photographs", ", ".join(f"{count} {which}" for which, count in found["photographs"].items())),
-        ("size", f"{found['width']} x {found['height']} pixels"),
-        ("object's sphere", f"center {', '.join(f'{v:.4g}' for v in found['sphere']['center'])}; "
-                            f"radius {found['sphere']['radius']:.4g}"),
-        ("object covers", f"{_range(found['coverage'], 100)} % of a photograph"),
-        ("background", "masked" if found["masked"] else f"black; {percent(found['unknown'])} of the pixels unknown"),
-        ("cameras to object", f"{_range(found['distance'])} radii; the median is {length:.4g} of the data set's "
+        ("photographs", ", ".join(f"{count} {split}" for split, count in data["photographs"].items())),
+        ("size", f"{data['width']} x {data['height']} pixels"),
+        ("object's sphere", f"center {', '.join(f'{v:.4g}' for v in data['sphere']['center'])}; "
+                            f"radius {data['sphere']['radius']:.4g}"),
+        ("object covers", f"{_range(data['coverage'], 100)} % of a photograph"),
+        ("background", "masked" if data["masked"] else f"black; {percent(data['unknown'])} of the pixels unknown"),
+        ("cameras to object", f"{_range(data['distance'])} radii; the median is {length:.4g} of the data set's "
                               "lengths"),
-        ("pixel at the object", f"{_range(found['pixel'])} radii"),
-        ("flash beside the lens", f"{_range(found['flash_degrees'], 1, '.1f')} degrees, seen from the object"),
-        ("largest gap of cameras", f"{found['gap']['degrees']:.0f} degrees"),
-        ("brightness, largest / smallest", " ".join("–" if r is None else f"{r:.3g}" for r in ratio) + " (R G B)"),
+        ("pixel at the object", f"{_range(data['pixel'])} radii"),
+        ("flash beside the lens", f"{_range(data['flash_degrees'], 1, '.1f')} degrees, seen from the object"),
+        ("largest gap of cameras", f"{data['gap']['degrees']:.0f} degrees"),
+        ("brightness, largest / smallest", f"{' '.join(map(_number, ratio))} (R G B)"),
         ("colour, largest / smallest", f"{_number(balance['red_over_green'])} (R/G) "
                                        f"{_number(balance['blue_over_green'])} (B/G)"),
-        ("saturated", f"{percent(found['saturated'])} of the object"),
-        ("nearly black", f"{percent(found['black'])} of the object"),
-        ("silhouette outside the others' hull", f"{_range(found['uncovered'], 100)} %"),
+        ("saturated", f"{percent(data['saturated'])} of the object"),
+        ("nearly black", f"{percent(data['black'])} of the object"),
+        ("silhouette outside the others' hull", f"{_range(data['uncovered'], 100)} %"),
     ]
 
 
-def _page(folder: Path, read: Found, splits: dict[str, Split], rows: list[measures.Photograph], found: dict) -> Page:
-    """The page; `read` is what the reader of the folder's form says."""
+def _page(folder: Path, described: DataSet, splits: Splits, rows: list[measures.Photograph], data: Numbers) -> Page:
     page = Page(f"Data set {folder.resolve().name}")
     page.text(str(folder.resolve()))
-    for text in found["warnings"]:
+    for text in data["warnings"]:
         page.warning(text)
-    page.table(["", ""], summary(found))
-    if found["said"]:
+    page.table(["", ""], summary(data))
+    if data["said"]:
         page.section("What was found and assumed")
-        page.table([""], [[text] for text in found["said"]])
+        page.table([""], [[text] for text in data["said"]])
     page.section("Cameras")
-    page.figure(inspect_figures.cameras(splits, _some(read.points)), "Cameras and where they look, around the object's "
+    points = described.points
+    points = None if points is None or not len(points) else points[:: -(-len(points) // POINTS)]
+    page.figure(inspect_figures.cameras(splits, points), "Cameras and where they look, around the object's "
                 "sphere; lengths in its radii.")
-    page.figure(inspect_figures.directions(splits, np.array(found["gap"]["direction"])),
+    page.figure(inspect_figures.directions(splits, np.array(data["gap"]["direction"])),
                 "The sides the object was seen from. Dark: no camera for training is near.")
-    settled, _ = orientation.settle(read.views, False)
-    views = {view.image: view for split in settled.values() for view in split}
+    turned, _ = assumptions.turn(described.views, False)
     page.section("Masks")
     page.text("The line is the mask's outline; what is outside is dimmed and bluish"
-              + ("." if found["masked"] else ", what is not known is orange.")
+              + ("." if data["masked"] else ", what is not known is orange.")
               + " The whole object should be inside and nothing else.")
-    page.pictures(_thumbnails(folder, views, splits, rows), width=250)
+    page.pictures(_thumbnails(folder, {view.image: view for view in assumptions.every(turned)}, splits, rows), 250)
     page.section("Brightness")
     page.text("Mean of the object's pixels as apparent albedo, π L d²/I. Slow changes are the object's sides; jumps "
               "are the camera's or the flash's.")
@@ -111,35 +126,25 @@ def _page(folder: Path, read: Found, splits: dict[str, Split], rows: list[measur
     return page
 
 
-def _thumbnails(folder: Path, views: dict[Path, View], splits: dict[str, Split], rows: list[measures.Photograph]):
-    """(caption, picture) of photographs evenly chosen among `rows`; `views` by their files."""
-    white, _ = measures.white_level(splits)
-    place = {measures.name(splits, which, i): (which, i) for which, split in splits.items()
-             for i in range(len(split.images))}
+def _thumbnails(folder: Path, views: dict[Path, View], splits: Splits, rows: list[measures.Photograph]
+                ) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield (caption, picture) of photographs evenly chosen among `rows`; `views` are keyed by their files."""
+    white, places = measures.white_level(splits).level, measures.places(splits)
     for k in np.unique(np.linspace(0, len(rows) - 1, min(THUMBNAILS, len(rows))).round().astype(int)):
-        row = rows[k]
-        which, i = place[row.name]
-        view = views.get(folder / row.name, views.get(Path(row.name)))
-        caption = f"{k}: {row.name} ({row.split}), covers {percent(row.coverage)}"
-        yield caption, inspect_figures.thumbnail(splits[which], i, view, white)
+        name, split, i = places[k]
+        view = views.get(folder / name, views.get(Path(name)))
+        yield (f"{k}: {name} ({split}), covers {percent(rows[k].coverage)}",
+               inspect_figures.thumbnail(splits[split], i, view, white))
 
 
-def _some(points: np.ndarray | None) -> np.ndarray | None:
-    """At most ``POINTS`` of the reconstructed points."""
-    return None if points is None or not len(points) else points[:: -(-len(points) // POINTS)]
+def _plain(value: object) -> object:
+    """Return `value` for JSON: lists for arrays, None for NaN."""
+    if isinstance(value, np.ndarray):
+        return [_plain(v) for v in value.tolist()]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
-def _plain(row: measures.Photograph) -> dict:
-    """A photograph's numbers for JSON: lists for arrays, None for NaN."""
-    def plain(value):
-        if isinstance(value, np.ndarray):
-            return [plain(v) for v in value.tolist()]
-        return None if isinstance(value, float) and not np.isfinite(value) else value
-
-    return {key: plain(value) for key, value in row._asdict().items()}
-
-
-def _range(values: dict | None, scale: float = 1, form: str = ".3g") -> str:
+def _range(values: dict[str, float] | None, scale: float = 1, form: str = ".3g") -> str:
     if values is None:
         return "–"
     least, median, most = (f"{scale * values[key]:{form}}" for key in ("least", "median", "most"))

@@ -1,10 +1,11 @@
 """Reader of LLFF's `poses_bounds.npy` with its photographs in `images/`.
 
-One row of 17 numbers for each photograph, in the order of their names: a 3x5 matrix, row by row, and the depths of the
-nearest and farthest point. Columns of the matrix: the camera's axes down, right and backward in the world, its place,
-and (height, width, focal length) in pixels. The principal point is the middle. Photographs may be scaled copies.
+The file has one row of 17 numbers for each photograph, in the order of their names: a 3x5 matrix, row by row, and the
+depths of the nearest and farthest point. The matrix has the camera's axes down, right and backward in the world, its
+place, and (height, width, focal length) in pixels as columns. The principal point is the middle. Photographs may be
+scaled copies.
 
-Source: "Using your own poses" in the documentation of LLFF (Mildenhall et al. 2019), and the loader of NeRF.
+Sources: "Using your own poses" in the documentation of LLFF (Mildenhall et al. 2019), and the loader of NeRF.
 """
 
 from pathlib import Path
@@ -14,12 +15,12 @@ import numpy as np
 from mi_ntf.core.errors import MiNtfError, shown
 from mi_ntf.data.file_names import SUFFIXES, mask_places
 from mi_ntf.data.poses import check_rigid
-from mi_ntf.data.schema import Camera, Found, View
+from mi_ntf.data.schema import Camera, DataSet, View
 
 FORM = "LLFF data set (poses_bounds.npy)"
 
 
-def read(folder: Path) -> Found:
+def read(folder: Path) -> DataSet:
     """Read all photographs as one split, `train`. Raises MiNtfError."""
     path, images = folder / "poses_bounds.npy", folder / "images"
     rows = _rows(path)
@@ -29,12 +30,12 @@ def read(folder: Path) -> Found:
     if len(names) != len(rows):
         raise MiNtfError(f"{path}: has {len(rows)} poses, {images} has {len(names)} photographs; one belongs to each, "
                          "in the order of the names: take out the photographs that have no pose")
-    return Found(FORM, {"train": [_view(row, f"{path}, row {i} ({name})", folder, name)
-                                  for i, (row, name) in enumerate(zip(rows, names, strict=True))]})
+    return DataSet(FORM, {"train": [_view(row, f"{path}, row {i} ({name})", folder, name)
+                                    for i, (row, name) in enumerate(zip(rows, names, strict=True))]})
 
 
 def _rows(path: Path) -> np.ndarray:
-    """(N, 17) float64. The file is mapped first, so that a head that lies takes no memory."""
+    """Return (N, 17) float64. The file is mapped, so that a wrong header allocates no memory."""
     try:
         rows = np.load(path, mmap_mode="r", allow_pickle=False)
     except Exception as error:  # NumPy raises many kinds for a damaged file
@@ -43,7 +44,7 @@ def _rows(path: Path) -> np.ndarray:
     if rows.ndim != 2 or rows.shape[1] != 17 or not len(rows) or rows.dtype.kind not in "fiu":
         raise MiNtfError(f"{path}: is an array of {rows.dtype} with shape {rows.shape}, expected numbers (N, 17); "
                          "write it again with LLFF's imgs2poses.py")
-    with np.errstate(all="ignore"):  # infinity is told of each row
+    with np.errstate(all="ignore"):  # `_view` reports infinity
         return np.array(rows, np.float64)
 
 

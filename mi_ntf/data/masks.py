@@ -1,36 +1,40 @@
-"""Masks: images that tell the object's share of each pixel. One rule, whatever the file's depth and colours.
+"""Masks: images of the object's fraction of each pixel. One rule serves files of every depth and colour.
 
     an alpha channel, not opaque throughout     is the mask (a cut-out)
     colours, 256 at most                        labels: the object is where they are not black
-    grey, up to three quarters of white or more level / white is the share
+    grey, up to three quarters of white or more level / white is the fraction
     grey, darker, 16 levels at most             labels: the object is where they are not black (0 and 1, numbers)
 
-White is 255, of 16 bits 65535 if any level is above 255. Everything else is refused.
+White is 255, or 65535 if any level of a 16-bit file is above 255. All other files are refused.
 """
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mi_ntf.core.errors import MiNtfError, shown
 from mi_ntf.data import exif
 
+if TYPE_CHECKING:
+    from PIL import Image
+
 BRIGHT = 0.75
-"""Share of white that a mask of shares reaches."""
+"""Fraction of white that the brightest level of a mask of fractions reaches."""
 LABELS, COLOURS = 16, 256
-"""Levels, and colours, of a mask of labels at most."""
+"""Largest numbers of levels and of colours of a mask of labels."""
 BLACK = 16
-"""Levels of noise that JPEG may add: up to this level a channel counts as black, and channels this close as grey."""
+"""Levels of noise that JPEG may add: channels up to this level count as black, and channels this close as grey."""
 
 
 def read(path: Path) -> tuple[np.ndarray, str | None]:
-    """``(alpha (H, W) of 8 bits, what was assumed or None)`` of a mask. Raises MiNtfError."""
+    """Return the 8-bit alpha (H, W) of the mask in `path`, and an assumption or None. Raises MiNtfError."""
     from PIL import Image
 
     try:
         with Image.open(path) as image:
             exif.check_stored(image, path)
-            return _decoded(image, path)
+            return _decode(image, path)
     except MiNtfError:
         raise
     except Exception as error:
@@ -38,7 +42,7 @@ def read(path: Path) -> tuple[np.ndarray, str | None]:
                          ) from error
 
 
-def _decoded(image, path: Path) -> tuple[np.ndarray, str | None]:
+def _decode(image: "Image.Image", path: Path) -> tuple[np.ndarray, str | None]:
     if image.mode[:1] == "F":
         raise ValueError(f"mode '{image.mode}'")
     if image.mode[:1] == "I":
@@ -46,8 +50,9 @@ def _decoded(image, path: Path) -> tuple[np.ndarray, str | None]:
         return _grey(levels, 65535 if levels.max(initial=0) > 255 else 255, path)
     if "A" in image.getbands() or "transparency" in image.info:
         image = image.convert("RGBA")
-        if image.getchannel("A").getextrema()[0] < 255:
-            return np.asarray(image.getchannel("A")), "a mask that has an alpha channel is that channel"
+        alpha = np.asarray(image.getchannel("A"))
+        if alpha.min() < 255:
+            return alpha, "a mask that has an alpha channel is that channel"
     if image.mode not in ("1", "L"):
         image = image.convert("RGB")
         pixels = np.asarray(image)
@@ -56,8 +61,8 @@ def _decoded(image, path: Path) -> tuple[np.ndarray, str | None]:
     return _grey(np.asarray(image.convert("L")), 255, path)
 
 
-def _coloured(image, pixels: np.ndarray, path: Path) -> tuple[np.ndarray, str]:
-    """Return the object's share of each pixel of a coloured mask of labels, 0 or 255."""
+def _coloured(image: "Image.Image", pixels: np.ndarray, path: Path) -> tuple[np.ndarray, str]:
+    """Return the alpha of a coloured mask of labels: 0 or 255."""
     shows = pixels.max(-1) > BLACK
     if image.getcolors(COLOURS) is None or shows.all():
         fault = "nothing in it is black" if shows.all() else f"it has more than {COLOURS} colours"
@@ -67,14 +72,14 @@ def _coloured(image, pixels: np.ndarray, path: Path) -> tuple[np.ndarray, str]:
 
 
 def _grey(levels: np.ndarray, white: int, path: Path) -> tuple[np.ndarray, str | None]:
-    """Return the object's share of each pixel from the grey `levels` (H, W), read as shares or as labels."""
-    there = np.flatnonzero(np.bincount(levels.ravel(), minlength=2))  # raises for negative ones
-    brightest = int(there.max(initial=0))
-    if brightest >= BRIGHT * white or (len(there) == 1 and brightest != 1):  # one level alone is a share
+    """Return the alpha of grey `levels` (H, W), which are fractions of `white` or labels."""
+    used = np.flatnonzero(np.bincount(levels.ravel(), minlength=2))  # raises for negative ones
+    brightest = int(used.max(initial=0))
+    if brightest >= BRIGHT * white or (len(used) == 1 and brightest != 1):  # one level alone is a fraction
         return np.round(levels * (255 / white)).astype(np.uint8) if levels.dtype != np.uint8 else levels, None
-    if len(there) <= LABELS:
+    if len(used) <= LABELS:
         return np.where(levels > 0, np.uint8(255), np.uint8(0)), (
             "a mask of few dark levels shows the object where it is not black")
-    raise MiNtfError(f"{path}: its brightest level is {brightest} of {white}, and it has {len(there)} levels, so "
+    raise MiNtfError(f"{path}: its brightest level is {brightest} of {white}, and it has {len(used)} levels, so "
                      "neither is white the object nor are they labels; write the object white and everything else "
                      "black, as 8-bit grey PNG")

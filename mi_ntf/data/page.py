@@ -1,5 +1,4 @@
-"""HTML pages for reports. A page holds all that it shows: it needs no network, and no scripts but those given to
-:meth:`Page.markup`.
+"""HTML pages for reports. A page contains everything that it shows: it needs no network and no other file.
 
     page = Page("skull")
     page.section("Photographs")
@@ -19,18 +18,20 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mi_ntf.core import files
 from mi_ntf.data.images import levels
 
-GREY = "#7d7d7d"
-"""Of a figure's text and lines: it can be read on a light page and on a dark one."""
-COLOURS = {"red": "#e0433a", "green": "#2f9e44", "blue": "#3b82e0"}
-"""Of curves that are called so; others take matplotlib's in turn."""
-SMALL = 128 * 128
-"""Pictures of so many pixels are PNG, exact to the level; larger ones JPEG."""
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+GREY = "#7d7d7d"  # text and lines of figures: legible on a light page and on a dark one
+COLOURS = {"red": "#e0433a", "green": "#2f9e44", "blue": "#3b82e0"}  # of curves with these names
+SMALL = 128 * 128  # pictures of up to this number of pixels are PNG, exact to the level; larger ones are JPEG
 
 _STYLE = """
 :root { color-scheme: light dark; --page: #fff; --ink: #1c1c1c; --warn: #fff1d6; }
@@ -60,28 +61,31 @@ for (const button of document.querySelectorAll("button.copy")) button.addEventLi
 
 
 class Page:
-    """A page under way; nothing is on the disk before :meth:`write`."""
+    """HTML page in memory; :meth:`write` puts it on the disk."""
 
     def __init__(self, title: str):
         self._parts = [f"<h1>{escape(title)}</h1>"]
         self._title = title
 
     def section(self, title: str) -> None:
-        """A heading."""
+        """Add a heading."""
         self._parts.append(f"<h2>{escape(title)}</h2>")
 
     def text(self, text: str) -> None:
-        """A paragraph."""
+        """Add a paragraph."""
         self._parts.append(f"<p>{escape(text)}</p>")
 
     def warning(self, text: str) -> None:
-        """A paragraph that stands out."""
+        """Add a paragraph that stands out."""
         self._parts.append(f'<p class="warning">⚠ {escape(text)}</p>')
 
     def table(self, header: Sequence[object], rows: Iterable[Sequence[object]], folded: str = "",
               groups: Sequence[tuple[str, int]] = ()) -> None:
-        """A table, one text or number a cell. `folded`: what is shown in its place until it is clicked on. `groups`: a
-        line above the header, each text over so many columns."""
+        """Add a table, one text or number a cell.
+
+        If `folded` is given, the page shows this text until it is clicked. `groups` is a line above the header of
+        texts with the number of columns that each spans.
+        """
         lines = ["".join(f'<th colspan="{span}">{escape(text)}</th>' for text, span in groups)] if groups else []
         lines += ["".join(f"<th>{escape(str(cell))}</th>" for cell in header)]
         lines += ["".join(f"<td>{escape(str(cell))}</td>" for cell in row) for row in rows]
@@ -89,16 +93,18 @@ class Page:
         self.scrolling(f"<details><summary>{escape(folded)}</summary>{table}</details>" if folded else table, "table")
 
     def pictures(self, pictures: Iterable[tuple[str, np.ndarray]], width: int = 240) -> None:
-        """A row of pictures (caption, (H, W, 3)), each shown `width` CSS pixels wide."""
+        """Add a row of pictures (caption, (H, W, 3)), each shown `width` CSS pixels wide."""
         self._parts.append('<div class="row">')
         for caption, array in pictures:
             small = ' class="small"' if array.shape[1] < width else ""
             self._image(encode(array), caption, f'{small} width="{width}"', f' style="max-width: {max(width, 150)}px"')
         self._parts.append("</div>")
 
-    def figure(self, figure, caption: str = "", vector: bool = False) -> None:
-        """A `matplotlib.figure.Figure`; its background is the page's, its text and axes should be ``GREY``. `vector`:
-        as SVG, for figures of few lines."""
+    def figure(self, figure: "Figure", caption: str = "", vector: bool = False) -> None:
+        """Add a figure on the page's background; its text and axes should be ``GREY``.
+
+        `vector` draws it as SVG, which suits figures of few lines.
+        """
         buffer = io.BytesIO()
         metadata = {"Date": None} if vector else {}  # the same figure is the same page
         figure.savefig(buffer, format="svg" if vector else "png", dpi=150, transparent=True, metadata=metadata)
@@ -107,7 +113,7 @@ class Page:
 
     def curves(self, title: str, curves: Mapping[str, tuple[Sequence[float], Sequence[float]]], xlabel: str = "",
                ylabel: str = "", log: bool = False) -> None:
-        """Curves (xs, ys) by name in one diagram; `log`: of the y axis. NaN leaves a gap."""
+        """Add a diagram of curves (xs, ys) by name, with a logarithmic y axis if `log`. NaN leaves a gap."""
         figure = new_figure(7.5, 3.0)
         axes = figure.add_subplot()
         plain(axes)
@@ -127,9 +133,11 @@ class Page:
             axes.legend(frameon=False, labelcolor=GREY)
         self.figure(figure)
 
-    def drawing(self, figure, label: str, width: int) -> None:
-        """Add a `matplotlib.figure.Figure` as part of the page, whose text can be read aloud and copied: as wide as the
-        page, but `width` CSS pixels at least. `label` says what it shows."""
+    def drawing(self, figure: "Figure", label: str, width: int) -> None:
+        """Add a figure as inline SVG, whose text can be read aloud and copied.
+
+        It is as wide as the page, but at least `width` CSS pixels. `label` describes it to those who hear the page.
+        """
         import matplotlib
 
         buffer = io.StringIO()
@@ -142,8 +150,7 @@ class Page:
         self.scrolling(f"{head}>{body}".replace("xlink:href", "href"), label)
 
     def scrolling(self, html: str, label: str) -> None:
-        """Add HTML that may be wider than a phone: it scrolls by itself, by keyboard as well. `label` is for those who
-        hear the page."""
+        """Add HTML that may be wider than a phone and scrolls by itself; `label` is for those who hear the page."""
         self._parts.append(f'<div class="wide" tabindex="0" role="region" aria-label="{escape(label)}">{html}</div>')
 
     @staticmethod
@@ -153,11 +160,11 @@ class Page:
                 f"<pre>{escape(text.strip())}</pre>")
 
     def markup(self, html: str) -> None:
-        """HTML as it is, not escaped: the caller's own, that loads nothing."""
+        """Add HTML as it is, not escaped. It must load no other file."""
         self._parts.append(html)
 
     def html(self) -> str:
-        """The page so far."""
+        """Return the page."""
         script = [_COPY] if any('class="copy"' in part for part in self._parts) else []
         return ('<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">\n'
                 f'<meta name="viewport" content="width=device-width">\n<title>{escape(self._title)}</title>\n'
@@ -173,15 +180,15 @@ class Page:
                            f"<figcaption>{caption}</figcaption></figure>")
 
 
-def new_figure(width: float, height: float):
-    """An empty `matplotlib.figure.Figure` of `width` x `height` inches (96 CSS pixels each), on no screen."""
+def new_figure(width: float, height: float) -> "Figure":
+    """Return an empty figure of `width` x `height` inches (96 CSS pixels each) without a window."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def plain(axes) -> None:
-    """Make the lines and texts of matplotlib `axes` ``GREY``."""
+def plain(axes: "Axes") -> None:
+    """Make the lines and texts of `axes` ``GREY``."""
     axes.set_facecolor("none")
     axes.tick_params(colors=GREY, which="both", labelsize=8)
     for spine in axes.spines.values():
@@ -193,7 +200,7 @@ def plain(axes) -> None:
 
 
 def encode(array: np.ndarray) -> str:
-    """Data URI of a picture (H, W, 3): linear light as floats, or sRGB levels."""
+    """Return the data URI of a picture (H, W, 3): linear light as floats, or sRGB levels."""
     from PIL import Image
 
     if array.ndim != 3 or array.shape[2] != 3:
@@ -207,7 +214,7 @@ def encode(array: np.ndarray) -> str:
 
 
 def _literal(text: str) -> str:
-    """`text` for matplotlib, which takes what stands between two dollars for a formula."""
+    """Escape dollars, between which matplotlib expects a formula."""
     return text.replace("$", r"\$")
 
 

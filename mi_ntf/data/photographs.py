@@ -1,32 +1,53 @@
 """Photographs with their masks and lenses, read one at a time into the array that a split holds.
 
-Of all of them together nothing exists but that array: 8-bit files make an array of bytes, 4 a pixel. Any other file
-makes one of half precision, or of single precision where half would not hold a photograph's light.
+No other copy of all photographs exists. Files of 8 bits make an array of bytes, 4 a pixel. Any other file makes an
+array of half precision, or of single precision if half does not hold the light of some photograph.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.data import background, exif, images, lens, masks
-from mi_ntf.data.assumptions import Assumed
+from mi_ntf.data.assumptions import Assumptions
 from mi_ntf.data.file_names import first
 from mi_ntf.data.schema import Camera, View, focal_length
 
-HALF = (1e-3, 65504.0)
-"""Between these, the brightest light of a photograph for which half precision will do: it has 11 bits down to 6e-5."""
+HALF = (1e-3, 65504.0)  # range of a photograph's brightest light for half precision, which has 11 bits down to 6e-5
 
 
-def load(views: list[View], size: int | None = None, black: bool = False, assumed: Assumed | None = None
-         ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """``(images (N, H, W, 4) as stored, c2w (N, 4, 4), focal (N, 2), principal (N, 2))`` of a split; pixels, float64.
+class Photographs(NamedTuple):
+    """Photographs of a split with their cameras, as :class:`mi_ntf.data.schema.Split` has them."""
 
-    `size`: longer side in pixels that photographs are scaled down to. `black`: alpha is what the black background tells
-    (`background`) instead of masks. Every photograph has one size in the end: portraits are turned by 90 degrees if the
-    first is none, with their cameras, and landscapes likewise. What is assumed is added to `assumed`. Raises
-    MiNtfError.
+    images: np.ndarray
+    c2w: np.ndarray
+    focal: np.ndarray
+    principal: np.ndarray
+
+
+def load(views: list[View], size: int | None = None, black: bool = False, assumed: Assumptions | None = None
+         ) -> Photographs:
+    """Read the photographs of a split.
+
+    Parameters
+    ----------
+    views : list of View
+        All photographs have one size in the end: those that lie otherwise than the first are turned by 90 degrees.
+    size : int, optional
+        Longer side in pixels to which photographs are scaled down.
+    black : bool
+        Alpha comes from the black background (`background`) instead of masks.
+    assumed : Assumptions, optional
+        Receives the assumptions about the files.
+
+    Raises
+    ------
+    MiNtfError
+        If a photograph or its mask cannot be read or does not fit.
     """
     stored, straighten, intrinsics, poses = np.empty((0, 0, 0, 4), np.uint8), lens.Straightener(), [], []
-    assumed = Assumed() if assumed is None else assumed
+    assumed = Assumptions() if assumed is None else assumed
     for i, view in enumerate(views):
         (pixels, camera), c2w = read(view, size, black, straighten, assumed), view.c2w
         if i == 0:
@@ -39,24 +60,24 @@ def load(views: list[View], size: int | None = None, black: bool = False, assume
             raise MiNtfError(f"{view.image}: is {pixels.shape[1]}x{pixels.shape[0]}, {views[0].image} is "
                              f"{stored.shape[2]}x{stored.shape[1]}; all photographs of a split have one size: scale or "
                              "crop them")
-        stored = _held(stored, i, _fitting(pixels))
+        stored = _widened(stored, i, _fitting(pixels))
         stored[i] = pixels if pixels.dtype == stored.dtype or pixels.dtype != np.uint8 else images.linear(pixels)
         intrinsics.append((camera.fx, camera.fy, camera.cx, camera.cy))
         poses.append(c2w)
     numbers = np.array(intrinsics, dtype=np.float64)
-    return stored, np.stack(poses), numbers[:, :2], numbers[:, 2:]
+    return Photographs(stored, np.stack(poses), numbers[:, :2], numbers[:, 2:])
 
 
 def _fitting(pixels: np.ndarray) -> np.dtype:
-    """The smallest type that holds a photograph."""
+    """Return the smallest type that holds a photograph."""
     if pixels.dtype == np.uint8:
         return np.dtype(np.uint8)
     brightest = max(float(pixels[..., :3].max()), -float(pixels[..., :3].min()))
     return np.dtype(np.float16 if brightest == 0 or HALF[0] < brightest <= HALF[1] else np.float32)
 
 
-def _held(stored: np.ndarray, count: int, dtype: np.dtype) -> np.ndarray:
-    """`stored` with the first `count` photographs kept, of `dtype` where that holds more."""
+def _widened(stored: np.ndarray, count: int, dtype: np.dtype) -> np.ndarray:
+    """Return `stored`, of which the first `count` photographs are in use, in a type that also holds `dtype`."""
     if dtype.itemsize <= stored.dtype.itemsize:
         return stored
     wider = np.empty(stored.shape, dtype)
@@ -65,11 +86,17 @@ def _held(stored: np.ndarray, count: int, dtype: np.dtype) -> np.ndarray:
     return wider
 
 
-def read(view: View, size: int | None, black: bool, straighten: lens.Straightener, assumed: Assumed | None = None
+def read(view: View, size: int | None, black: bool, straighten: lens.Straightener, assumed: Assumptions | None = None
          ) -> tuple[np.ndarray, Camera]:
-    """``(pixels (H, W, 4), camera)`` of one photograph: 8-bit levels, or float32. Raises MiNtfError."""
-    assumed = Assumed() if assumed is None else assumed
-    image, mask = _upright(view, *_stored(view, black, assumed))
+    """Return the pixels (H, W, 4) of one photograph, 8-bit levels or float32, and its camera. Raises MiNtfError."""
+    assumed = Assumptions() if assumed is None else assumed
+    image = images.decode(view.image)
+    for note in image.assumed:
+        assumed.add(note, view.image)
+    mask = None if black else _mask(view, image, assumed)
+    if view.upright:
+        alpha, mask = (None if plane is None else exif.turned(plane, view.orientation) for plane in (image.alpha, mask))
+        image = image._replace(rgb=exif.turned(image.rgb, view.orientation), alpha=alpha)
     height, width = image.rgb.shape[:2]
     camera = _camera(view, width, height)
     target, whole = lens.shrunk(width, height, size), image.rgb.dtype == np.uint8
@@ -78,7 +105,7 @@ def read(view: View, size: int | None, black: bool, straighten: lens.Straightene
         pixels = images.as_levels(image, mask)
     else:
         pixels = images.as_linear(image, mask)
-        del image, mask  # of 12 megapixels each copy counts
+        del image, mask  # each copy of 12 megapixels counts
         if bent:
             pixels, camera = straighten(pixels, camera, view.where)
         if target != (width, height):
@@ -90,23 +117,6 @@ def read(view: View, size: int | None, black: bool, straighten: lens.Straightene
     return pixels, camera
 
 
-def _stored(view: View, black: bool, assumed: Assumed) -> tuple[images.Decoded, np.ndarray | None]:
-    """The photograph and its mask, both as the photograph is stored."""
-    image = images.decode(view.image)
-    for note in image.assumed:
-        assumed.add(note, view.image)
-    return image, None if black else _mask(view, image, assumed)
-
-
-def _upright(view: View, image: images.Decoded, mask: np.ndarray | None) -> tuple[images.Decoded, np.ndarray | None]:
-    """Both as pose and camera have them."""
-    if not view.upright:
-        return image, mask
-    alpha, mask = (None if plane is None else exif.turned(plane, view.orientation)
-                   for plane in (image.alpha, mask))
-    return image._replace(rgb=exif.turned(image.rgb, view.orientation), alpha=alpha), mask
-
-
 def _as_levels(pixels: np.ndarray) -> np.ndarray:
     stored = np.empty(pixels.shape, np.uint8)
     for rows in images.strips(pixels):
@@ -114,8 +124,8 @@ def _as_levels(pixels: np.ndarray) -> np.ndarray:
     return stored
 
 
-def _mask(view: View, image: images.Decoded, assumed: Assumed) -> np.ndarray | None:
-    """The mask that is the photograph's alpha, as the photograph is stored; None where that has its own.
+def _mask(view: View, image: images.Decoded, assumed: Assumptions) -> np.ndarray | None:
+    """Return the mask that replaces the photograph's alpha, as the photograph is stored; None if its own alpha stays.
 
     Training must know which pixels show the object, so a photograph with neither is an error.
     """
@@ -130,7 +140,7 @@ def _mask(view: View, image: images.Decoded, assumed: Assumed) -> np.ndarray | N
                          "if all were taken with a flash in a dark room, say --background black")
     mask, note = masks.read(place)
     assumed.add(note, view.image)
-    mask = exif.turned(mask, exif.UNDONE[view.orientation]) if view.mask_upright else mask
+    mask = exif.turned(mask, exif.INVERSE[view.orientation]) if view.mask_upright else mask
     if mask.shape != image.rgb.shape[:2]:
         raise MiNtfError(f"{place}: is {mask.shape[1]}x{mask.shape[0]}, its photograph {view.image} is "
                          f"{image.rgb.shape[1]}x{image.rgb.shape[0]}; a mask has the size of its photograph")
@@ -138,17 +148,17 @@ def _mask(view: View, image: images.Decoded, assumed: Assumed) -> np.ndarray | N
 
 
 def _camera(view: View, width: int, height: int) -> Camera:
-    """The camera of the photograph's `width` and `height` in pixels."""
+    """Return the camera of the photograph, which is `width` by `height` pixels large."""
     camera = view.camera
     if not isinstance(camera, Camera):
         focal = focal_length(camera, width)
         camera = Camera(focal, focal, 0.5 * width, 0.5 * height)
     if view.size is not None and view.size != (width, height):
-        told = f"{view.image}: is {width}x{height}, {view.where} says {view.size[0]}x{view.size[1]}"
+        sizes = f"{view.image}: is {width}x{height}, {view.where} says {view.size[0]}x{view.size[1]}"
         if not view.rescaled:
-            raise MiNtfError(f"{told}; photograph and camera must belong together: scale one of them")
-        if abs(width * view.size[1] / (height * view.size[0]) - 1) > 0.02:  # 1 pixel of 50 that rounding took
-            raise MiNtfError(f"{told}; photographs may be scaled, in the same proportion: put the whole ones there")
+            raise MiNtfError(f"{sizes}; photograph and camera must belong together: scale one of them")
+        if abs(width * view.size[1] / (height * view.size[0]) - 1) > 0.02:  # rounding loses at most 1 pixel of 50
+            raise MiNtfError(f"{sizes}; photographs may be scaled, in the same proportion: put the whole ones there")
         camera = lens.rescaled(camera, view.size, (width, height))
     if not (0 < camera.cx < width and 0 < camera.cy < height):
         raise MiNtfError(f"{view.where}: its principal point is ({camera.cx:g}, {camera.cy:g}), outside the image "

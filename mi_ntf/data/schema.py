@@ -1,7 +1,7 @@
-"""Data sets: what is in memory (`Split`), our own format on disk, and the pinhole camera.
+"""Data sets: a set in memory (`Split`), the format of `mi-ntf capture` on disk, and the pinhole camera.
 
-A data set of `mi-ntf capture` is a folder with one `transforms_<split>.json` a split (train, val, test), in the
-NeRF-synthetic/Blender convention, and per frame the light that took part:
+A data set of `mi-ntf capture` is a folder with one `transforms_<split>.json` for each split (train, val, test). It
+follows the NeRF-synthetic/Blender convention, and each frame has its light:
 
     {"camera_angle_x": 0.63, "w": 128, "h": 128,                  horizontal field of view (radians), size (pixels)
      "unit_sphere": {"center": [x, y, z], "radius": r},           field = (world - center) / radius, object inside 1
@@ -10,9 +10,9 @@ NeRF-synthetic/Blender convention, and per frame the light that took part:
                  "pl_pos": [x, y, z],                             point light, world units
                  "pl_intensity": [r, g, b]}, ...]}                radiant intensity, W/sr, linear RGB
 
-Images are linear RGBA radiance with alpha premultiplied, as a renderer with a box filter writes them (background 0), in
-EXR. Lengths are those of the captured world. What else is read, and how: `readers`. NumPy only: training reads data
-where no renderer is installed.
+Images are EXR files of linear RGBA radiance with premultiplied alpha, as a renderer with a box filter writes them
+(background 0). Lengths are those of the captured world. `readers` lists the other forms. This module uses NumPy alone,
+so that training reads data where no renderer is installed.
 """
 
 import hashlib
@@ -24,9 +24,10 @@ from pathlib import Path
 import numpy as np
 
 from mi_ntf.core import files
-from mi_ntf.data.images import read_image, write_exr
+from mi_ntf.data.exr import write_exr
+from mi_ntf.data.images import read_image
 
-__all__ = ["SPLITS", "Camera", "Found", "Frame", "Split", "Transforms", "View", "fingerprint", "focal_length",
+__all__ = ["SPLITS", "Camera", "DataSet", "Frame", "Split", "Transforms", "View", "fingerprint", "focal_length",
            "mitsuba_to_opengl", "pixel_rays", "read_image", "write_exr", "write_transforms"]
 
 SPLITS = ("train", "val", "test")
@@ -34,7 +35,7 @@ SPLITS = ("train", "val", "test")
 
 @dataclass(frozen=True)
 class Frame:
-    """Frame of a photograph to be written: its file, and the places of camera and light (world units)."""
+    """Frame of a photograph to be written: its file, and the places of camera and light in world units."""
 
     file: str
     c2w: np.ndarray
@@ -56,89 +57,65 @@ class Transforms:
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole, and the lens before it. Pixels; (0, 0) is the corner of the top left pixel."""
+    """Pinhole camera with a lens, in pixels; (0, 0) is the corner of the top left pixel."""
 
     fx: float
     fy: float
     cx: float
     cy: float
-    distortion: tuple[float, ...] = ()
-    """OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]]; none: straight."""
+    distortion: tuple[float, ...] = ()  # OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]]; empty: a straight picture
 
 
 @dataclass(frozen=True)
 class View:
-    """Photograph as a reader found it, pixels not yet read. `None`: the data set does not say."""
+    """Photograph as a data set describes it, before its pixels are read. None means that the data set does not say."""
 
-    where: str
-    """File and frame, for messages."""
+    where: str  # file and frame, for messages
     image: Path
-    name: str
-    """The photograph's file as the data set calls it: by that its mask is found."""
-    masks: list[Path]
-    """Where its mask may lie."""
-    c2w: np.ndarray
-    """(4, 4) camera-to-world, OpenGL axes."""
-    camera: Camera | float
-    """A number: the horizontal field of view in radians, of square pixels and a centred camera."""
-    size: tuple[int, int] | None = None
-    """(width, height) in pixels."""
+    name: str  # the photograph's file as the data set calls it; its mask has the same name
+    masks: list[Path]  # possible places of the mask
+    c2w: np.ndarray  # (4, 4) camera-to-world, OpenGL axes
+    camera: Camera | float  # a number is the horizontal field of view in radians of a centred camera
+    size: tuple[int, int] | None = None  # (width, height) in pixels
     light_pos: np.ndarray | None = None
     light_intensity: np.ndarray | None = None
-    mask_first: bool = False
-    """The mask is the alpha, whatever the image has."""
-    rescaled: bool = False
-    """The photograph may be a copy of another size than `size`; `camera` is that of `size`."""
-    orientation: int = 1
-    """The file's Exif orientation, 1 to 8."""
-    upright: bool = False
-    """Pose and camera are those of the photograph turned by `orientation`."""
-    mask_upright: bool = False
-    """The mask is that of the photograph turned by `orientation`."""
+    mask_first: bool = False  # the mask replaces the image's own alpha
+    rescaled: bool = False  # the photograph may have another size than `size`, which is that of `camera`
+    orientation: int = 1  # the file's Exif orientation, 1 to 8
+    upright: bool = False  # pose and camera are those of the photograph turned by `orientation`
+    mask_upright: bool = False  # the mask is that of the photograph turned by `orientation`
 
 
 @dataclass(frozen=True)
-class Found:
-    """Data set that a reader found in a folder, pixels not yet read. World units; `sphere` is (center (3,), radius)."""
+class DataSet:
+    """Data set as its files describe it, before any pixel is read, in world units."""
 
-    form: str
-    """What the data set is and where it lies, for messages."""
-    views: dict[str, list[View]]
-    sphere: tuple[np.ndarray, float] | None = None
-    points: np.ndarray | None = None
-    """(P, 3) reconstructed points."""
+    form: str  # name of the form, for messages
+    views: dict[str, list[View]]  # by split
+    sphere: tuple[np.ndarray, float] | None = None  # center (3,) and radius of the object's sphere
+    points: np.ndarray | None = None  # (P, 3) reconstructed points
     notes: list[str] = field(default_factory=list)
-    assumed: list[str] = field(default_factory=list)
-    """What was assumed where the data set could mean something else, a sentence each."""
+    assumed: list[str] = field(default_factory=list)  # assumptions about ambiguous files, a sentence each
 
 
 @dataclass(frozen=True)
 class Split:
-    """A split in memory. N frames of H x W pixels; float32 unless noted.
+    """Split in memory: N frames of H x W pixels, float32 unless noted, and the similarity that all splits share."""
 
-    images (N, H, W, 4) RGBA as they are stored, which :func:`mi_ntf.data.images.linear` makes linear premultiplied
-    float32: 8-bit levels, or float16 or float32 · c2w (N, 4, 4) float64, OpenGL axes · focal (N, 2) fx, fy and
-    principal (N, 2) cx, cy in pixels from the top left corner, float64 · light_pos (N, 3) world ·
-    light_intensity (N, 3) · center (3,) and radius: field = (world - center) / radius.
-    """
-
-    images: np.ndarray
-    c2w: np.ndarray
-    focal: np.ndarray
-    principal: np.ndarray
-    light_pos: np.ndarray
-    light_intensity: np.ndarray
-    center: np.ndarray
+    images: np.ndarray  # (N, H, W, 4) RGBA as stored: 8-bit levels, float16 or float32; `images.linear` makes it linear
+    c2w: np.ndarray  # (N, 4, 4) float64, OpenGL axes
+    focal: np.ndarray  # (N, 2) fx and fy in pixels, float64
+    principal: np.ndarray  # (N, 2) cx and cy in pixels from the top left corner, float64
+    light_pos: np.ndarray  # (N, 3) world units
+    light_intensity: np.ndarray  # (N, 3) W/sr
+    center: np.ndarray  # (3,); field = (world - center) / radius
     radius: float
-    names: tuple[str, ...] = ()
-    """The photographs' files, for messages."""
+    names: tuple[str, ...] = ()  # the photographs' files, for messages
     masked: bool = True
-    """Alpha is the object's share of the pixel; if not, the background is black, and alpha says what is known: 1
-    matter, 0 none, all between unknown."""
-    calibrated: bool = True
-    """The lights' intensities were given; if not, they are estimated, alike for all photographs."""
-    located: bool = True
-    """The lights' places were given; if not, they are the lenses'."""
+    """True: alpha is the object's fraction of the pixel. False: the background is black, and alpha is 1 for matter, 0
+    for empty space, and between them where neither is known."""
+    calibrated: bool = True  # the lights' intensities come from the data set; else one estimate serves all photographs
+    located: bool = True  # the lights' places come from the data set; else they are the lenses'
 
 
 def write_transforms(folder: Path, split: str, transforms: Transforms) -> Path:
@@ -155,31 +132,32 @@ def write_transforms(folder: Path, split: str, transforms: Transforms) -> Path:
 
 
 def fingerprint(splits: dict[str, Split]) -> dict[str, str]:
-    """Hashes of all that `splits` hold, by what it is: tells changed data from the same ones, in whatever files."""
+    """Return hashes of the content of `splits` by its kind, independent of the files that it comes from."""
     parts = {"photographs or masks": ("images", "masked"), "cameras": ("c2w", "focal", "principal"),
              "lights": ("light_pos", "light_intensity"), "the object's sphere": ("center", "radius")}
-    found = {}
-    for what, names in parts.items():
+    hashes = {}
+    for kind, names in parts.items():
         digest = hashlib.sha256()
         for split, name in itertools.product(sorted(splits), names):
             value = np.ascontiguousarray(getattr(splits[split], name))
             digest.update(f"{split} {name} {value.dtype} {value.shape}".encode())
             digest.update(value.data)
-        found[what] = digest.hexdigest()
-    return found
+        hashes[kind] = digest.hexdigest()
+    return hashes
 
 
 def focal_length(angle_x: float, w: float) -> float:
-    """Focal length in pixels of a camera `w` pixels wide with horizontal field of view `angle_x` (radians)."""
+    """Return the focal length in pixels of a camera `w` pixels wide with horizontal field of view `angle_x` (rad)."""
     return float(0.5 * w / np.tan(0.5 * angle_x))
 
 
-def pixel_rays(c2w: np.ndarray, focal, w: int, h: int, principal=None) -> tuple[np.ndarray, np.ndarray]:
-    """Rays through the pixel centres: origins and unit directions, both (..., h, w, 3), world.
+def pixel_rays(c2w: np.ndarray, focal: "float | np.ndarray", w: int, h: int, principal: np.ndarray | None = None
+               ) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rays through the pixel centres: origins and unit directions, both (..., h, w, 3), in world axes.
 
-    c2w (..., 4, 4) OpenGL camera-to-world; focal in pixels, one number or (..., 2) for x and y; principal point
-    (..., 2) in pixels from the top left corner, the middle of the image unless given. Row 0 is the top row, column 0
-    the left one. Source: the pinhole model of NeRF's `get_rays`.
+    `c2w` (..., 4, 4) are OpenGL camera-to-world matrices. `focal` is in pixels, one number or (..., 2) for x and y. The
+    `principal` point (..., 2) is in pixels from the top left corner; the default is the middle of the image. Row 0 is
+    the top row, column 0 the left one. Source: the pinhole model of NeRF's `get_rays`.
     """
     focal = np.asarray(focal, dtype=np.float64)
     focal = np.stack([focal, focal], -1) if focal.ndim == 0 else focal
@@ -193,8 +171,9 @@ def pixel_rays(c2w: np.ndarray, focal, w: int, h: int, principal=None) -> tuple[
 
 
 def mitsuba_to_opengl(to_world: np.ndarray) -> np.ndarray:
-    """OpenGL camera-to-world (+X right, looks down -Z) of a Mitsuba sensor's `to_world` (+X left, looks along +Z).
+    """Return the OpenGL camera-to-world (..., 4, 4) of a Mitsuba sensor's `to_world` (+X left, looks along +Z).
 
-    Flips the camera's X and Z axes, (..., 4, 4) -> (..., 4, 4); the flip is its own inverse, so it also leads back.
+    The function flips the camera's X and Z axes, and it is its own inverse.
     """
-    return np.asarray(to_world, dtype=np.float64) * np.array([-1.0, 1.0, -1.0, 1.0])
+    flipped: np.ndarray = np.asarray(to_world, dtype=np.float64) * np.array([-1.0, 1.0, -1.0, 1.0])
+    return flipped

@@ -1,8 +1,8 @@
-"""Whether masks and poses agree: what each mask shows, the visual hull of all other masks must cover.
+"""Agreement of masks and poses: the visual hull of all masks but one must cover the silhouette in that mask.
 
-The hull of all photographs but k is every cell that none of them shows empty. A pixel of mask k that no such cell
-covers tells that this mask is too large there, or another one too small, or a pose wrong. Cells count with their whole
-extent and pixels are pooled, both such that only real disagreement shows.
+The hull of all photographs but k consists of the cells that none of them shows empty. If no such cell covers a pixel of
+mask k, this mask is too large there, or another one too small, or a pose wrong. Cells count with their whole extent,
+and pixels are pooled, so that only real disagreement shows.
 """
 
 from collections.abc import Sequence
@@ -10,34 +10,33 @@ from typing import NamedTuple
 
 import numpy as np
 
-CELLS = 28
-"""Cells along an edge of the cube around the object, before they are split."""
-SPLITS = 2
-"""Cells are halved so often: at last one is a 56th of the object's sphere's radius wide."""
-PIXELS = 384
-"""Masks are pooled to so many pixels a side, at most."""
-VIEWS = 60
-"""So many photographs are compared, at most."""
+from mi_ntf.data.poses import Footprint, footprint
+
+CELLS = 28  # along an edge of the cube around the object, before they are split
+SPLITS = 2  # halvings of cells: a cell of the last level is 1/56 of the radius of the object's sphere wide
+PIXELS = 384  # largest side of pooled masks
+VIEWS = 60  # largest number of photographs that are compared
 
 
 class Outline(NamedTuple):
-    """One photograph's silhouette."""
+    """Silhouette of one photograph, with its pose (4, 4) and its focal lengths and principal point (2,) in pixels."""
 
-    maybe: np.ndarray
-    """(H, W) bool: may show the object."""
-    surely: np.ndarray
-    """(H, W) bool: shows it."""
+    maybe: np.ndarray  # (H, W) bool: the pixel may show the object
+    surely: np.ndarray  # (H, W) bool: the pixel shows it
     c2w: np.ndarray
-    """(4, 4) OpenGL camera-to-world."""
     focal: np.ndarray
     principal: np.ndarray
-    """(2,) each, pixels."""
+
+    def footprint(self, cells: np.ndarray, edge: float) -> Footprint:
+        """Return the windows of pixels on which the cells (K, 3) may fall."""
+        return footprint(cells, edge, self.c2w, self.focal, self.principal, (self.maybe.shape[1], self.maybe.shape[0]))
 
 
 def disagreement(outlines: Sequence[Outline], center: np.ndarray, radius: float) -> np.ndarray:
-    """Share of each mask's pixels (N,) that the hull of all others does not cover; NaN where it shows nothing.
+    """Return the fraction of each mask's pixels (N,) that the hull of all others does not cover.
 
-    `center` (3,), `radius`: the object's sphere, world units. Where the others leave no cell at all the share is 1.
+    It is NaN for masks that show nothing, and 1 where the others leave no cell at all. `center` (3,) and `radius` are
+    those of the object's sphere in world units.
     """
     small = [_pooled(outline) for outline in outlines]
     edge = 2 * radius / CELLS
@@ -48,9 +47,9 @@ def disagreement(outlines: Sequence[Outline], center: np.ndarray, radius: float)
     for level in range(1 + SPLITS):
         if level:
             cells, edge = (cells[:, None] + edge * corners).reshape(-1, 3), edge / 2
-        empty, full = (np.stack(kind) for kind in zip(*(_seen(o, cells, edge) for o in small), strict=True))
+        empty, full = (np.stack(kind) for kind in zip(*(_classify(o, cells, edge) for o in small), strict=True))
         inner.append((cells[full.all(0)], edge))
-        near = (empty.sum(0, dtype=np.int32) < 2) & ~full.all(0)  # where two see nothing, any hull is empty
+        near = (empty.sum(0, dtype=np.int32) < 2) & ~full.all(0)  # two empty views leave nothing of any hull
         cells, empty = cells[near], empty[:, near]
     objectors = empty.sum(0, dtype=np.int32)
     return np.array([_uncovered(outline, [*inner, (cells[objectors == empty[k]], edge)])
@@ -58,12 +57,12 @@ def disagreement(outlines: Sequence[Outline], center: np.ndarray, radius: float)
 
 
 def chosen(count: int) -> np.ndarray:
-    """Which of `count` photographs are compared: evenly spaced."""
+    """Return the evenly spaced indices of the photographs, of `count`, that are compared."""
     return np.unique(np.linspace(0, count - 1, min(count, VIEWS)).round().astype(int))
 
 
 def _pooled(outline: Outline) -> Outline:
-    """The outline in larger pixels, of which `maybe` grows and `surely` shrinks."""
+    """Return the outline in larger pixels: `maybe` grows and `surely` shrinks."""
     height, width = outline.maybe.shape
     step = -(-max(height, width) // PIXELS)
     room = ((0, -height % step), (0, -width % step))
@@ -76,45 +75,29 @@ def _pooled(outline: Outline) -> Outline:
                    outline.focal / step, outline.principal / step)
 
 
-def _windows(outline: Outline, cells: np.ndarray, edge: float) -> tuple[np.ndarray, ...]:
-    """The pixels that each cell (K, 3) may fall on, columns u0 to u1 and rows v0 to v1 (ends left out; none behind the
-    camera), and whether its middle is in the image."""
-    height, width = outline.maybe.shape
-    local = (cells - outline.c2w[:3, 3]) @ outline.c2w[:3, :3]
-    depth = -local[:, 2]
-    front = depth > edge
-    safe = np.where(front, depth, 1.0)
-    u = outline.principal[0] + outline.focal[0] * local[:, 0] / safe
-    v = outline.principal[1] - outline.focal[1] * local[:, 1] / safe
-    slant = np.linalg.norm(local, axis=1) / safe  # lengths along the ray move the pixel too, off the axis
-    reach = slant * np.sqrt(3) / 2 * edge * outline.focal.max() / np.maximum(safe - edge, edge)
-    inside = front & (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    u0, u1 = (np.clip(np.floor(u + s * reach) + (s > 0), 0, width).astype(np.int32) for s in (-1, 1))
-    v0, v1 = (np.clip(np.floor(v + s * reach) + (s > 0), 0, height).astype(np.int32) for s in (-1, 1))
-    u1 = np.where(front, u1, u0)
-    return u0, u1, v0, v1, inside
+def _classify(outline: Outline, cells: np.ndarray, edge: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return which cells (K,) the photograph shows empty, and which full.
 
-
-def _seen(outline: Outline, cells: np.ndarray, edge: float) -> tuple[np.ndarray, np.ndarray]:
-    """Which cells (K,) the photograph shows empty, their middle in the image and no pixel that may show the object, and
-    which are full, all their pixels such ones: so are then all parts of them."""
-    u0, u1, v0, v1, inside = _windows(outline, cells, edge)
-    sums = np.pad(outline.maybe.astype(np.int32).cumsum(0).cumsum(1), ((1, 0), (1, 0)))
-    found = sums[v1, u1] - sums[v0, u1] - sums[v1, u0] + sums[v0, u0]
-    return inside & (found == 0), found == (u1 - u0) * (v1 - v0)
+    The centre of an empty cell is in the image, and none of its pixels may show the object; all pixels of a full cell
+    may, so the same holds for its parts.
+    """
+    window = outline.footprint(cells, edge)
+    pixels = window.pixels(outline.maybe)
+    area = (window.right - window.left) * (window.bottom - window.top)
+    return window.inside & (pixels == 0), pixels == area
 
 
 def _uncovered(outline: Outline, groups: list[tuple[np.ndarray, float]]) -> float:
-    """Share of the pixels that surely show the object and that no cell of the `groups` (cells, edge) falls on."""
+    """Return the fraction of the surely covered pixels on which no cell of the `groups` (cells, edge) falls."""
     total = np.count_nonzero(outline.surely)
     if not total:
         return float("nan")
     height, width = outline.maybe.shape
     row = width + 1
-    change = np.zeros((height + 1) * row)  # summed up: how many cells fall on a pixel
+    change = np.zeros((height + 1) * row)  # its sums are the number of cells on each pixel
     for cells, edge in groups:
-        u0, u1, v0, v1, _ = _windows(outline, cells, edge)
-        u0, u1, v0, v1 = (side[(u1 > u0) & (v1 > v0)] for side in (u0, u1, v0, v1))
+        window = outline.footprint(cells, edge)
+        u0, u1, v0, v1 = (side[(window.right > window.left) & (window.bottom > window.top)] for side in window[:4])
         corners = np.concatenate([v0 * row + u0, v1 * row + u1, v0 * row + u1, v1 * row + u0])
         change += np.bincount(corners, np.repeat([1.0, 1.0, -1.0, -1.0], len(u0)), len(change))
     covered = change.reshape(height + 1, row).cumsum(0).cumsum(1)[:-1, :-1] > 0.5

@@ -8,8 +8,8 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 from train import two_spheres
 
-from mi_ntf.data import bounds, schema
-from mi_ntf.data.capture import view_directions
+from mi_ntf.data import estimates, schema
+from mi_ntf.data.poses import view_directions
 
 SIZE, ANGLE, VIEWS = 24, 0.62, 16
 FOCAL = schema.focal_length(ANGLE, SIZE)
@@ -28,7 +28,7 @@ def true_bounds() -> tuple[np.ndarray, float]:
     """The smallest sphere around two spheres: on the line through their centres."""
     (a, r), (b, s) = SPHERES
     along = (b - a) / np.linalg.norm(b - a)
-    return bounds.bounding_sphere(np.stack([a - r * along, b + s * along]))
+    return estimates.bounding_sphere(np.stack([a - r * along, b + s * along]))
 
 
 def straight_srgb(picture: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from mi_ntf.core.errors import MiNtfError
-from mi_ntf.data import images
+from mi_ntf.data import exr, images
 
 cv2 = pytest.importorskip("cv2", reason="TIFF needs OpenCV: pip install 'mi-ntf[train]'")
 
@@ -84,7 +84,7 @@ def test_without_opencv_the_extra_is_named(monkeypatch, tmp_path):
 
 
 def test_sizes_by_the_head_alone(tmp_path):
-    images.write_exr(tmp_path / "a.exr", np.zeros((4, 6, 4)))
+    exr.write_exr(tmp_path / "a.exr", np.zeros((4, 6, 4)))
     Image.new("RGB", (7, 3)).save(tmp_path / "a.jpg")
     cv2.imwrite(str(tmp_path / "a.tif"), np.zeros((2, 5, 3), np.float32))  # Pillow does not know these
     assert [images.size_of(tmp_path / f"a.{s}") for s in ("exr", "jpg", "tif", "png")] == [(6, 4), (7, 3), None, None]
@@ -93,7 +93,7 @@ def test_sizes_by_the_head_alone(tmp_path):
 def test_files_that_cannot_be_read(tmp_path):
     pixels = np.zeros((4, 6, 4), np.float32)
     pixels[1, 2, 0], pixels[3, 3, 3] = np.nan, np.inf
-    images.write_exr(tmp_path / "1.exr", pixels)
+    exr.write_exr(tmp_path / "1.exr", pixels)
     with pytest.raises(MiNtfError, match=r"1.exr: 2 pixels are NaN or infinite .half .*; write it with 32 bits"):
         images.read_image(tmp_path / "1.exr")
     (tmp_path / "1.exr").write_bytes(b"no image")
@@ -116,9 +116,9 @@ def test_files_that_cannot_be_read(tmp_path):
 def test_bright_pixels_keep_their_value(tmp_path):
     """Half precision where it holds the image: it is half as large; single where it would write infinity."""
     pixels = np.full((2, 2, 4), 0.5, np.float32)
-    images.write_exr(tmp_path / "dim.exr", pixels)
+    exr.write_exr(tmp_path / "dim.exr", pixels)
     pixels[0, 0, 1] = 1e6
-    images.write_exr(tmp_path / "bright.exr", pixels)
+    exr.write_exr(tmp_path / "bright.exr", pixels)
     np.testing.assert_array_equal(images.read_image(tmp_path / "bright.exr"), pixels)
     for name, dtype in (("dim", np.float16), ("bright", np.float32)):
         with OpenEXR.File(str(tmp_path / f"{name}.exr")) as file:

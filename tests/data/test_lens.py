@@ -125,7 +125,7 @@ def test_masks_go_through_the_lens_alike_and_leave_no_empty_border(tmp_path):
 def test_the_picture_shows_all_that_it_can(bent):
     """Every pixel comes from the photograph; by a focal length a thousandth shorter some would not."""
     camera = Camera(F, 1.1 * F, CX, CY, bent)
-    pinhole = lens.straight(camera, (WIDTH, HEIGHT), "here")
+    pinhole = lens.straight(camera, (WIDTH, HEIGHT))
     border = np.array([(u, v) for u in np.arange(WIDTH) + 0.5 for v in (0.5, HEIGHT - 0.5)]
                       + [(u, v) for u in (0.5, WIDTH - 0.5) for v in np.arange(HEIGHT) + 0.5])
 

@@ -31,10 +31,10 @@ def write(folder: Path, tags=(1,), poses: str = "stored", masks: str = "stored",
         tag, seen = tags[i % len(tags)], forms.straight_srgb(pictures[i])
         if i in portraits:
             seen, c2w = np.rot90(seen, -1), c2w @ ROLL
-        stored = exif.turned(seen, exif.UNDONE[tag]) if poses == "upright" else seen
+        stored = exif.turned(seen, exif.INVERSE[tag]) if poses == "upright" else seen
         mask = exif.turned(stored, tag) if masks == "upright" else stored
         tag_of = Image.Exif()
-        tag_of[exif.TAG] = tag
+        tag_of[exif.ORIENTATION] = tag
         Image.fromarray(np.ascontiguousarray(stored[..., :3])).save(folder / f"images/{i:03d}.png", exif=tag_of)
         Image.fromarray(np.ascontiguousarray(mask[..., 3])).save(folder / f"masks/{i:03d}.png")
         height, width = seen.shape[:2]
@@ -64,14 +64,14 @@ def check(splits, pictures=LANDSCAPES) -> None:
 def test_pixels_are_turned_as_pillow_turns_them(tmp_path, tag):
     pixels = np.random.default_rng(0).integers(0, 256, (3, 5, 3)).astype(np.uint8)
     tag_of = Image.Exif()
-    tag_of[exif.TAG] = tag
+    tag_of[exif.ORIENTATION] = tag
     for name in ("a.png", "a.tif"):
         Image.fromarray(pixels).save(tmp_path / name, exif=tag_of)
-        assert exif.head(tmp_path / name) == (tag, (5, 3), False) and images.size_of(tmp_path / name) == (5, 3)
+        assert exif.read_header(tmp_path / name) == (tag, (5, 3), False) and images.size_of(tmp_path / name) == (5, 3)
     with Image.open(tmp_path / "a.png") as image:
         expected = np.asarray(ImageOps.exif_transpose(image))
     np.testing.assert_array_equal(exif.turned(pixels, tag), expected)
-    np.testing.assert_array_equal(exif.turned(expected, exif.UNDONE[tag]), pixels)
+    np.testing.assert_array_equal(exif.turned(expected, exif.INVERSE[tag]), pixels)
     np.testing.assert_array_equal(images.decode(tmp_path / "a.png").rgb, pixels)
     for read in (images.decode, masks.read) if tag > 1 else ():
         with pytest.raises(MiNtfError, match=rf"a.tif: TIFF of 8 bits with Exif orientation {tag} is not read; take"):
@@ -101,7 +101,7 @@ def test_masks_of_which_nothing_tells_are_refused(tmp_path, tag, pictures):
         load_dataset(tmp_path, lambda _: None)
     for path in (tmp_path / "masks").iterdir():  # a mask with the same tag lies as its photograph
         tag_of = Image.Exif()
-        tag_of[exif.TAG] = tag
+        tag_of[exif.ORIENTATION] = tag
         Image.open(path).copy().save(path, exif=tag_of)
     check(load_dataset(tmp_path, lambda _: None), pictures)
 

@@ -5,7 +5,7 @@ import pytest
 from data import forms
 
 from mi_ntf.core.errors import MiNtfError
-from mi_ntf.data import bounds, light, poses
+from mi_ntf.data import estimates, poses
 
 N = forms.VIEWS
 FOCAL, MIDDLE = np.full((N, 2), forms.FOCAL), np.full((N, 2), forms.SIZE / 2)
@@ -25,33 +25,33 @@ def test_masks_that_are_off_centre_and_cut(tmp_path):
     move = np.array([30.0, -7.0, 4.0])
     c2w = forms.C2W.copy()
     c2w[:, :3, 3] += move
-    there = bounds.find(PICTURES[:, :, 7:], c2w, FOCAL, MIDDLE - (7, 0), None)
-    here = bounds.find(PICTURES, forms.C2W, FOCAL, MIDDLE, None)
-    assert here[2] == there[2] == "from the masks' visual hull"
-    for (center, radius, _), offset in ((here, 0), (there, move)):
+    there = estimates.find_sphere(PICTURES[:, :, 7:], c2w, FOCAL, MIDDLE - (7, 0), None)
+    here = estimates.find_sphere(PICTURES, forms.C2W, FOCAL, MIDDLE, None)
+    assert here[1] == there[1] == "from the masks' visual hull"
+    for ((center, radius), _), offset in ((here, 0), (there, move)):
         for c, r in forms.SPHERES:
             assert np.linalg.norm(c + offset - center) + r <= radius
         assert radius < 1.2 * forms.true_bounds()[1]  # 24 pixels and 16 views leave that much
 
 
 def test_points_without_masks():
-    center, radius, how = bounds.find(OPAQUE, forms.C2W, FOCAL, MIDDLE, forms.surface_points())
-    assert how == "from the reconstructed points"
+    (center, radius), source = estimates.find_sphere(OPAQUE, forms.C2W, FOCAL, MIDDLE, forms.surface_points())
+    assert source == "from the reconstructed points"
     true_center, true_radius = forms.true_bounds()
     # a tenth of the points are outliers 40 times as far; the median of the rest lies within the object
     assert np.linalg.norm(center - true_center) < 0.5 * true_radius and 0.8 < radius / true_radius < 1.5
 
 
 def test_cameras_alone():
-    center, radius, how = bounds.find(OPAQUE, forms.C2W, FOCAL, MIDDLE, None)
+    (center, radius), source = estimates.find_sphere(OPAQUE, forms.C2W, FOCAL, MIDDLE, None)
     np.testing.assert_allclose(center, 0, atol=1e-12)  # all look at the origin from 3.2
-    assert radius == pytest.approx(3.2 * np.sin(forms.ANGLE / 2)) and "from the cameras alone" in how
+    assert radius == pytest.approx(3.2 * np.sin(forms.ANGLE / 2)) and "from the cameras alone" in source
 
 
 @pytest.mark.parametrize("pictures", [PICTURES, OPAQUE])
 def test_parallel_cameras_do_not_tell_where_the_object_is(pictures):
     with pytest.raises(MiNtfError, match=r"all 16 cameras look in one direction, .*write 'unit_sphere'"):
-        bounds.find(np.repeat(pictures[:1], N, 0), np.repeat(forms.C2W[:1], N, 0), FOCAL, MIDDLE, None)
+        estimates.find_sphere(np.repeat(pictures[:1], N, 0), np.repeat(forms.C2W[:1], N, 0), FOCAL, MIDDLE, None)
 
 
 def test_intensity_of_a_facing_wall_in_closed_form():
@@ -63,6 +63,6 @@ def test_intensity_of_a_facing_wall_in_closed_form():
     images[:, 8] = 0
     images[:, 0, 1:5] = images[:, 1, 1:5]
     lights = np.array([[0, 0, 3.0], [3.0, 0, 0]])
-    assert light.estimate(images, lights, np.zeros(3), 1.0) == pytest.approx(7, rel=1e-6)  # float32 pixels
+    assert estimates.find_intensity(images, lights, np.zeros(3), 1.0) == pytest.approx(7, rel=1e-6)  # float32 pixels
     images[..., :3] *= 3
-    assert light.estimate(images, lights, np.zeros(3), 1.0) == pytest.approx(21, rel=1e-6)
+    assert estimates.find_intensity(images, lights, np.zeros(3), 1.0) == pytest.approx(21, rel=1e-6)
