@@ -3,11 +3,12 @@
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TypeAlias
 
 from ..core.errors import MiNtfError
 
-Tell = Callable[[float, str, bool], None]
-"""Function that is called with the seconds spent so far, what is done now, and True for a line that stays."""
+Tell: TypeAlias = Callable[[float, str, bool], None]
+"""Function of the seconds spent so far, the work that is done now, and True for a line that stays."""
 
 
 def seconds(text: str) -> float:
@@ -21,7 +22,7 @@ def seconds(text: str) -> float:
 
 @contextmanager
 def progress(budget: float, quiet: bool = False) -> Iterator[Tell]:
-    """Show on stderr how much of `budget` seconds is used and what is done, unless `quiet`."""
+    """Show the used part of `budget` seconds and the work that is done now on stderr, unless `quiet`."""
     from rich.console import Console
     from rich.markup import escape
     from rich.progress import BarColumn, Progress, TextColumn

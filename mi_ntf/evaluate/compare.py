@@ -1,4 +1,4 @@
-"""`mi-ntf compare IMAGE REFERENCE`: read two images, measure, print."""
+"""The command `mi-ntf compare IMAGE REFERENCE`: read two images, measure, print."""
 
 from pathlib import Path
 
@@ -7,20 +7,24 @@ import numpy as np
 from mi_ntf.core.errors import MiNtfError
 
 from . import compare_picture, metrics, perceptual
-from .limits import METRICS
+from .limits import METRICS, Json
 
 VARIANTS = {"aligned": "aligned", "masked": "object", "masked_aligned": "object, aligned"}
-"""Beside the raw figures: name and title."""
+"""Names and titles of the figures besides the raw ones."""
 INSIDE = 0.5
-"""Pixels of the reference with more alpha than this are the object."""
+"""Alpha of the reference above which a pixel belongs to the object."""
 
 
-def compare(image: Path, reference: Path, picture: Path | None = None) -> dict:
-    """All metrics by name, both images composited on black; see :func:`compare_arrays`.
+def compare(image: Path, reference: Path, picture: Path | None = None) -> Json:
+    """Return all metrics by name, both images composited on black; see :func:`compare_arrays`.
 
-    EXR is read as linear and premultiplied, its AOV layers are dropped; PNG as sRGB with straight alpha. `picture`: PNG
-    to write, see :func:`.compare_picture.draw`; its name is returned as ``picture``. Raises :class:`MiNtfError` where a
-    file is missing or unreadable, sizes differ, a pixel is not finite, or the picture cannot be written.
+    EXR files are read as linear and premultiplied, without their AOV layers; PNG files as sRGB with straight alpha.
+    `picture` is a PNG file to write, see :func:`.compare_picture.draw`; its name is returned as ``picture``.
+
+    Raises
+    ------
+    MiNtfError
+        If a file is missing or unreadable, sizes differ, a pixel is not finite, or the picture cannot be written.
     """
     if picture is not None:
         compare_picture.check(picture)
@@ -35,22 +39,22 @@ def compare(image: Path, reference: Path, picture: Path | None = None) -> dict:
 
 
 def compare_arrays(image: np.ndarray, reference: np.ndarray, alpha: np.ndarray | None = None,
-                   lpips: bool = False) -> dict:
-    """:func:`compare` for linear RGB arrays (h, w, 3), composited on black, and the reference's alpha (h, w).
+                   lpips: bool = False) -> Json:
+    """Return all metrics of linear RGB arrays (h, w, 3), composited on black, by name.
 
-    The raw figures by their names. Below ``aligned`` the same after one factor a channel, which stand there as
-    ``factors``: published comparisons of relit objects take out the scale of the albedo that way. Below ``masked`` and
-    ``masked_aligned`` those of the object's own pixels, a share ``coverage`` of the picture, where `alpha` tells the
-    object from a background. A figure that picture or machine do not allow is None, with ``reason`` and ``remedy``
-    below ``not_measured``. `lpips`: LPIPS, too, which imports PyTorch where it is installed.
+    ``aligned`` holds the same after one factor for each channel, stored as ``factors``; published comparisons of relit
+    objects remove the scale of the albedo in this way. ``masked`` and ``masked_aligned`` hold those of the object's own
+    pixels, a fraction ``coverage`` of the picture, where `alpha` of the reference (h, w) tells the object from a
+    background. A metric that picture or machine do not allow is None, with ``reason`` and ``remedy`` in
+    ``not_measured``. With `lpips`, LPIPS is measured too, which imports PyTorch where it is installed.
     """
     names = [name for name in METRICS if lpips or name != "lpips"]
     missing: dict[str, dict[str, str]] = {}
 
-    def figures(image, mask) -> dict:
+    def figures(image: np.ndarray, mask: np.ndarray | None) -> Json:
         return {name: _figure(name, image, reference, mask, missing) for name in names}
 
-    def aligned(mask) -> dict:
+    def aligned(mask: np.ndarray | None) -> Json:
         factors = metrics.alignment(image, reference, mask)
         return figures(image * factors, mask) | {"factors": [float(f) for f in factors]}
 
@@ -62,19 +66,21 @@ def compare_arrays(image: np.ndarray, reference: np.ndarray, alpha: np.ndarray |
     return result | ({"not_measured": missing} if missing else {})
 
 
-def _figure(name: str, image, reference, mask, missing: dict) -> float | None:
-    """One figure; None, with an entry in `missing`, where it cannot be measured."""
+def _figure(name: str, image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None,
+            missing: dict[str, dict[str, str]]) -> float | None:
+    """Return one metric, or None with an entry in `missing` where it cannot be measured."""
+    metric: metrics.Function = getattr(perceptual if name == "lpips" else metrics, name)
     try:
-        return getattr(perceptual if name == "lpips" else metrics, name)(image, reference, mask)
+        return metric(image, reference, mask)
     except metrics.NotMeasured as error:
         missing[name] = {"reason": error.reason, "remedy": error.remedy}
         return None
 
 
 def read_image(path: Path) -> np.ndarray:
-    """Linear premultiplied RGBA (h, w, 4), float32; alpha is 1 where the file has none.
+    """Return linear premultiplied RGBA (h, w, 4), float32; alpha is 1 where the file has none.
 
-    For errors see :func:`compare`.
+    Raises MiNtfError as :func:`compare` does.
     """
     path = Path(path)
     if not path.is_file():
@@ -90,8 +96,8 @@ def read_image(path: Path) -> np.ndarray:
     return pixels
 
 
-def print_table(result: dict) -> None:
-    """Print what :func:`compare` returned, with each metric's definition."""
+def print_table(result: Json) -> None:
+    """Print the result of :func:`compare` with the definition of each metric."""
     from rich.console import Console
     from rich.table import Table
 
@@ -101,14 +107,14 @@ def print_table(result: dict) -> None:
     for name, metric in METRICS.items():
         if name in result:
             values = [figures[name] for figures in (result, *variants.values())]
-            said = f"not measured: {missing[name]['reason']}" if name in missing else metric.definition
+            text = f"not measured: {missing[name]['reason']}" if name in missing else metric.definition
             title = ", ".join(filter(None, [metric.title, metric.unit]))
-            table.add_row(title, *("–" if v is None else f"{v:.4g}" for v in values), said)
+            table.add_row(title, *("–" if v is None else f"{v:.4g}" for v in values), text)
     console = Console()
     console.print(table)
-    for name, why in missing.items():
-        if why["remedy"]:  # never wrapped, so that commands can be copied
-            line = f"to measure {METRICS[name].title}: {why['remedy']}"
+    for name, entry in missing.items():
+        if entry["remedy"]:  # never wrapped, so that commands can be copied
+            line = f"to measure {METRICS[name].title}: {entry['remedy']}"
             console.print(line, soft_wrap=True, markup=False, highlight=False)
     for title, figures in variants.items():
         if "factors" in figures:
@@ -132,12 +138,12 @@ def _read_exr(path: Path) -> np.ndarray:
     except Exception as error:  # OpenEXR raises bare RuntimeError and ValueError
         raise MiNtfError(f"image {path} is no readable EXR ({error}); render it anew") from None
     for channels in parts:
-        for names in ("RGB", "YYY"):
-            if set(names) <= set(channels):
-                colour = [channels[c] for c in names]
+        for letters in ("RGB", "YYY"):
+            if set(letters) <= set(channels):
+                colour = [channels[c] for c in letters]
                 return np.stack([*colour, channels.get("A", np.ones_like(colour[0]))], axis=-1)
-    found = sorted({name for channels in parts for name in channels})
-    raise MiNtfError(f"image {path}: no part has the channels R, G, B or Y; found {', '.join(found)}")
+    names = sorted({name for channels in parts for name in channels})
+    raise MiNtfError(f"image {path}: no part has the channels R, G, B or Y; found {', '.join(names)}")
 
 
 def _read_png(path: Path) -> np.ndarray:

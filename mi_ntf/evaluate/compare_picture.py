@@ -1,35 +1,41 @@
-"""The picture of `mi-ntf compare`: image, reference, where they differ, and how much of it is seen."""
+"""The picture of `mi-ntf compare`: image, reference, their difference, and the visible part of it."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..core import files
 from ..core.errors import MiNtfError
 from . import metrics
+from .limits import Json
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 DPI = 110
-SHOWN = 99.5
-"""Per cent of the pixels whose difference the colours tell apart; single bright pixels would hide all others."""
+PERCENTILE = 99.5
+"""Percentile of the differences at the end of the colour scale; single bright pixels would hide all others."""
 
 
 def check(path: Path) -> None:
-    """Raise :class:`MiNtfError` for a name that is no PNG's or cannot be written to, before the work."""
+    """Raise :class:`MiNtfError` unless the file is a PNG that can be written."""
     if path.suffix.lower() != ".png":
         raise MiNtfError(f"picture {path}: unknown ending {path.suffix!r}; give .png")
     files.check(path)
 
 
-def draw(path: Path, image: np.ndarray, reference: np.ndarray, result: dict) -> None:
-    """Write a row of four panels as PNG: image and reference (linear RGB (h, w, 3), shown as sRGB, clipped), the signed
-    difference a − b, mean of channels, over the RMS of the reference, and the map of HDR-FLIP, 0 to 1.
+def draw(path: Path, image: np.ndarray, reference: np.ndarray, result: Json) -> None:
+    """Write a row of four panels as PNG: image, reference, signed difference, and the map of HDR-FLIP.
 
-    `result`: figures of the two, for the titles. Raises :class:`MiNtfError`.
+    Images are linear RGB (h, w, 3) and shown as clipped sRGB. The difference is that of :func:`difference`. The metrics
+    in `result` stand in the titles. Raises :class:`MiNtfError`.
     """
     from matplotlib.figure import Figure
 
     relative = difference(image, reference)
-    scale = round_scale(np.percentile(np.abs(relative), SHOWN))
+    scale = round_scale(np.percentile(np.abs(relative), PERCENTILE))
     height, width = relative.shape
     panel = float(np.clip(width / DPI, 3.2, 10))  # inches
     tall = float(np.clip(panel * height / width, 1.2, 10))
@@ -50,18 +56,20 @@ def draw(path: Path, image: np.ndarray, reference: np.ndarray, result: dict) -> 
 
 
 def difference(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Mean of channels of a − b over the RMS of b, (h, w): above 0 where the image is too bright."""
-    return (image - reference).mean(-1) / np.sqrt(np.mean(np.square(reference)))
+    """Return the mean of channels of a − b over the RMS of b, (h, w); positive where the image is too bright."""
+    relative: np.ndarray = (image - reference).mean(-1) / np.sqrt(np.mean(np.square(reference)))
+    return relative
 
 
 def round_scale(value: float) -> float:
-    """The next of 1, 2, 5, 10, 20 … per cent and their parts from `value` on; at least 0.1 per cent."""
+    """Return the least of 0.001, 0.002, 0.005, 0.01, 0.02 … that is not below `value`."""
     value = max(float(value), 1e-3)
     power = 10.0 ** np.floor(np.log10(value))
     return float(next(power * step for step in (1, 2, 5, 10) if power * step >= value * (1 - 1e-9)))
 
 
-def _map(figure, axes, values, title, extend, **colours) -> None:
-    drawn = axes.imshow(values, interpolation="nearest", **colours)
+def _map(figure: "Figure", axes: "Axes", values: np.ndarray, title: str, extend: str, cmap: str, vmin: float,
+         vmax: float) -> None:
+    image = axes.imshow(values, interpolation="nearest", cmap=cmap, vmin=vmin, vmax=vmax)
     axes.set_title(title)
-    figure.colorbar(drawn, ax=axes, extend=extend, fraction=0.05, pad=0.02)
+    figure.colorbar(image, ax=axes, extend=extend, fraction=0.05, pad=0.02)

@@ -1,17 +1,21 @@
 """The metrics of `mi-ntf compare` by name, and limits on them, so that scripts can judge a picture.
 
-Light to import: the command line makes its options from this table.
+This module imports little, since the command line makes its options from the table of metrics.
 """
 
-from dataclasses import asdict, dataclass, field, make_dataclass
-from typing import Annotated, Any
+from collections.abc import Mapping
+from dataclasses import dataclass, field, make_dataclass
+from typing import Annotated, Any, TypeAlias
 
 from tyro.conf import arg
+
+Json: TypeAlias = dict[str, Any]
+"""A mapping that is written as JSON."""
 
 
 @dataclass(frozen=True)
 class Metric:
-    """What the table says of a metric, and which way it is better."""
+    """Title, definition and unit of a metric for tables, and its direction."""
 
     title: str
     definition: str
@@ -34,50 +38,52 @@ METRICS = {
 
 
 def _option(name: str) -> str:
-    """Name of the limit on a metric: max_flip, min_psnr, max_abs."""
+    """Return the name of the limit on a metric, such as max_flip, min_psnr or max_abs."""
     return ("min_" if METRICS[name].more_is_better else "max_") + name.removeprefix("max_")
 
 
-def _field(name: str, metric: Metric) -> tuple[str, Any, Any]:
-    says = f"Fail where the {metric.title} is {'less' if metric.more_is_better else 'more'}."
-    return _option(name), Annotated[float | None, arg(metavar="VALUE", help=says)], field(default=None)
+def _field(name: str, metric: Metric) -> tuple[str, object, float | None]:
+    text = f"Fail where the {metric.title} is {'less' if metric.more_is_better else 'more'}."
+    return _option(name), Annotated[float | None, arg(metavar="VALUE", help=text)], field(default=None)
 
 
 Limits = make_dataclass("Limits", [_field(name, metric) for name, metric in METRICS.items()])
-"""One optional number a metric; tyro makes an option of each."""
+"""One optional number for each metric; tyro makes an option of each."""
 
 
-def broken(result: dict[str, Any], limits: Any, masked: bool = False) -> list[dict[str, Any]]:
-    """The `Limits` that a result of :func:`.compare.compare` does not keep: `metric`, `value`, `limit`, and `says`, a
-    line that names all three.
+def broken(result: Json, limits: object, masked: bool = False) -> list[Json]:
+    """Return the `Limits` that a result of :func:`.compare.compare` exceeds.
 
-    `masked`: the object's own pixels are judged, not the whole picture. NaN keeps no limit. A metric that could not be
-    measured keeps none, either: its `value` is None and the line says why.
+    Each entry has ``metric``, ``value``, ``limit`` and ``says``, a line that names all three. NaN exceeds every limit.
+    So does a metric that could not be measured: its value is None, and the line gives the reason.
+
+    With `masked`, the object's own pixels are judged, not the whole picture.
     """
     figures = result.get("masked", {}) if masked else result
-    found = []
+    failures: list[Json] = []
     for name, metric in METRICS.items():
         limit, value = getattr(limits, _option(name)), figures.get(name)
         if limit is None or (value is not None and (value >= limit if metric.more_is_better else value <= limit)):
             continue
         option = f"--{_option(name).replace('_', '-')} {limit:g}"
         if value is None:
-            says = f"{metric.title} was not measured, so {option} cannot be judged: {_reason(result, name, masked)}"
+            text = f"{metric.title} was not measured, so {option} cannot be judged: {_reason(result, name, masked)}"
         else:
             measured = f"{value:.6g} {metric.unit}".rstrip()
-            says = (f"{metric.title}{' of the object' if masked else ''} is {measured}, "
+            text = (f"{metric.title}{' of the object' if masked else ''} is {measured}, "
                     f"{'less' if metric.more_is_better else 'more'} than {option} allows")
-        found.append({"metric": name, "value": value, "limit": limit, "says": says})
-    return found
+        failures.append({"metric": name, "value": value, "limit": limit, "says": text})
+    return failures
 
 
-def given(limits: Any) -> bool:
-    """Whether any of the `Limits` is set."""
-    return any(value is not None for value in asdict(limits).values())
+def given(limits: object) -> bool:
+    """Return True if any of the `Limits` is set."""
+    return any(value is not None for value in vars(limits).values())
 
 
-def _reason(result: dict[str, Any], name: str, masked: bool) -> str:
+def _reason(result: Mapping[str, Json], name: str, masked: bool) -> str:
+    """Return the reason why a metric was not measured."""
     if masked and "masked" not in result:
         return "the reference has no alpha that tells an object from a background; leave --masked out"
-    why = result.get("not_measured", {}).get(name, {"reason": "it is not among the figures", "remedy": ""})
-    return "; ".join(filter(None, [why["reason"], why["remedy"]]))
+    entry = result.get("not_measured", {}).get(name, {"reason": "it is not among the figures", "remedy": ""})
+    return "; ".join(filter(None, [entry["reason"], entry["remedy"]]))
