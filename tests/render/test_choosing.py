@@ -6,7 +6,7 @@ import pytest
 from helpers import scenes
 
 from mi_ntf.infer.visibility import transmittance_atlas
-from mi_ntf.render.scene.settings import Limits, Settings
+from mi_ntf.render.scene.settings import Limits
 from mi_ntf.render.transport import choosing, pilot
 
 MANY = 1 << 20
@@ -93,7 +93,7 @@ def test_a_named_method_stays(blobs):
 def test_what_hardly_shows_is_left_out(tmp_path, monkeypatch, what, field, lights, options):
     """Where it saves time. The error is that of the picture; a hundredth of it is not allowed."""
     cost = {"without specular lobes": lambda s: 1.0 + s.specular, "without further bounces": lambda s: float(
-        abs(s.max_depth)), "brightest lights": lambda s: float(s.brightest or 100)}[what]
+        abs(s.max_depth)), "brightest lights": lambda s: float(s.brightest_lights or 100)}[what]
     clock(monkeypatch, cost)
     shining = {"sun": scenes.light("point")}
     if lights == "lamps":
@@ -113,7 +113,7 @@ def test_what_hardly_shows_is_left_out(tmp_path, monkeypatch, what, field, light
 @pytest.mark.parametrize("shown", [True, False])
 def test_a_field_of_a_few_pixels_is_left_out_or_seen(blobs, monkeypatch, shown):
     """The pilot looks at it, however small: where it is as bright as a lamp, it stays."""
-    clock(monkeypatch, lambda s: 1.0 - 0.5 * len(s.without))
+    clock(monkeypatch, lambda s: 1.0 - 0.5 * len(s.without_media))
     center, radius = np.array([-1.6, 0.2, -3.0]), 0.12
     size = radius / scenes.SIMILARITY.radius
     place = mi.ScalarTransform4f().translate((center - size * np.array(scenes.SIMILARITY.center)).tolist()).scale(size)
@@ -161,28 +161,27 @@ def test_other_lights_are_another_choice(blobs):
     for lights in ({"light": scenes.light("env")}, {"light": scenes.light("point")}):
         loaded = scenes.scene(blobs, nrf(max_error=0.3), lights, size=16, spp=1)
         before = choices[0] if choices else None
-        chooser = choosing.Chooser(loaded, Settings.of(loaded.integrator()), Limits(error=0.3), loaded.sensors()[0], 1,
-                                   before=before)
-        choices.append(chooser.choose().kept())
-    (one, _, first, _), (other, _, second, _) = choices
-    assert one != other and first != second
+        chooser = choosing.Chooser(loaded, loaded.integrator().context.settings, Limits(error=0.3),
+                                   loaded.sensors()[0], 1, previous=before)
+        choices.append(chooser.choose()[1])
+    one, other = choices
+    assert one.key != other.key and one.trials != other.trials
 
 
-def chosen_in(blobs, monkeypatch, budget: float, each, gone: float = 0.0):
+def chosen_in(blobs, monkeypatch, budget: float, each):
     clock(monkeypatch, each)
     loaded = scenes.scene(blobs, nrf(time_budget=budget, map_resolution=4), {"light": scenes.light("point")}, size=16,
                           spp=1)
-    chooser = choosing.Chooser(loaded, Settings.of(loaded.integrator()), loaded.integrator().limits,
-                               loaded.sensors()[0], 1, gone=lambda: gone)
-    return chooser.choose()
+    context = loaded.integrator().context
+    return choosing.Chooser(loaded, context.settings, context.limits, loaded.sensors()[0], 1).choose()
 
 
 @pytest.mark.parametrize(("march", "other", "visibility"), [
     (1e-4, 1e-5, "raymarch"), (50.0, 1e-3, "transmittance_map")])
 def test_a_budget_takes_what_errs_least_in_its_time(blobs, monkeypatch, march, other, visibility):
     """Noise and bias together: a march of many samples has none of either, one of a fifth of a sample has much."""
-    choice = chosen_in(blobs, monkeypatch, 10.0, lambda s: march if s.visibility == "raymarch" else other)
-    assert choice.composition.effects.visibility == visibility
+    composition, choice = chosen_in(blobs, monkeypatch, 10.0, lambda s: march if s.visibility == "raymarch" else other)
+    assert composition.effects.visibility == visibility
     assert choice.predicted["seconds"] == 10.0 and choice.predicted["error"] <= choice.predicted["bound"]
 
 
@@ -198,7 +197,7 @@ def test_a_budget_that_cannot_be_kept_is_said(blobs, monkeypatch, capfd):
 def test_auto_counts_rays(blobs, light, size, spp, frames, visibility):
     """Camera rays × lights × frames against the rays that fill an atlas."""
     loaded = scenes.scene(blobs, nrf(frames=frames), {"light": scenes.light(light)}, size=size, spp=spp)
-    chooser = choosing.Chooser(loaded, Settings.of(loaded.integrator()), Limits(), loaded.sensors()[0], spp)
+    chooser = choosing.Chooser(loaded, loaded.integrator().context.settings, Limits(), loaded.sensors()[0], spp)
     lights = 32 if light == "env" else 1
     assert (size * size * spp * lights * frames > transmittance_atlas.RAYS) == (visibility != "raymarch")
-    assert chooser.choose().effects.visibility == visibility
+    assert chooser.choose()[0].effects.visibility == visibility

@@ -11,7 +11,6 @@ from mi_ntf.core.architecture import Similarity
 from mi_ntf.evaluate.metrics import relative_rmse
 from mi_ntf.render.lights import scene_lights
 from mi_ntf.render.scene.media import find_media
-from mi_ntf.render.scene.settings import Settings
 from mi_ntf.render.transport import composition
 
 SEEDS = 4
@@ -236,22 +235,17 @@ def test_a_sun_among_many_lights_is_marched_to(monkeypatch):
     assert relative_rmse(picture("transmittance_atlas"), truth) > 0.015
 
 
-def test_parts_of_the_lights_know_their_own_suns():
-    """Each part those among its own rows, those that bounced light asks for among all."""
+def test_suns_of_the_table_and_of_sampled_lights():
+    """Rows of the table are known to be suns; sampled lights say it themselves."""
     loaded = shipped.scene("statue", "sky", 16, 1)
-    settings = Settings.of(shipped.integrator(visibility="transmittance_atlas"))
+    settings = shipped.integrator(visibility="transmittance_atlas").context.settings
     whole = composition.Composition(loaded, settings, loaded.sensors()[0], 1)
-    expected, found = whole.lights.suns(), []
-    assert expected.any()
-    for i in range(3):
-        part = composition.Composition(loaded, settings.but(share=(i, 3)), loaded.sensors()[0], 1)
-        [one] = part.parts
-        own = getattr(one.mapped, "suns", np.zeros(one.table.count, bool))
-        assert len(own) == one.table.count
-        found += list(own)
-        assert (part.with_all_lights(lambda part=part: part.parts[0].mapped.suns) == expected).all()
-        assert not hasattr(one.drawn.looked_up, "suns")
-    assert found == list(expected)
+    [part], expected = whole.parts, whole.lights.suns()
+    assert expected.any() and (part.for_run.suns == expected).all()
+    with whole.with_all_lights():
+        assert (whole.parts[0].for_run.suns == expected).all()
+    assert whole.parts == [part]
+    assert part.for_sampled.suns is None and not hasattr(part.for_sampled.looked_up, "suns")
 
 
 @pytest.mark.parametrize(("count", "bright", "expected"), [(64, 1, 1), (64, 6, 4), (15, 1, 0), (64, 0, 0)])

@@ -13,7 +13,6 @@ from mi_ntf.infer.visibility import raymarch
 from mi_ntf.render.maps import building
 from mi_ntf.render.scene import effects
 from mi_ntf.render.scene.media import find_media
-from mi_ntf.render.scene.settings import Settings
 from mi_ntf.render.transport import camera_light, composition, walk
 
 EYE = [scenes.SIMILARITY.center[0] + 1.2, scenes.SIMILARITY.center[1] + 1.5, scenes.SIMILARITY.center[2] + 5]
@@ -39,7 +38,7 @@ def forbid(monkeypatch, owner, name):
 
 
 def described(scene) -> effects.Effects:
-    return composition.Composition(scene, Settings.of(scene.integrator()), scene.sensors()[0], 4).effects
+    return composition.Composition(scene, scene.integrator().context.settings, scene.sensors()[0], 4).effects
 
 
 def operations(scene) -> int:

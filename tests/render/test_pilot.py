@@ -1,5 +1,7 @@
 """The pilot: places, errors with their bounds, and random numbers that all ways to render share."""
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -8,7 +10,6 @@ from helpers import scenes
 
 from mi_ntf.render import timing
 from mi_ntf.render.scene.media import find_media
-from mi_ntf.render.scene.settings import Settings
 from mi_ntf.render.transport import pilot
 from mi_ntf.render.transport.composition import Composition
 
@@ -24,10 +25,10 @@ def look_of(loaded, **changed):
     """A function of settings' changes that returns the pilot's look, and the pilot."""
     sensor = loaded.sensors()[0]
     one = pilot.Pilot(sensor, find_media(loaded))
-    settings = Settings.of(loaded.integrator())
+    settings = loaded.integrator().context.settings
 
     def look(**changed):
-        return one.look(lambda: Composition(loaded, settings.but(**changed), sensor, 4))
+        return one.look(lambda: Composition(loaded, replace(settings, **changed), sensor, 4))
 
     return look, one
 
@@ -110,7 +111,7 @@ def test_what_is_left_out_changes_no_other_numbers(blobs):
     media = find_media(loaded)
     number = min(range(2), key=lambda i: media[i].frame.length)
     look, _ = look_of(loaded)
-    whole, without = look().radiance, look(without=(number,)).radiance
+    whole, without = look().radiance, look(without_media=(number,)).radiance
     same = (whole == without).all((1, 2))
     lit = whole.max((1, 2)) > 0
     # The small field hides, shades and lights some of what is seen, not most of it.

@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from ...core.errors import MiNtfError
 from ...infer import march, shade
@@ -134,15 +133,10 @@ class Composition:
         if not REGISTRY[method].per_field:
             return Part(medium, all_lights, table, visibility, visibility, visibility)
         assert visibility
-        lookup, suns = visibility, self.lights.suns()
-
-        def with_suns(suns: np.ndarray | None) -> Visibility:
-            if suns is not None and not suns.any():
-                return lookup
-            return building.with_suns(lookup, suns, medium, table, options)
-
-        run_suns = suns[table.first : table.first + table.count]
-        return Part(medium, all_lights, table, with_suns(run_suns), with_suns(None), with_suns(suns))
+        suns = self.lights.suns()
+        of_sampled = building.with_suns(visibility, None, medium, table, options)
+        of_table = building.with_suns(visibility, suns, medium, table, options) if suns.any() else visibility
+        return Part(medium, all_lights, table, of_table, of_sampled, of_table)
 
     def seed_lookups(self, stream: UInt32) -> None:
         """Set the opaque seed of visibility methods whose lookups take random numbers."""
