@@ -7,7 +7,8 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from mi_ntf.commands.options import Define, OptionalOutput, UsageError, definitions, print_report
+from mi_ntf.commands import options
+from mi_ntf.commands.options import Define, Json, OptionalOutput, UsageError
 from mi_ntf.evaluate.limits import Limits, broken, given
 
 
@@ -24,8 +25,7 @@ class Compare:
     limits: Annotated[object, arg(name="", constructor=Limits)] = field(default_factory=Limits)
     masked: bool = False
     """Apply the limits to the object's pixels, where the reference's alpha is above 0.5, not to the whole picture."""
-    json: bool = False
-    """Print JSON in place of a table."""
+    json: Json = False
 
     def run(self) -> int:
         """Print the metrics, and the exceeded limits to standard error."""
@@ -35,7 +35,7 @@ class Compare:
 
         result = compare(self.image, self.reference, self.output)
         failures = broken(result, self.limits, self.masked)
-        print_report(result | ({"exceeded": failures} if given(self.limits) else {}), self.json, print_table)
+        options.print_report(result | ({"exceeded": failures} if given(self.limits) else {}), self.json, print_table)
         for failure in failures:
             print(f"mi-ntf: {failure['says']}", file=sys.stderr)
         return 1 if failures else 0
@@ -47,19 +47,17 @@ class Explain:
 
     scene: Positional[Path]
     """Scene with an nrf medium."""
-    define: Define = field(default_factory=tuple)
-    """Value of $KEY in the scene."""
+    define: Define = ()
     measure: bool = False
     """Render the scene, and show the measured seconds beside those that a pilot predicts."""
-    json: bool = False
-    """Print JSON in place of a table."""
+    json: Json = False
 
     def run(self) -> None:
         """Print the description."""
-        parameters = definitions(self.define)
+        parameters = options.definitions(self.define)
         from mi_ntf.render.commands.explain import explain, print_table
 
-        print_report(explain(self.scene, parameters, self.measure), self.json, print_table)
+        options.print_report(explain(self.scene, parameters, self.measure), self.json, print_table)
 
 
 @dataclass
@@ -70,18 +68,16 @@ class Tradeoff:
     """Scene with an nrf medium and integrator."""
     output: Annotated[Path, arg(aliases=("-o",), metavar="DIR")] = Path("tradeoff")
     """Folder for index.html, tradeoff.csv and tradeoff.json. An interrupted study continues in it."""
-    define: Define = field(default_factory=tuple)
-    """Value of $KEY in the scene."""
+    define: Define = ()
     budget: str = "5m"
     """Time that the study may take: 90s, 5m, 1h."""
     reference: Annotated[Path | None, arg(metavar="FILE")] = None
     """The path-traced mesh: an EXR picture or the XML file of its scene. Shipped scenes have theirs."""
-    json: bool = False
-    """Print JSON in place of a table, and no progress."""
+    json: Json = False
 
     def run(self) -> None:
         """Measure, write the page, and print the table."""
-        parameters = definitions(self.define)
+        parameters = options.definitions(self.define)
         from mi_ntf.evaluate.budget import seconds
         from mi_ntf.evaluate.tradeoff import study
 
@@ -89,5 +85,5 @@ class Tradeoff:
             budget = seconds(self.budget)
         except ValueError as error:
             raise UsageError(str(error)) from None
-        print_report(study.tradeoff(self.scene, self.output, parameters, budget, self.reference, self.json),
+        options.print_report(study.tradeoff(self.scene, self.output, parameters, budget, self.reference, self.json),
                      self.json, study.print_table)

@@ -7,17 +7,8 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from mi_ntf.commands.options import (
-    FlashOffset,
-    OptionalOutput,
-    Output,
-    UsageError,
-    WorkerOptions,
-    check_workers,
-    parse_offset,
-    print_pairs,
-    print_report,
-)
+from mi_ntf.commands import options
+from mi_ntf.commands.options import Background, FlashOffset, Json, Masks, OptionalOutput, Output, WorkerOptions
 from mi_ntf.jobs.options import Workers
 
 
@@ -45,20 +36,12 @@ class Capture:
 
     def run(self) -> None:
         """Render the photographs."""
-        check_workers(self.workers)
+        options.check_workers(self.workers)
         from mi_ntf.data.capture import capture
 
-        capture(
-            self.scene,
-            self.folder,
-            views=self.views,
-            size=self.size,
-            test_views=self.test_views,
-            spp=self.spp,
-            seed=self.seed,
-            flash_offset=parse_offset(self.flash_offset) or (0.0, 0.0, 0.0),
-            workers=self.workers,
-        )
+        offset = options.parse_offset(self.flash_offset) or (0.0, 0.0, 0.0)
+        capture(self.scene, self.folder, views=self.views, size=self.size, test_views=self.test_views, spp=self.spp,
+                seed=self.seed, flash_offset=offset, workers=self.workers)
 
 
 @dataclass
@@ -71,23 +54,20 @@ class Inspect:
     """HTML page to write. The default is DIR-inspect.html in the working folder."""
     size: int | None = None
     """Scale photographs to this many pixels along their longer side."""
-    masks: Path | None = None
-    """Folder of masks with the names of the photographs (white: object)."""
-    background: str | None = None
-    """Set to black for photographs without masks that were taken with a flash in a dark room."""
+    masks: Masks = None
+    background: Background = None
     flash_offset: FlashOffset = None
     """Offset of the flash from the lens: right,up,forward."""
-    json: bool = False
-    """Print JSON in place of a summary."""
+    json: Json = False
 
     def run(self) -> None:
         """Write the page and print the summary."""
-        offset = parse_offset(self.flash_offset)
+        offset = options.parse_offset(self.flash_offset)
         from mi_ntf.data.inspect import inspect, print_table
 
         report = inspect(self.dataset, self.output, size=self.size, masks=self.masks, background=self.background,
                          flash_offset=offset)
-        print_report(report, self.json, print_table)
+        options.print_report(report, self.json, print_table)
 
 
 @dataclass
@@ -114,10 +94,8 @@ class Train:
     """Do not compare pixels lit by the learned transmittance with the photographs."""
     size: int | None = None
     """Scale photographs to this many pixels along their longer side, in linear light."""
-    masks: Path | None = None
-    """Folder of masks with the names of the photographs (white: object)."""
-    background: str | None = None
-    """Set to black for photographs without masks that were taken with a flash in a dark room."""
+    masks: Masks = None
+    background: Background = None
     flash_offset: FlashOffset = None
     """Offset of the flash from the lens: right,up,forward in the data set's lengths, or `estimate`."""
     no_gains: bool = False
@@ -136,15 +114,14 @@ class Train:
     """Show the field in a browser during training. It needs the extra `view`."""
     baked: bool = False
     """Also put the field's voxels into the file, so that it loads without a bake or a cache."""
-    json: bool = False
-    """Print the whole report as JSON in place of a summary."""
+    json: Json = False
 
     def run(self) -> None:
         """Train, write the field file, and print the report."""
         if self.minutes is not None and self.steps is not None:
-            raise UsageError("give --minutes or --steps, not both")
+            raise options.UsageError("give --minutes or --steps, not both")
         estimate = self.flash_offset == "estimate"
-        offset = None if estimate else parse_offset(self.flash_offset)
+        offset = None if estimate else options.parse_offset(self.flash_offset)
         from mi_ntf.train import train
 
         report = train(self.dataset, self.output, preset=self.preset, minutes=self.minutes, steps=self.steps,
@@ -159,13 +136,13 @@ class Train:
                 from mi_ntf.render.commands.bake import bake_fields
 
                 bake_fields(self.output, {})
-            print_report(report, self.json, _print_training)
+            options.print_report(report, self.json, _print_training)
 
 
 def _print_training(report: Mapping[str, object]) -> None:
     """Print the length of a training run and the quality of its field."""
     keys = ("steps_done", "seconds", "kept", "faults", "val", "test", "transmittance")
-    print_pairs({key: report[key] for key in keys if report.get(key)})
+    options.print_pairs({key: report[key] for key in keys if report.get(key)})
 
 
 @dataclass
@@ -180,15 +157,14 @@ class Export:
     """Voxels per side of the grid that the surface is extracted from, 32 to 512."""
     level: float | None = None
     """Density of the surface, 1/(radius of the field's sphere). The default is 10, or less in thin matter."""
-    json: bool = False
-    """Print JSON in place of a table."""
+    json: Json = False
 
     def run(self) -> None:
         """Write the mesh and print its figures."""
         from mi_ntf.export import export
 
         mesh = export(self.field_file, self.output, self.resolution, self.level)
-        print_report(asdict(mesh), self.json, print_pairs)
+        options.print_report(asdict(mesh), self.json, options.print_pairs)
 
 
 @dataclass
@@ -197,11 +173,10 @@ class Info:
 
     field_file: Annotated[Positional[Path], arg(metavar="FIELD")]
     """Trained field."""
-    json: bool = False
-    """Print JSON in place of a table."""
+    json: Json = False
 
     def run(self) -> None:
         """Print the description."""
         from mi_ntf.core.field_file import describe
 
-        print_report(describe(self.field_file), self.json, print_pairs)
+        options.print_report(describe(self.field_file), self.json, options.print_pairs)

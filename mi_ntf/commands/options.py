@@ -15,7 +15,12 @@ Report = TypeVar("Report")
 WorkerOptions = Annotated[Workers, arg(name="")]
 Output = Annotated[Path, arg(aliases=("-o",), metavar="FILE")]
 OptionalOutput = Annotated[Path | None, arg(aliases=("-o",), metavar="FILE")]
-Define = Annotated[UseAppendAction[tuple[str, ...]], arg(aliases=("-D",), metavar="KEY=VALUE")]
+Json = Annotated[bool, arg(help="Print JSON in place of tables and progress.")]
+Define = Annotated[UseAppendAction[tuple[str, ...]],
+                   arg(aliases=("-D",), metavar="KEY=VALUE", help="Value of $KEY in the scene.")]
+Masks = Annotated[Path | None, arg(help="Folder of masks with the names of the photographs (white: object).")]
+Background = Annotated[str | None, arg(
+    help="Set to black for photographs without masks that were taken with a flash in a dark room.")]
 FlashOffset = Annotated[str | None, arg(metavar="R,U,F")]
 
 

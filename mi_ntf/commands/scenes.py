@@ -7,17 +7,8 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from mi_ntf.commands.options import (
-    Define,
-    OptionalOutput,
-    Output,
-    UsageError,
-    WorkerOptions,
-    check_workers,
-    definitions,
-    print_pairs,
-    print_report,
-)
+from mi_ntf.commands import options
+from mi_ntf.commands.options import Define, Json, OptionalOutput, Output, UsageError, WorkerOptions
 from mi_ntf.jobs.options import Workers
 
 
@@ -60,8 +51,7 @@ class View:
 
     scene: Positional[Path]
     """Scene with an nrf medium and integrator."""
-    define: Define = field(default_factory=tuple)
-    """Value of $KEY in the scene."""
+    define: Define = ()
     size: int = 256
     """The picture has about SIZE² pixels."""
     samples: int = 64
@@ -73,7 +63,7 @@ class View:
 
     def run(self) -> None:
         """Serve the page until Ctrl-C."""
-        parameters = definitions(self.define)
+        parameters = options.definitions(self.define)
         from mi_ntf.view import view
 
         view(self.scene, parameters, self.size, self.samples, self.host, self.port)
@@ -90,10 +80,8 @@ class Bake:
     """EXR to write."""
     baked: bool = False
     """Put the voxels of the scene's fields into their files, so that they load without a bake or a cache."""
-    define: Define = field(default_factory=tuple)
-    """Value of $KEY in the scene."""
-    json: bool = False
-    """Print JSON in place of a table."""
+    define: Define = ()
+    json: Json = False
 
     def run(self) -> None:
         """Write the files and print their sizes."""
@@ -101,9 +89,9 @@ class Bake:
             raise UsageError("give -o FILE for maps, or --baked for the fields' voxels")
         from mi_ntf.render.commands.bake import bake, bake_fields
 
-        parameters = definitions(self.define)
+        parameters = options.definitions(self.define)
         report = bake(self.scene, self.output, parameters) if self.output else bake_fields(self.scene, parameters)
-        print_report(report, self.json, print_pairs)
+        options.print_report(report, self.json, options.print_pairs)
 
 
 @dataclass
@@ -112,14 +100,13 @@ class Cache:
 
     clear: bool = False
     """Remove them."""
-    json: bool = False
-    """Print JSON in place of a table."""
+    json: Json = False
 
     def run(self) -> None:
         """Print the cache's contents."""
         from mi_ntf.render.commands.cache import report
 
-        print_report(report(self.clear), self.json, print_pairs)
+        options.print_report(report(self.clear), self.json, options.print_pairs)
 
 
 @dataclass
@@ -134,8 +121,7 @@ class RenderSequence:
     """Values over the frames at key frames: $names, camera, lights, environment."""
     parameters: Annotated[Path | None, arg(metavar="P.csv")] = None
     """Values of $names, one line per frame."""
-    define: Define = field(default_factory=tuple)
-    """Value of $KEY in all frames."""
+    define: Define = ()
     env: Annotated[Path | None, arg(metavar="FILE")] = None
     """Latitude-longitude image in place of the environment's."""
     env_rotate: Annotated[float, arg(metavar="DEG")] = 0.0
@@ -153,15 +139,14 @@ class RenderSequence:
     mode: Annotated[str, arg(aliases=("-m",), metavar="VARIANT")] = ""
     """Mitsuba's variant. The default is the first available of cuda_ad_rgb and llvm_ad_rgb."""
     workers: WorkerOptions = field(default_factory=Workers)
-    json: bool = False
-    """Print JSON in place of a summary, and no progress."""
+    json: Json = False
 
     def run(self) -> int:
         """Render or check the frames of this shard."""
         if self.timeline is not None and self.parameters is not None:
             raise UsageError("give --timeline or --parameters, not both")
-        check_workers(self.workers)
-        fixed = definitions(self.define)
+        options.check_workers(self.workers)
+        fixed = options.definitions(self.define)
         from mi_ntf.render.scene.environment_option import Environment
         from mi_ntf.sequence import command
         from mi_ntf.sequence.film import Film
@@ -177,11 +162,11 @@ class RenderSequence:
         tasks = command.tasks_of(self.scene, self.output, frames.frames, self.mode, environment)[i - 1 :: n]
         if self.check:
             result = command.check(tasks)
-            print_report(result, self.json, command.print_check)
+            options.print_report(result, self.json, command.print_check)
             for text in result.faults:
                 print(f"mi-ntf: {text}", file=sys.stderr)
             return 1 if result.faults else 0
         film = Film(self.film, frames.fps, self.exposure) if self.film else None
         summary = command.run(tasks, quiet=self.json, film=film, workers=self.workers)
-        print_report(summary, self.json, command.print_summary)
+        options.print_report(summary, self.json, command.print_summary)
         return 0
