@@ -106,22 +106,15 @@ def check_python() -> Check:
     """Check the version of the running interpreter."""
     minimum = ".".join(map(str, PYTHON_MINIMUM))
     ok = sys.version_info >= PYTHON_MINIMUM
-    return Check(
-        "Python",
-        ok,
-        True,
-        f"{platform.python_version()} ({sys.executable})",
-        "" if ok else f"make the environment with Python {minimum} or newer",
-    )
+    return Check("Python", ok, True, f"{platform.python_version()} ({sys.executable})",
+                 "" if ok else f"make the environment with Python {minimum} or newer")
 
 
 def check_cores() -> Check:
     """Check that this process has two cores. With one, Mitsuba hangs when it reads or writes an EXR file."""
     count = cores()
-    remedy = (
-        "mi-ntf and scenes with its plugins use two threads by themselves; render other scenes with `mitsuba -t 3` "
-        "and call drjit.set_thread_count(2) in Python programs without mi_ntf.render.register()"
-    )
+    remedy = ("mi-ntf and scenes with its plugins use two threads by themselves; render other scenes with "
+              "`mitsuba -t 3` and call drjit.set_thread_count(2) in Python programs without mi_ntf.render.register()")
     return Check("cores", count > 1, False, str(count), "" if count > 1 else remedy)
 
 
@@ -145,15 +138,9 @@ def check_llvm() -> Check:
     ok = code == 0 and int(version.split(".")[0]) >= LLVM_MINIMUM
     if ok:
         return Check("LLVM", True, True, f"{version} ({path})")
-    found = f"{version} ({path})" if version else f"not usable: {error}"
-    return Check(
-        "LLVM",
-        False,
-        True,
-        found,
-        f"install LLVM {LLVM_MINIMUM} or newer (Debian: sudo apt-get install libllvm19) and run "
-        "`export DRJIT_LIBLLVM_PATH=$(ls /usr/lib/*-linux-gnu/libLLVM.so.19.1)`",
-    )
+    return Check("LLVM", False, True, f"{version} ({path})" if version else f"not usable: {error}",
+                 f"install LLVM {LLVM_MINIMUM} or newer (Debian: sudo apt-get install libllvm19) and run "
+                 "`export DRJIT_LIBLLVM_PATH=$(ls /usr/lib/*-linux-gnu/libLLVM.so.19.1)`")
 
 
 def check_cuda() -> Check:
@@ -190,22 +177,16 @@ def check_libpython() -> Check:
         except OSError:
             pass
     remedy = f"sudo apt-get install {name.removesuffix('.so.1.0')}" if sys.base_prefix == "/usr" else ""
-    return Check(
-        "libpython",
-        shared,
-        False,
-        name if shared else f"no {name}; `mitsuba` hands over to `mi-ntf render`",
-        "" if shared else remedy,
-    )
+    return Check("libpython", shared, False, name if shared else f"no {name}; `mitsuba` hands over to `mi-ntf render`",
+                 "" if shared else remedy)
 
 
 def check_extra(extra: str) -> Check:
     """Check that the modules of an optional extra are there, without importing them."""
     missing = [module for module in EXTRAS[extra] if importlib.util.find_spec(module) is None]
     remedy = pip_install(f"[{extra}]") if missing else ""
-    return Check(
-        f"extra {extra}", not missing, False, "missing: " + ", ".join(missing) if missing else "installed", remedy
-    )
+    state = "missing: " + ", ".join(missing) if missing else "installed"
+    return Check(f"extra {extra}", not missing, False, state, remedy)
 
 
 def pip_install(extras: str, *options: str) -> str:
@@ -224,13 +205,8 @@ def _version(package: str) -> str:
 
 def _probe(code: str) -> tuple[int, list[str], str]:
     """Run Python code in a child process. Returns its exit status, the words of its output, and its error message."""
-    child = subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        env={**os.environ, "PYTHONWARNINGS": "ignore"},
-    )
+    child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120,
+                           env={**os.environ, "PYTHONWARNINGS": "ignore"})
     errors = child.stderr.strip().splitlines()
     messages = [line for line in errors if "error" in line.lower()]
     reason = (messages or errors or [f"the process ended with status {child.returncode}"])[-1]

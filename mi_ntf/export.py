@@ -68,21 +68,9 @@ class MeshFile:
 def export(field: Path, output: Path, resolution: int = 256, level: float | None = None) -> MeshFile:
     """Write the surface of a field file as a mesh, in the format of `output`'s suffix.
 
-    Parameters
-    ----------
-    field
-        Field file.
-    output
-        Mesh to write.
-    resolution
-        Voxels per side of the field's unit sphere.
-    level
-        Density of the surface, 1/(unit-sphere radius). None chooses it (:func:`mi_ntf.infer.surface.surface`).
-
-    Raises
-    ------
-    MiNtfError
-        If an argument is out of range, or the field has no surface.
+    `resolution` is the number of voxels per side of the field's unit sphere, `level` the density of the surface,
+    1/(unit-sphere radius). None chooses it (:func:`mi_ntf.infer.surface.surface`). Raises MiNtfError if an argument is
+    out of range, or the field has no surface.
     """
     field, output = Path(field), Path(output)
     if output.suffix.lower() not in SUFFIXES:
@@ -105,15 +93,9 @@ def export(field: Path, output: Path, resolution: int = 256, level: float | None
 def mitsuba_shape(path: Path, mesh: MeshFile, to_world: np.ndarray) -> str:
     """Return the ``<shape>`` of a PLY file for Mitsuba's stock integrators.
 
-    Parameters
-    ----------
-    path
-        The file as the XML names it.
-    mesh
-        Result of :func:`export`. Its mean roughness and specular weight hold all over the mesh, because the plugin
-        ``ply`` has no attributes of a single number.
-    to_world
-        (4, 4) matrix from the capture's coordinates to the scene's.
+    `path` is the file as the XML names it, `mesh` the result of :func:`export`. Its mean roughness and specular weight
+    hold all over the mesh, because the plugin ``ply`` has no attributes of a single number. `to_world` is the (4, 4)
+    matrix from the capture's coordinates to the scene's.
     """
     return _SHAPE.format(file=escape(str(path)), place=" ".join(f"{value:.9g}" for value in to_world.ravel()),
                          specular=mesh.specular, alpha=mesh.roughness**2)

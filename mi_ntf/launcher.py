@@ -34,18 +34,14 @@ CLOCK_DELAY = 2.0
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the stock program's command line and of further options."""
-    p = argparse.ArgumentParser(
-        prog="mi-ntf render", description="Render Mitsuba scenes with the flags of the program `mitsuba` and some more."
-    )
+    p = argparse.ArgumentParser("mi-ntf render", description="Render Mitsuba scenes with the flags of the program "
+                                "`mitsuba` and some more.")
     p.add_argument("scenes", nargs="+", metavar="SCENE.xml")
-    p.add_argument(
-        "-m", "--mode", metavar="VARIANT", help="default: the first available of " + ", ".join(VARIANTS)
-    )
+    p.add_argument("-m", "--mode", metavar="VARIANT", help="default: the first available of " + ", ".join(VARIANTS))
     p.add_argument("-v", "--verbose", action="count", default=0, help="more messages; may be given twice")
     p.add_argument("-t", "--threads", type=int, metavar="COUNT", help="number of CPU threads (1 counts as 2)")
-    p.add_argument(
-        "-D", "--define", action="append", default=[], metavar="KEY=VALUE", help="value of $KEY in the scene"
-    )
+    p.add_argument("-D", "--define", action="append", default=[], metavar="KEY=VALUE",
+                   help="value of $KEY in the scene")
     p.add_argument("-s", "--sensor", type=int, default=0, metavar="INDEX", help="sensor to render (default 0)")
     p.add_argument("-a", "--append", default="", metavar="PATH;PATH", help="folders to search for resources")
     p.add_argument("-o", "--output", metavar="FILE", help="image to write (default: beside the scene)")
@@ -110,25 +106,9 @@ def render_file(path: Path, parameters: dict[str, str], *, sensor_index: int = 0
                 environment: Environment | None = None, note: Callable[[Path], None] | None = None) -> mi.Film:
     """Render a scene file in the current variant, write the image, and return the film.
 
-    Parameters
-    ----------
-    path
-        Scene file.
-    parameters
-        Values of $names in the scene.
-    sensor_index
-        Sensor to render.
-    output
-        Image to write; by default it is beside the scene. The film sets the extension.
-    environment
-        Change of the scene's environment.
-    note
-        Function that is called with each file before it is read.
-
-    Raises
-    ------
-    MiNtfError
-        If the scene cannot be rendered.
+    `parameters` are values of $names, `environment` changes the scene's, and `note` is called with each file before it
+    is read. The image is `output`, or lies beside the scene; the film sets the extension. Raises MiNtfError if the
+    scene cannot be rendered.
     """
     scene = scene_file.load(path, parameters, environment, note)
     if not 0 <= sensor_index < len(scene.sensors()):
@@ -170,10 +150,8 @@ def _apply_settings(args: argparse.Namespace) -> None:
     try:
         mi.set_variant(*([args.mode] if args.mode else VARIANTS))
     except ImportError as error:
-        raise MiNtfError(
-            f"this machine cannot run {args.mode or 'any of ' + ', '.join(VARIANTS)}: "
-            f"`mi-ntf doctor` names the remedy ({error})"
-        ) from error
+        raise MiNtfError(f"this machine cannot run {args.mode or 'any of ' + ', '.join(VARIANTS)}: `mi-ntf doctor` "
+                         f"names the remedy ({error})") from error
     variant = str(mi.variant())
     log.info(f'Rendering using the "{variant}" variant.')
     bridge.register_all(variant)
@@ -186,14 +164,9 @@ def _apply_settings(args: argparse.Namespace) -> None:
     for folder in filter(None, args.append.split(";")):
         mi.file_resolver().append(folder)  # type: ignore[operator]  # an object in the stub
 
-    flags = (
-        dr.JitFlag.MergeFunctions,
-        dr.JitFlag.ConstantPropagation,
-        dr.JitFlag.ValueNumbering,
-        dr.JitFlag.OptimizeCalls,
-        dr.JitFlag.OptimizeLoops,
-    )
     if args.optimise is not None:
+        flags = (dr.JitFlag.MergeFunctions, dr.JitFlag.ConstantPropagation, dr.JitFlag.ValueNumbering,
+                 dr.JitFlag.OptimizeCalls, dr.JitFlag.OptimizeLoops)
         for position, flag in enumerate(flags):
             dr.set_flag(flag, args.optimise > position)
     if args.wavefront:

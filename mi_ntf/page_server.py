@@ -19,20 +19,11 @@ Gate: TypeAlias = "Callable[[ServerConnection, Request], Response | None]"
 
 
 def serve(label: str, host: str = "127.0.0.1", port: int = 8080) -> tuple["viser.ViserServer", str]:
-    """Serve a page called `label` at `port` or the next free one.
+    """Serve a page called `label` at `port` or the next free one, and return the server and the page's address.
 
     The address ends in a random token. Requests without it are refused, and so are requests of pages of other servers,
-    which a browser lets connect to this machine.
-
-    Returns
-    -------
-    server, address
-        The running server, and the address of its page.
-
-    Raises
-    ------
-    MiNtfError
-        If the extra is missing, or `host` is no address of this machine.
+    which a browser lets connect to this machine. Raises MiNtfError if the extra is missing, or `host` is no address of
+    this machine.
     """
     try:
         import viser

@@ -32,24 +32,8 @@ def swap(scene: Path, field: Path, out: Path) -> list[str]:
     with the defaults of ``$parameters`` in its name. Unused BSDFs and textures, and comments, are dropped. Paths are
     rewritten for `out`'s folder, which is searched before the working folder.
 
-    Parameters
-    ----------
-    scene
-        XML file of the mesh scene.
-    field
-        Field file.
-    out
-        XML file to write.
-
-    Returns
-    -------
-    list of str
-        Sentences about other things that were left out.
-
-    Raises
-    ------
-    MiNtfError
-        If `scene` is no Mitsuba XML or has no shape to replace, or an include is missing.
+    Returns sentences about other things that were left out. Raises MiNtfError if `scene` is no Mitsuba XML or has no
+    shape to replace, or an include is missing.
     """
     scene, field, out = Path(scene), Path(field), Path(out)
     similarity = load_header(field).similarity
@@ -124,18 +108,10 @@ def substitute(text: str, defaults: dict[str, str]) -> str:
 
 def inline(root: ET.Element, source: Path, folder: Path, defaults: dict[str, str],
            is_needed: Callable[[ET.Element], bool]) -> None:
-    """Replace includes by their content where `is_needed` is true of it.
+    """Replace includes of `root`, the content of the file `source`, by their content where `is_needed` is true of it.
 
-    Parameters
-    ----------
-    root, source
-        Content and path of the including file.
-    folder
-        Folder of the main scene.
-    defaults
-        Values of $parameters of the main scene. Those of the includes are added.
-    is_needed
-        Function of the content of an include, after its own includes are inlined.
+    `folder` is that of the main scene, `defaults` are the values of its $parameters, to which those of includes are
+    added.
     """
     for include in root.findall("include"):
         path = _resolve(include, source, folder, defaults)
@@ -157,23 +133,16 @@ def inline(root: ET.Element, source: Path, folder: Path, defaults: dict[str, str
 def _replaceable(root: ET.Element) -> list[ET.Element]:
     """Return the top-level shapes that are neither emitters nor sensors."""
     lights = {e.get("id") for e in root.findall("emitter")} - {None}
-    return [
-        s
-        for s in root.findall("shape")
-        if s.find("emitter") is None
-        and s.find("sensor") is None
-        and not any(r.get("id") in lights for r in s.findall("ref"))
-    ]
+    return [s for s in root.findall("shape") if s.find("emitter") is None and s.find("sensor") is None
+            and not any(r.get("id") in lights for r in s.findall("ref"))]
 
 
 def _remove_shapes(root: ET.Element, scene: Path) -> int:
     """Remove the shapes that the field replaces, and return the index of the first among the root's children."""
     shapes = _replaceable(root)
     if not shapes:
-        raise MiNtfError(
-            f"{scene} has no shape that a field could replace (emitters stay); give the scene that "
-            "`mi-ntf capture` photographed"
-        )
+        raise MiNtfError(f"{scene} has no shape that a field could replace (emitters stay); give the scene that "
+                         "`mi-ntf capture` photographed")
     index = list(root).index(shapes[0])
     for shape in shapes:
         root.remove(shape)

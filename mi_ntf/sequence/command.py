@@ -98,25 +98,8 @@ def run(tasks: list[Task], work: Callable[[Task], float] = render, quiet: bool =
         workers: Workers = Workers()) -> Summary:  # noqa: B008
     """Render the frames that are not there yet, and at the end their `film`.
 
-    Broken frames and frames of other parameters are named on standard error and rendered again.
-
-    Parameters
-    ----------
-    tasks
-        All frames.
-    work
-        Function that makes one frame and returns its seconds.
-    quiet
-        True for no progress bar.
-    film
-        Film of the frames, if wanted.
-    workers
-        Processes that render.
-
-    Raises
-    ------
-    MiNtfError
-        If frames fail. In this process the first failure ends the work, with workers the other frames are finished.
+    `work` makes one frame and returns its seconds. Broken frames and frames of other parameters are named on standard
+    error and rendered again. Raises MiNtfError if frames fail: in this process at once, with workers after the others.
     """
     begin = time.perf_counter()
     if film:

@@ -88,19 +88,8 @@ class Circle:
 def track(value: object, size: int, name: str) -> Keys | Circle:
     """Return the curve of a value of a timeline.
 
-    Parameters
-    ----------
-    value
-        A constant, a table of ``keys`` and ``interpolation``, or for positions the table of a circle.
-    size
-        Number of components of the value, 1 or 3.
-    name
-        Name of the value in errors.
-
-    Raises
-    ------
-    MiNtfError
-        If `value` is none of these.
+    `value` is a constant, a table of ``keys`` and ``interpolation``, or for positions the table of a circle. `size` is
+    its number of components, 1 or 3; `name` stands in errors. Raises MiNtfError for anything else.
     """
     if not isinstance(value, dict):
         return Keys(np.zeros(1), _components(value, size, name)[None], "step")

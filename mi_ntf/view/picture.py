@@ -49,18 +49,9 @@ class Picture:
               keep: bool) -> np.ndarray:
         """Return linear RGB and opacity, (h, w, 4).
 
-        Parameters
-        ----------
-        sensor
-            Camera.
-        rays
-            All that the camera's rays depend on. While it, `seed` and `spp` stay the same, stored layers are used.
-        versions
-            Version of each light, by the emitter's number. A layer with other versions is rendered again.
-        seed, spp
-            Seed of the samples, and samples per pixel.
-        keep
-            False to store nothing.
+        `rays` is all that the camera's rays depend on, `versions` the version of each light by the emitter's number.
+        With the same `rays`, `seed` and `spp`, only layers of other versions are rendered again. `keep` False stores
+        nothing.
         """
         if not keep:
             self.context.sample_cache = None

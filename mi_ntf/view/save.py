@@ -33,19 +33,8 @@ def save(session: Session, out: Path, environment: Path | None = None) -> None:
     Unchanged elements stay as they were written. Includes that hold a light, a sensor or an integrator are inlined,
     comments are lost, and the session's values of $names become their defaults.
 
-    Parameters
-    ----------
-    session
-        View of the scene.
-    out
-        XML file to write.
-    environment
-        Picture file in place of the present environment.
-
-    Raises
-    ------
-    MiNtfError
-        If `out` is the scene itself, or a changed light is not an <emitter> of the scene's top level.
+    `environment` is a picture file in place of the present one. Raises MiNtfError if `out` is the scene itself, or a
+    changed light is not an <emitter> of the scene's top level.
     """
     if out.resolve() == session.path.resolve():
         raise MiNtfError(f"{out} is the scene that is being viewed; choose another name")

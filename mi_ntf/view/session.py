@@ -104,21 +104,8 @@ class Session:
                aov: str | None = None) -> None:
         """Change how the scene is rendered. None keeps a value.
 
-        Parameters
-        ----------
-        visibility
-            Visibility method.
-        max_depth
-            Length of paths.
-        second_visibility
-            Method of the right side of a split view. "" ends the split.
-        aov
-            Output to show, one of `AOVS`. "" shows light.
-
-        Raises
-        ------
-        MiNtfError
-            If a name is unknown.
+        `second_visibility` is the method of the right side of a split view, "" ends the split. `aov` is the output to
+        show, one of `AOVS`, "" is light. Raises MiNtfError if a name is unknown.
         """
         for name in (visibility, second_visibility or None):
             if name is not None and name not in names():

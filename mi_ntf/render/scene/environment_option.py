@@ -13,6 +13,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
+from ...core import rotation
 from ...core.errors import MiNtfError
 from ...infer.types import Array
 from .changed import Node, ParsedScene
@@ -80,12 +81,8 @@ def turned(to_world: np.ndarray, degrees: float, up: str = "y") -> np.ndarray:
     """
     direction = to_world[:3, 1 if up == "y" else 2]
     axis = int(np.abs(direction).argmax())
-    angle = math.radians(degrees) * (1 if direction[axis] >= 0 else -1)
-    first, second = (axis + 1) % 3, (axis + 2) % 3
-    rotation = np.eye(4)
-    rotation[[first, second], [first, second]] = math.cos(angle)
-    rotation[second, first], rotation[first, second] = math.sin(angle), -math.sin(angle)
-    result: np.ndarray = rotation @ to_world
+    result = to_world.copy()
+    result[:3] = rotation.about(np.eye(3)[axis], degrees if direction[axis] >= 0 else -degrees) @ to_world[:3]
     return result
 
 
