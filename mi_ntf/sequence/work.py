@@ -12,7 +12,6 @@ import time
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -21,10 +20,11 @@ from numpy.typing import DTypeLike
 from .. import __version__, bridge
 from ..core.errors import MiNtfError, sentence
 from ..core.variants import VARIANTS
-from ..render import user_cache
+from ..render import log, user_cache
 from ..render.maps import map_cache
 from ..render.scene import changed, environment_option, scene_file
 from ..render.scene.environment_option import Environment
+from ..render.transport.bounced import Patches
 from . import changes, image_file
 from .timeline import Frame
 
@@ -94,8 +94,8 @@ def prepare(variant: str = "") -> None:
 _registered: set[str] = set()
 
 
-_kept: dict[str, Any] = {}
-"""Patches of the fields of the last frame, for bounced light."""
+_last_frame: dict[str, Patches | None] = {}
+"""Patches of the fields, for bounced light."""
 
 
 def _parsed(task: Task) -> tuple[mi.parser.ParserState, str]:
@@ -109,11 +109,10 @@ def _parsed(task: Task) -> tuple[mi.parser.ParserState, str]:
         changes.apply(state.nodes, task.frame)
         digest = hashlib.sha256(json.dumps([__version__, mi.__version__, task.frame.values()]).encode())
         digest.update(mi.parser.write_string(state).encode())
-        resolver = mi.file_resolver()  # type: ignore[operator]  # an object in the stub
         for node in state.nodes:
             for name in node.props:
                 if "file" in name and node.props.type(name) == mi.Properties.Type.String:
-                    digest.update(_content(Path(str(resolver.resolve(node.props[name])))))
+                    digest.update(_content(Path(log.resolve(node.props[name]))))
     return state, digest.hexdigest()
 
 
@@ -152,10 +151,10 @@ def _render(scene: mi.Scene, path: str, precision: DTypeLike) -> dict[str, np.nd
         raise MiNtfError(f"{path} needs an integrator and a sensor")
     context = getattr(integrator, "context", None)  # of an nrf integrator
     if context:
-        context.patches = _kept.get("patches")
+        context.patches = _last_frame.get("patches")
     scene_file.render_to_film(scene, sensors[0])
     if context:
-        _kept["patches"] = context.patches
+        _last_frame["patches"] = context.patches
     bitmap = sensors[0].film().bitmap()
     pixels = np.array(bitmap)
     pixels = pixels.reshape(*pixels.shape[:2], -1)

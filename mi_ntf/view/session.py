@@ -17,6 +17,7 @@ from mi_ntf.render.plugins.registration import load_scene
 from mi_ntf.render.scene.media import find_media, ordinary_shapes
 from mi_ntf.render.scene.settings import Settings
 from mi_ntf.render.transport.aovs import CHANNELS
+from mi_ntf.render.transport.context import RenderContext
 
 from . import camera
 from .lights import lights_of
@@ -70,7 +71,9 @@ class Session:
         self.center = np.mean([m.frame.origin for m in self.media], axis=0)
         self.pose = self.initial_pose = camera.pose_of(self.sensor, self.parameters, self.center)
         self.lights = lights_of(self.scene, self.parameters, np.array(self.pose.up))
-        self.settings = self.initial_settings = replace(self.scene.integrator().context.settings, frames=FRAMES)
+        context = getattr(self.scene.integrator(), "context", None)
+        assert isinstance(context, RenderContext)  # load_scene refuses other integrators than nrf
+        self.settings = self.initial_settings = replace(context.settings, frames=FRAMES)
         self._common = [light.number for light in self.lights[MAX_LAYERS:]]
         width, height = (int(n) for n in self.sensor.film().crop_size())
         self.resize(size, width / height)

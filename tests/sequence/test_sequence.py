@@ -189,16 +189,16 @@ def test_nothing_is_compiled_and_nothing_piles_up_after_the_second_frame(scene, 
                     {"origin": [2 + 0.1 * i, 1.5, 6], "target": [0.4, -0.2, 0.3]},
                     {"lamp": {"position": [3 - 0.2 * i, 3, 2.5]}}) for i in range(5)]
     line = tasks(scene(), tmp_path / "out", frames)
-    work._kept.clear()
+    work._last_frame.clear()
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         for task in line[:3]:
             work.render(task)
-        patches, _ = work._kept["patches"], dr.kernel_history()
+        patches, _ = work._last_frame["patches"], dr.kernel_history()
         for task in line[3:]:
             work.render(task)
         new = [k for k in dr.kernel_history() if "cache_hit" in k and not k["cache_hit"]]
     assert new == []
-    assert work._kept["patches"] is patches
+    assert work._last_frame["patches"] is patches
     assert len(map_cache._maps) == 1
 
 
