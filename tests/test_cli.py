@@ -16,12 +16,12 @@ from mi_ntf.jobs import Workers
 
 @pytest.fixture
 def calls(monkeypatch: pytest.MonkeyPatch) -> list:
-    """Stand-ins for the functions behind the commands; holds what they were called with."""
-    seen: list = []
+    """Arguments of the calls of stand-ins for the functions behind the commands."""
+    calls: list = []
 
     def note(result=None):
         def function(*args, **kwargs):
-            seen.append((args, kwargs))
+            calls.append((args, kwargs))
             return result
 
         return function
@@ -41,7 +41,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list:
     stand_in("mi_ntf.core.field_file", describe=note(table))
     stand_in("mi_ntf.evaluate.tradeoff", study=types.SimpleNamespace(
         tradeoff=note(table), print_table=lambda values: print("table", values["psnr"])))
-    return seen
+    return calls
 
 
 @pytest.mark.parametrize(
@@ -235,9 +235,9 @@ def test_doctor_as_json(tmp_path: Path):
 def test_doctor_knows_what_one_core_does(tmp_path: Path):
     done = run_on_one_core("mi-ntf", "doctor", "--json", cwd=tmp_path)
     report = json.loads(done.stdout)
-    found = {check["name"]: check for check in report["checks"]}["cores"]
-    assert report["ok"] and (found["ok"], found["found"]) == (False, "1")
-    assert "`mitsuba -t 3`" in found["remedy"] and "drjit.set_thread_count(2)" in found["remedy"]
+    check = {check["name"]: check for check in report["checks"]}["cores"]
+    assert report["ok"] and (check["ok"], check["found"]) == (False, "1")
+    assert "`mitsuba -t 3`" in check["remedy"] and "drjit.set_thread_count(2)" in check["remedy"]
 
 
 def test_doctor_survives_a_missing_llvm(tmp_path: Path):

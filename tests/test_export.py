@@ -1,4 +1,4 @@
-"""`mi-ntf export`: the mesh by value, against the meshes that were photographed, and as its readers see it."""
+"""`mi-ntf export`: the mesh by value, against the photographed meshes, and in programs that read it."""
 
 import re
 from pathlib import Path
@@ -24,16 +24,16 @@ STATUE = SCENES / "statue" / "field.safetensors"
 
 
 def read(path: Path) -> dict[str, np.ndarray]:
-    """Vertices and attributes of a binary PLY file, by name, and its faces; taken apart here, by the header."""
+    """Return the vertex attributes of a binary PLY file by name, and its faces."""
     head, _, body = path.read_bytes().partition(b"end_header\n")
     text = head.decode()
     count, faces = (int(re.search(rf"element {kind} (\d+)", text)[1]) for kind in ("vertex", "face"))
     names = re.findall(r"property (float|uchar) (\w+)", text)
     vertex = np.dtype([(name, {"float": "<f4", "uchar": "u1"}[kind]) for kind, name in names])
-    found = np.frombuffer(body, vertex, count)
+    attributes = np.frombuffer(body, vertex, count)
     triangles = np.frombuffer(body, [("n", "u1"), ("v", "<i4", 3)], faces, count * vertex.itemsize)
     assert (triangles["n"] == 3).all()
-    return {name: found[name] for name in vertex.names} | {"faces": triangles["v"]}
+    return {name: attributes[name] for name in vertex.names} | {"faces": triangles["v"]}
 
 
 def stack(mesh: dict, *names: str) -> np.ndarray:
@@ -50,7 +50,7 @@ def statue(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def original() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points of the photographed meshes, their normals, and the albedo of the parts that are diffuse, else NaN."""
+    """Points of the photographed meshes, their normals, and their albedo, NaN where it is not diffuse."""
     xml = (SCENES / "statue/mesh.xml").read_text()
     points, normals, albedo = [], [], []
     for path in sorted((SCENES / "statue/meshes").glob("*.ply")):
@@ -101,10 +101,10 @@ def test_it_is_closed_in_one_piece_and_faces_outward(statue):
 
 def test_mitsuba_reads_vertices_normals_and_albedo(statue):
     mi.set_variant("llvm_ad_rgb")
-    found, mesh = mi.traverse(mi.load_dict({"type": "ply", "filename": str(statue)})), read(statue)
+    attributes, mesh = mi.traverse(mi.load_dict({"type": "ply", "filename": str(statue)})), read(statue)
     for name, columns in (("vertex_positions", "x y z"), ("vertex_normals", "nx ny nz"),
                           ("vertex_albedo_color", "albedo_r albedo_g albedo_b")):
-        np.testing.assert_allclose(np.array(found[name]).reshape(-1, 3), stack(mesh, *columns.split()), atol=1e-6)
+        np.testing.assert_allclose(np.array(attributes[name]).reshape(-1, 3), stack(mesh, *columns.split()), atol=1e-6)
 
 
 def test_a_ball_of_known_density_and_reflectance_in_scene_units(tmp_path: Path):
@@ -113,10 +113,10 @@ def test_a_ball_of_known_density_and_reflectance_in_scene_units(tmp_path: Path):
     field_file.save(tmp_path / "f.safetensors", header, tensors, np.float32)
     export(tmp_path / "f.safetensors", tmp_path / "m.ply", resolution=96)
     mesh = read(tmp_path / "m.ply")
-    away = np.linalg.norm(stack(mesh, "x", "y", "z") - [1.2, 2, 3], axis=1)
+    radii = np.linalg.norm(stack(mesh, "x", "y", "z") - [1.2, 2, 3], axis=1)
     # ln σ = −12 + 7.5 + 32 (e exp(−(r/0.5)²) − 1), see fields.blobs; the capture's lengths are twice the field's.
     radius = 0.5 * np.sqrt(1 - np.log(1 + (np.log(10) + 4.5) / 32))
-    np.testing.assert_allclose(away, 2 * radius, atol=0.012)  # measured: 0.011, of voxels of 0.042
+    np.testing.assert_allclose(radii, 2 * radius, atol=0.012)  # measured: 0.011, of voxels of 0.042
     albedo = stack(mesh, "albedo_r", "albedo_g", "albedo_b")
     np.testing.assert_allclose(albedo, np.broadcast_to([0.6, 0.5, 0.4], albedo.shape), atol=1e-3)
     np.testing.assert_allclose(mesh["roughness"], 0.5, atol=1e-3)
@@ -139,11 +139,11 @@ def test_kinds_of_files_hold_the_same_surface(tmp_path: Path, suffix: str):
 
 
 def shell(n=48) -> np.ndarray:
-    """ln σ of a hollow ball with a thin spot, and a crumb beside it."""
+    """Return ln σ of a hollow ball with a thin spot, and of a small separate part."""
     z, y, x = np.mgrid[:n, :n, :n] - n / 2
-    away = np.sqrt(x * x + y * y + z * z)
-    values = np.where((away > 10) & (away < 14), np.log(100), -6).astype(np.float32)
-    values[(away > 10) & (away < 14) & (abs(x) < 2) & (abs(y) < 2) & (z > 0)] = np.log(4)
+    radii = np.sqrt(x * x + y * y + z * z)
+    values = np.where((radii > 10) & (radii < 14), np.log(100), -6).astype(np.float32)
+    values[(radii > 10) & (radii < 14) & (abs(x) < 2) & (abs(y) < 2) & (z > 0)] = np.log(4)
     values[3, 3, 3] = np.log(100)
     return values
 

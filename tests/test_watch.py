@@ -1,4 +1,4 @@
-"""`mi-ntf render --watch`: what makes it render again, what it survives, what tev is sent."""
+"""`mi-ntf render --watch`: changes that cause a render, faults that it survives, pictures for tev."""
 
 import os
 import signal
@@ -35,7 +35,7 @@ SENSOR = """
 
 
 class Viewer:
-    """Listens as tev does and takes pictures apart; layout: `Ipc.cpp` of tev."""
+    """Server that decodes pictures in the format of `Ipc.cpp` of tev."""
 
     def __init__(self):
         self.server = socket.create_server(("127.0.0.1", 0))
@@ -82,7 +82,7 @@ class Viewer:
 
 
 class Watching:
-    """The command, running."""
+    """The running command."""
 
     def __init__(self, folder: Path, *words: str):
         program = Path(sys.executable).with_name("mi-ntf")
@@ -95,7 +95,7 @@ class Watching:
         return [line for line in self.log.read_text().splitlines() if "; watching " in line]
 
     def rounds(self, count: int) -> str:
-        """Wait for that many rounds; what the last one said."""
+        """Wait for this many rounds, and return the last one's message."""
         end = time.monotonic() + 120
         while len(self.lines()) < count:
             assert self.process.poll() is None and time.monotonic() < end, self.log.read_text()
@@ -184,8 +184,8 @@ def test_files_that_are_still_being_written_are_waited_for(tmp_path: Path):
     file, seen_sizes = tmp_path / "field", []
     file.write_bytes(b"a")
 
-    def render(seen):
-        seen(file)
+    def render(note):
+        note(file)
         seen_sizes.append(file.stat().st_size)
         if len(seen_sizes) == 2:
             signal.raise_signal(signal.SIGINT)

@@ -1,4 +1,4 @@
-"""`mi-ntf swap` on XML alone: what is replaced, what stays, how paths move, and the error texts."""
+"""`mi-ntf swap` on XML alone: replaced and unchanged elements, rewritten paths, error texts."""
 
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -91,13 +91,13 @@ def test_integrator_is_replaced_and_keeps_depth_and_hide_emitters(folder):
 
 
 def integrator(folder, *elements, version="3.9.0"):
-    """The integrator that takes the place of `elements`: ``[(name, value), …]``, and what is told."""
+    """Return the properties of the integrator that replaces `elements`, and the notes of the swap."""
     shape = '<shape type="cube"/>'
     text = f'<scene version="{version}"><default name="i" value="path"/>{"".join(elements)}{shape}</scene>'
     (folder / "mesh.xml").write_text(text)
     notes = swap(folder / "mesh.xml", folder / "f.safetensors", folder / "scene.xml")
-    (found,) = ET.parse(folder / "scene.xml").getroot().findall("integrator")
-    return {e.get("name"): e.get("value") for e in found if e.get("name") != "visibility"}, notes
+    (properties,) = ET.parse(folder / "scene.xml").getroot().findall("integrator")
+    return {e.get("name"): e.get("value") for e in properties if e.get("name") != "visibility"}, notes
 
 
 def test_camel_case_of_old_versions_is_read(folder):
@@ -124,7 +124,7 @@ def test_a_depth_that_is_not_written_stays_the_old_integrators(folder, old, dept
 
 
 def test_depths_without_a_number_are_those_of_mitsuba():
-    """Of the Python integrators; those of C++ do not tell theirs."""
+    """Integrators in Python have the attribute, those in C++ do not."""
     mi = pytest.importorskip("mitsuba")
     mi.set_variant(VARIANT)
     for name in ("prb", "prb_basic", "prb_projective", "prbvolpath"):
@@ -135,10 +135,10 @@ def test_channels_of_aov_stay_where_nrf_has_them(folder):
     channels = "dd.y:depth, nn:sh_normal,gn:geo_normal, pp:position,albedo:albedo,uv:uv"
     old = f'<integrator type="aov"><string name="aovs" value="{channels}"/><integrator type="path" name="image">' \
           '<integer name="max_depth" value="5"/></integrator></integrator>'
-    found, notes = integrator(folder, old)
-    assert found == {"max_depth": "5", "aovs": "depth, normal, albedo"}
+    properties, notes = integrator(folder, old)
+    assert properties == {"max_depth": "5", "aovs": "depth, normal, albedo"}
     assert notes == ["left out pp:position, uv:uv of the integrator aov: nrf has depth, albedo, normal"]
-    assert aovs.parse(found["aovs"]) == ("depth", "normal", "albedo")
+    assert aovs.parse(properties["aovs"]) == ("depth", "normal", "albedo")
     with_parameter = '<default name="c" value="pp:position"/><integrator type="aov"><string name="aovs" value="$c"/>' \
                      '</integrator>'
     assert integrator(folder, with_parameter)[0] == {}
@@ -220,7 +220,7 @@ def test_errors(folder, text, message):
 
 
 def test_entities_are_refused_before_they_fill_the_memory(folder):
-    """In includes as well. A few lines stand for a gigabyte."""
+    """A few lines expand to a gigabyte. Includes are checked as well."""
     lines = "".join(f'<!ENTITY e{i} "{f"&e{i - 1};" * 10 if i else "x" * 10}">' for i in range(9))
     (folder / "sensor.xml").write_text(f"<!DOCTYPE scene [{lines}]><scene><path value='&e8;'/></scene>")
     with pytest.raises(MiNtfError, match=r"sensor.xml declares the entity 'e0'"):
@@ -237,7 +237,7 @@ def test_errors_of_files(folder):
 
 
 def test_mitsuba_loads_a_swapped_scene_from_another_folder(folder):
-    """Includes and files named in them are found; the medium itself is tried elsewhere, so a stock one stands in."""
+    """Mitsuba resolves includes and the files that they name. A stock medium replaces the field here."""
     mi = pytest.importorskip("mitsuba")
     mi.set_variant(VARIANT)
     mi.Bitmap(np.ones((2, 4, 3), np.float32)).write(str(folder / "env.exr"))

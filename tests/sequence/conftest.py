@@ -37,8 +37,7 @@ def field(tmp_path_factory):
 
 @pytest.fixture
 def scene(field, tmp_path):
-    """A function of the lights' XML to the path of a scene file; its values: spp, res, visibility, depth, more (aovs).
-    """
+    """Function that writes a scene file with the XML of lights and returns its path."""
     def write(lights=POINT):
         path = tmp_path / "scene.xml"
         path.write_text(SCENE.replace("LIGHTS", lights).replace("FIELD", str(field)))

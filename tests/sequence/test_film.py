@@ -1,4 +1,4 @@
-"""Films: tones by value, and what a decoder reads back."""
+"""Films: tones by value, and the pictures that a decoder reads back."""
 
 import subprocess
 from pathlib import Path
@@ -14,7 +14,7 @@ ffmpeg = pytest.importorskip("imageio_ffmpeg")
 
 
 def frames(folder, values, size=(20, 31)):
-    """Frames of one linear colour each."""
+    """Write frames of one linear colour each."""
     paths = []
     for number, value in enumerate(values):
         paths.append(image_file.path_of(folder, number, len(values)))
@@ -37,17 +37,17 @@ def test_tones_are_those_that_it_says():
 def test_a_film_shows_every_frame_once_in_its_colour(tmp_path, ending):
     colours = [(0.5, 0.05, 0.02), (0.02, 0.4, 0.1), (0.1, 0.1, 0.6), (0.9, 0.9, 0.9), (0, 0, 0)]
     path = tmp_path / f"film.{ending}"
-    made = film.Film(path, 10)
-    made.write(frames(tmp_path, colours))
+    the_film = film.Film(path, 10)
+    the_film.write(frames(tmp_path, colours))
     program = ffmpeg.get_ffmpeg_exe()
-    told = subprocess.run([program, "-i", str(path)], capture_output=True, text=True).stderr
-    assert "32x20" in told and "10 fps" in told and "sRGB curve" in told and "bt709" in told
+    output = subprocess.run([program, "-i", str(path)], capture_output=True, text=True).stderr
+    assert "32x20" in output and "10 fps" in output and "sRGB curve" in output and "bt709" in output
     read = [program, "-v", "error", "-i", str(path), "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
     shown = np.frombuffer(subprocess.run(read, capture_output=True, check=True).stdout, np.uint8).reshape(-1, 20, 32, 3)
     assert len(shown) == 5
-    for found, colour in zip(shown, colours, strict=True):
-        expected = made.toned({c: np.float32([[v]]) for c, v in zip("RGB", colour, strict=True)})[0, 0]
-        np.testing.assert_allclose(found[10, 16].astype(int), expected, atol=4)  # 8-bit Y'CbCr, lossy
+    for pixels, colour in zip(shown, colours, strict=True):
+        expected = the_film.toned({c: np.float32([[v]]) for c, v in zip("RGB", colour, strict=True)})[0, 0]
+        np.testing.assert_allclose(pixels[10, 16].astype(int), expected, atol=4)  # 8-bit Y'CbCr, lossy
     assert sorted(p.name for p in tmp_path.iterdir()) == ["film." + ending, *(f"frame_000{i}.exr" for i in range(5))]
 
 

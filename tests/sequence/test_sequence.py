@@ -1,4 +1,4 @@
-"""Frames in files: what they show, going on, checking, shards."""
+"""Frames in files: their pixels, resuming, checking, shards."""
 
 import json
 import os
@@ -103,12 +103,13 @@ def test_the_command_renders_goes_on_and_checks(scene, circle, tmp_path, capsys)
     (out / "frame_0003.exr").write_bytes(whole["frame_0000.exr"])
     capsys.readouterr()
     assert cli.main([*words, "--check"]) == 1
-    told = capsys.readouterr()
-    found = json.loads(told.out)
-    assert found["done"] == 0 and len(found["missing"]) == 1 and len(found["broken"]) == 2 and len(found["other"]) == 1
+    printed = capsys.readouterr()
+    result = json.loads(printed.out)
+    assert result["done"] == 0
+    assert [len(result[kind]) for kind in ("missing", "broken", "other")] == [1, 2, 1]
     for i in range(4):
-        assert f"frame_000{i}.exr" in told.err
-    assert '"position": [3.0, 3.0, 2.5]' in found["other"][0]
+        assert f"frame_000{i}.exr" in printed.err
+    assert '"position": [3.0, 3.0, 2.5]' in result["other"][0]
 
     assert cli.main(words) == 0
     assert contents(out) == whole
@@ -118,15 +119,15 @@ def test_the_command_renders_goes_on_and_checks(scene, circle, tmp_path, capsys)
 
 def test_a_changed_field_makes_frames_old(scene, tmp_path, field):
     path = scene()
-    own = tmp_path / "own.safetensors"
-    own.write_bytes(field.read_bytes())
+    copy = tmp_path / "own.safetensors"
+    copy.write_bytes(field.read_bytes())
     path.write_text(path.read_text().replace(str(field), "own.safetensors"))
     (task,) = tasks(path, tmp_path / "out", [Frame(0)])
     before = work.key(task)
     assert work.key(task) == before
-    data = bytearray(own.read_bytes())
+    data = bytearray(copy.read_bytes())
     data[-1] ^= 1
-    own.write_bytes(data)
+    copy.write_bytes(data)
     assert work.key(task) != before
 
 
@@ -184,7 +185,7 @@ def kept_maps(monkeypatch):
 
 
 def test_nothing_is_compiled_and_nothing_piles_up_after_the_second_frame(scene, tmp_path, kept_maps):
-    """Radiosity between patches, maps, camera and light all move."""
+    """The scene has radiosity between patches and maps; camera and light move."""
     frames = [Frame(i, {"visibility": "transmittance_map", "depth": "4"},
                     {"origin": [2 + 0.1 * i, 1.5, 6], "target": [0.4, -0.2, 0.3]},
                     {"lamp": {"position": [3 - 0.2 * i, 3, 2.5]}}) for i in range(5)]
@@ -203,12 +204,12 @@ def test_nothing_is_compiled_and_nothing_piles_up_after_the_second_frame(scene, 
 
 
 def test_of_several_lights_those_that_moved_get_maps_anew(scene, tmp_path, kept_maps, monkeypatch):
-    """And pictures have the bits that they have where all maps are made at once."""
-    made = []
+    """The pictures are those of maps that are all made at once, bit by bit."""
+    made_rows = []
     joined = map_cache._joined
 
     def counting(each, some, count):
-        return joined(each, lambda rows: made.append(rows.tolist()) or some(rows), count)
+        return joined(each, lambda rows: made_rows.append(rows.tolist()) or some(rows), count)
 
     monkeypatch.setattr(map_cache, "_joined", counting)
     values = {"visibility": "transmittance_map", "spp": "4"}
@@ -216,15 +217,15 @@ def test_of_several_lights_those_that_moved_get_maps_anew(scene, tmp_path, kept_
     line = tasks(scene(LIGHTS), tmp_path / "out", frames)
     for task in line:
         work.render(task)
-    assert made == [[512 + 1]]  # after the constant light's, and the lamp
+    assert made_rows == [[512 + 1]]  # after the constant light's, and the lamp
     first = contents(tmp_path / "out")
     map_cache.forget()
     work.render(line[1])
-    assert made == [[512 + 1]] and contents(tmp_path / "out") == first
+    assert made_rows == [[512 + 1]] and contents(tmp_path / "out") == first
 
 
 def test_killed_three_times_it_ends_as_if_undisturbed(scene, circle, tmp_path):
-    """Every frame once; kill -9 at moments spread over the run, wherever that is."""
+    """The process gets kill -9 at moments spread over the run."""
     path = scene()
     program = [str(Path(sys.executable).parent / "mi-ntf"), "sequence", str(path), "--timeline", str(circle), "-D",
                "visibility=transmittance_map", "-o"]

@@ -19,21 +19,21 @@ def test_linear_and_step_keys():
 
 
 def test_catmull_rom_repeats_every_parabola():
-    """Three keys determine one; slopes at keys are those of it, so that Hermite's cubic is the parabola."""
+    """Three keys determine a parabola. Hermite's cubic with its slopes is the parabola itself."""
     def parabola(x):
         return 2 - 3 * x + 0.5 * x * x
     at = np.linspace(0, 7, 15)
-    found = curve([[x, parabola(x)] for x in (0.0, 2.0, 7.0)], "catmull-rom", at)
-    np.testing.assert_allclose(found, parabola(at), atol=1e-12)
+    values = curve([[x, parabola(x)] for x in (0.0, 2.0, 7.0)], "catmull-rom", at)
+    np.testing.assert_allclose(values, parabola(at), atol=1e-12)
 
 
 def test_monotone_agrees_with_scipys_pchip_and_never_leaves_its_keys():
     interpolate = pytest.importorskip("scipy.interpolate")
     frames, values = [0, 3, 4, 9, 12, 13], [0.0, 5.0, 5.2, 1.0, 1.0, 4.0]
     at = np.linspace(0, 13, 131)
-    found = np.array(curve([list(k) for k in zip(frames, values, strict=True)], "monotone", at))
-    np.testing.assert_allclose(found, interpolate.PchipInterpolator(frames, values)(at), atol=1e-12)
-    assert found.min() == 0 and found.max() == pytest.approx(5.2, abs=1e-12)
+    curve_values = np.array(curve([list(k) for k in zip(frames, values, strict=True)], "monotone", at))
+    np.testing.assert_allclose(curve_values, interpolate.PchipInterpolator(frames, values)(at), atol=1e-12)
+    assert curve_values.min() == 0 and curve_values.max() == pytest.approx(5.2, abs=1e-12)
 
 
 def test_smooth_is_monotone_for_numbers_and_catmull_rom_for_positions():
@@ -105,9 +105,9 @@ def test_what_a_timeline_says_of_its_frames(tmp_path):
 def test_a_wrong_timeline_is_one_clear_error(tmp_path, text, says):
     path = tmp_path / "t.toml"
     path.write_text(text)
-    with pytest.raises(MiNtfError, match=says) as found:
+    with pytest.raises(MiNtfError, match=says) as error:
         timeline.read(path)
-    assert str(path) in str(found.value)
+    assert str(path) in str(error.value)
 
 
 def test_a_table_of_parameters(tmp_path):

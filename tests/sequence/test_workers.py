@@ -16,8 +16,8 @@ def test_frames_of_two_workers_are_those_of_one(scene, tmp_path, monkeypatch):
     frames = [Frame(i, {}, {}, {"lamp": {"position": [3.0 - i, 3.0, 2.5]}}) for i in range(4)]
     command.run(command.tasks_of(path, tmp_path / "one", frames), quiet=True)
     two = command.tasks_of(path, "two", frames)
-    found = command.run(two, quiet=True, workers=Workers("local", 2))
-    assert (found.rendered, found.kept, len(found.each_of)) == (4, 0, 4)
+    summary = command.run(two, quiet=True, workers=Workers("local", 2))
+    assert (summary.rendered, summary.kept, len(summary.each_of)) == (4, 0, 4)
     assert [p.name for p in sorted((tmp_path / "two").iterdir())] == [f"frame_000{i}.exr" for i in range(4)]
     for image in (tmp_path / "one").iterdir():
         assert (tmp_path / "two" / image.name).read_bytes() == image.read_bytes()

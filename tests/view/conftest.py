@@ -18,7 +18,7 @@ def variant():
 
 @pytest.fixture(scope="session")
 def folder(tmp_path_factory):
-    """Field, skies, and ``scene(*lights)`` → a scene file."""
+    """Folder with a field and two skies."""
     mi.set_variant(VARIANT)
     where = scenes.write_blobs(tmp_path_factory.mktemp("view") / "scene", log_density=3.0).parent
     v, u = np.mgrid[:8, :16] / 8

@@ -1,4 +1,4 @@
-"""`mi-ntf view` in a browser without a screen: a light is dragged, the picture changes, nobody else is asked."""
+"""`mi-ntf view` in a headless browser: a light is dragged, the picture changes, no other server is contacted."""
 
 import io
 import re
@@ -24,7 +24,7 @@ IN_VIEW = POINT.replace('x="3.4" y="3" z="2.5"', 'x="0.9" y="0.5" z="1.8"').repl
 
 @pytest.fixture
 def served(scene):
-    """The program's address, and the scene file."""
+    """Address of the running program, and its scene file."""
     path = scene(IN_VIEW, name="served.xml")
     command = [sys.executable, "-m", "mi_ntf", "view", str(path), "--size", "48", "--samples", "4", "--port", "8090"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as program:
@@ -51,7 +51,7 @@ def page():
 
 
 def on_screen(canvas, pose, point):
-    """Where a scene point is on the page."""
+    """Return the place of a scene point on the page."""
     matrix = np.linalg.inv(pose.matrix)
     x, y, z = (matrix @ [*point, 1])[:3]
     scale = 0.5 * canvas["height"] / np.tan(np.radians(pose.fov) / 2) / z
@@ -59,7 +59,7 @@ def on_screen(canvas, pose, point):
 
 
 def rested(page):
-    """The picture on the page, when all its samples are there."""
+    """Return the picture on the page after all its samples."""
     page.get_by_text(re.compile("4 samples a pixel")).wait_for(timeout=60_000)
     time.sleep(0.5)  # until it is painted
     return np.array(Image.open(io.BytesIO(page.locator("canvas").first.screenshot())).convert("RGB"))
@@ -67,9 +67,9 @@ def rested(page):
 
 def test_a_light_is_dragged(page, served, tmp_path):
     address, path = served
-    asked, faults = set(), []
-    page.on("request", lambda request: asked.add(urlsplit(request.url.removeprefix("blob:")).netloc))
-    page.on("websocket", lambda socket: asked.add(urlsplit(socket.url).netloc))
+    hosts, faults = set(), []
+    page.on("request", lambda request: hosts.add(urlsplit(request.url.removeprefix("blob:")).netloc))
+    page.on("websocket", lambda socket: hosts.add(urlsplit(socket.url).netloc))
     page.on("console", lambda message: faults.append(message.text) if message.type == "error" else None)
     page.on("pageerror", lambda error: faults.append(str(error)))
     page.goto(address)
@@ -90,7 +90,7 @@ def test_a_light_is_dragged(page, served, tmp_path):
     page.screenshot(path=tmp_path / "page.png")
 
     assert np.abs(after.astype(float) - before).mean() > 2  # of 255
-    assert asked == {urlsplit(address).netloc}
+    assert hosts == {urlsplit(address).netloc}
     assert faults == []
 
     page.get_by_role("button", name="Save XML").click()

@@ -1,4 +1,4 @@
-"""Who may see and move a page: who has its address, from no other page."""
+"""Access to a page: only with its address, and from no other page."""
 
 import urllib.error
 import urllib.request
@@ -69,7 +69,7 @@ def test_other_servers_of_the_process_are_left_alone(address):
 
 
 def test_a_server_that_asks_nobody_is_not_left_running(monkeypatch):
-    """viser might start it otherwise some day."""
+    """A later viser might start its server in another way."""
     stopped = []
     monkeypatch.setattr(viser, "ViserServer", type("Other", (), {
         "__init__": lambda self, **options: None, "stop": lambda self: stopped.append(self)}))

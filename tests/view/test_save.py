@@ -1,4 +1,4 @@
-"""What is saved is the scene that was seen."""
+"""A saved scene is the scene that was seen."""
 
 import dataclasses
 from xml.etree import ElementTree as ET
@@ -16,7 +16,7 @@ from mi_ntf.view.save import save
 from mi_ntf.view.session import Session
 
 SAME = 1e-4
-"""Relative RMSE: the file has nine digits, of places that float32 rounds again."""
+"""Relative RMSE. The file has nine digits, and float32 rounds them again."""
 
 
 def fresh(path, **define):
@@ -24,7 +24,7 @@ def fresh(path, **define):
 
 
 def change(view):
-    """Something of everything."""
+    """Change one thing of each kind."""
     point, second, spot, directional, sky = view.lights
     point.move([-2.0, 3.5, 3.0])
     second.dim(3)
@@ -38,14 +38,14 @@ def change(view):
 
 
 def test_a_saved_scene_is_the_one_that_was_seen(scene, tmp_path):
-    """In another folder, from where field and sky are elsewhere."""
+    """The saved file is in another folder than field and sky."""
     view = Session(scene(POINT, SECOND, SPOT, DIRECTIONAL, ENVIRONMENT), {"visibility": "raymarch"}, 32)
     before = view.refine().image
     change(view)
-    seen = view.refine().image
+    shown = view.refine().image
     save(view, tmp_path / "new" / "saved.xml")
-    assert relative_rmse(before, seen) > 0.2
-    assert relative_rmse(fresh(tmp_path / "new" / "saved.xml"), seen) < SAME
+    assert relative_rmse(before, shown) > 0.2
+    assert relative_rmse(fresh(tmp_path / "new" / "saved.xml"), shown) < SAME
 
 
 def test_only_what_was_changed_is_written_anew(scene, tmp_path):
@@ -85,21 +85,21 @@ def test_lights_of_included_files_are_saved(scene):
 
 
 def test_the_environment_is_swapped(scene):
-    """And keeps what was done before: a light elsewhere, the sky turned."""
+    """Earlier changes stay: a moved light, a turned sky."""
     view = Session(scene(POINT, ENVIRONMENT), {}, 32)
     view.lights[0].move([-2.0, 3.5, 3.0])
     view.lights[1].turn(40)
     before = view.refine().image
     other = next(p for p in environments.beside(view) if p.name == "other.exr")
     environments.swap_environment(view, other)
-    seen = view.refine().image
+    shown = view.refine().image
     view.lights[1].turn(60)
     turned = view.refine().image
     save(view, view.path.with_name("saved.xml"))
     assert '"other.exr"' in view.path.with_name("saved.xml").read_text()
     truth = fresh(view.path.with_name("saved.xml"))
     assert relative_rmse(turned, truth) < SAME
-    assert min(relative_rmse(before, seen), relative_rmse(seen, turned)) > 0.01
+    assert min(relative_rmse(before, shown), relative_rmse(shown, turned)) > 0.01
 
 
 def test_the_first_choice_is_the_scenes_own_environment(scene):

@@ -96,21 +96,21 @@ def test_passes_add_up(scene):
 def test_only_the_layer_of_a_moved_light_is_rendered_and_its_map_alone_made(scene, monkeypatch):
     monkeypatch.setenv("MI_NTF_CACHE", "memory")
     map_cache.forget()
-    made = []
+    map_sizes = []
     cached = map_cache.cached
     monkeypatch.setattr(map_cache, "cached", lambda name, make, count, *rest, **options: cached(
-        name, lambda *values: (made.append(count), make(*values))[1], count, *rest, **options))
+        name, lambda *values: (map_sizes.append(count), make(*values))[1], count, *rest, **options))
     view = session(scene(POINT, SECOND, ENVIRONMENT))
     view.preview()
     picture = view._previews[0]
     one, sky = 2 * 48**2, 2 * 16 * 48**2
-    assert (picture.rendered, made) == ([(0,), (1,), (2,)], [one, one, sky])
+    assert (picture.rendered, map_sizes) == ([(0,), (1,), (2,)], [one, one, sky])
     view.lights[1].move([-2.0, 2.5, 3.0])
     view.preview()
-    assert (picture.rendered[3:], made[3:]) == ([(1,)], [one])
+    assert (picture.rendered[3:], map_sizes[3:]) == ([(1,)], [one])
     view.look(dataclasses.replace(view.pose, origin=(-2.0, 1.0, 5.0)))
     view.preview()
-    assert (picture.rendered[4:], made[4:]) == ([(0,), (1,), (2,)], [])
+    assert (picture.rendered[4:], map_sizes[4:]) == ([(0,), (1,), (2,)], [])
 
 
 @pytest.mark.parametrize("visibility", ["transmittance_map", "raymarch"])
@@ -168,8 +168,8 @@ def test_other_outputs(scene):
     view = session(scene(POINT, SECOND))
     view.choose(aov="normal")
     image = view.preview().image
-    seen = np.abs(image).max(-1) > 0
-    assert image.shape == (32, 32, 3) and np.allclose(np.linalg.norm(image[seen], axis=-1), 1, atol=1e-5)
+    is_hit = np.abs(image).max(-1) > 0
+    assert image.shape == (32, 32, 3) and np.allclose(np.linalg.norm(image[is_hit], axis=-1), 1, atol=1e-5)
     view.choose(aov="depth")
     depth = view.refine().image[..., 0]
     assert 3 < depth[depth > 0].min() and depth.max() < 8  # the camera is 5.3 away
@@ -195,8 +195,8 @@ def test_a_pass_ends_when_something_moves_and_leaves_nothing_behind(scene, monke
     truth = view.refine(1).image.copy()
     view.look(view.pose)
     view._finals[0].context.rays_in_flight = 512  # two chunks
-    asked = []
-    view.stop = lambda: asked.append(1) or len(asked) > 1
+    calls = []
+    view.stop = lambda: calls.append(1) or len(calls) > 1
     with pytest.raises(Interrupted):
         view.refine()
     view.stop, view._finals[0].chunk = (lambda: False), rendering.CHUNK
