@@ -1,8 +1,12 @@
 """The figure of `mi-ntf tradeoff` and of `make demo`: error over seconds, one curve for each way to render."""
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 from ..data.page import GREY
+from .limits import Json
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 COLOURS = {
     "raymarch": "#3b82e0", "transmittance_map": "#e0433a", "transmittance_atlas": "#2f9e44",
@@ -10,14 +14,15 @@ COLOURS = {
     "visibility_mlp": "#d6409f", "volpath": "#8a6d3b", "mesh": "#64748b", "none": GREY,
 }
 """Colour of each method in every figure."""
-DASHES: tuple[Any, ...] = ((0, (5, 2)), (0, (1, 1.5)), (0, (5, 2, 1, 2)), (0, (9, 3)), (0, (3, 1, 1, 1, 1, 1)))
-"""Dashes of a method's finer dials, in their order."""
+DASHES = ((0, (5, 2)), (0, (1, 1.5)), (0, (5, 2, 1, 2)), (0, (9, 3)), (0, (3, 1, 1, 1, 1, 1)))
+"""Dashes of the finer dials of a method, in their order."""
 
 
-def draw(axes, result: dict[str, Any], fontsize: float = 11.0) -> None:
+def draw(axes: "Axes", result: Json, fontsize: float = 11.0) -> None:
     """Draw the curves of ``tradeoff.json`` onto `axes`, their names beside them, and the Pareto front.
 
-    A curve's band is one standard error wide. Methods have the colours of `COLOURS`, finer dials of one other dashes.
+    The band of a curve is one standard error wide. Methods have the colours of `COLOURS`; finer dials of a method have
+    different dashes.
     """
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
@@ -27,16 +32,16 @@ def draw(axes, result: dict[str, Any], fontsize: float = 11.0) -> None:
     finer: dict[str, int] = {}
     for row in result["ways"]:
         points = [p for p in row["points"] if p["error"] > 0]
-        bound, dash = row["method"] == "none", "-"
+        bound, colour = row["method"] == "none", COLOURS.get(row["method"], "#111111")
+        dash: str | tuple[int, tuple[float, ...]] = (0, (2, 2)) if bound else "-"
         if row["finer"]:
             count = finer[row["method"]] = finer.get(row["method"], -1) + 1
             dash = DASHES[count % len(DASHES)]
-        look = {"color": COLOURS.get(row["method"], "#111111"), "linewidth": 1.3 if bound else 2}
         x, y = [p["seconds"] for p in points], [p["error"] for p in points]
-        axes.plot(x, y, linestyle=(0, (2, 2)) if bound else dash, marker="none" if bound else "o", markersize=4,
-                  zorder=2 if bound else 3, label=row["title"] + (" (a bound)" if bound else ""), **look)
+        axes.plot(x, y, linestyle=dash, marker="none" if bound else "o", markersize=4, zorder=2 if bound else 3,
+                  label=row["title"] + (" (a bound)" if bound else ""), color=colour, linewidth=1.3 if bound else 2)
         low = [max(p["error"] - p["error_uncertainty"], p["error"] / 2) for p in points]
-        axes.fill_between(x, low, [p["error"] + p["error_uncertainty"] for p in points], color=look["color"],
+        axes.fill_between(x, low, [p["error"] + p["error_uncertainty"] for p in points], color=colour,
                           alpha=0.12, linewidth=0)
     axes.set(xscale="log", yscale="log")
     axes.set_xlabel("seconds, building included, compilation apart", fontsize=fontsize)

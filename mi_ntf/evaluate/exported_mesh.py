@@ -1,4 +1,4 @@
-"""A scene with meshes of its fields in their places: what a user would render instead of the fields."""
+"""A scene whose fields are replaced by exported meshes, as a user would render it without this package."""
 
 import os
 import shlex
@@ -8,7 +8,7 @@ from typing import Any
 
 import mitsuba as mi
 
-from ..render.scene.media import ordinary_shapes
+from ..render.scene.media import NRFMedium, ordinary_shapes
 
 
 class ExportedMesh:
@@ -21,18 +21,18 @@ class ExportedMesh:
     media
         Its ``nrf`` media.
     folder
-        Where the meshes are written.
+        Folder for the meshes.
 
     Attributes
     ----------
     scene
         The scene with meshes.
     shapes
-        XML of the shapes that replace those around the fields, meshes named as `commands` write them.
+        XML of the shapes that replace those around the fields, with the file names of `commands`.
     commands
         Shell commands that make the meshes.
     seconds
-        Time of the export.
+        Duration of the export.
 
     Raises
     ------
@@ -40,7 +40,7 @@ class ExportedMesh:
         If a field has no surface, or libraries are missing.
     """
 
-    def __init__(self, loaded: Any, media: list, folder: Path):
+    def __init__(self, loaded: "mi.Scene", media: list[NRFMedium], folder: Path):
         from mi_ntf.export import export, mitsuba_shape
 
         start, shapes = time.perf_counter(), ordinary_shapes(loaded)
@@ -48,7 +48,7 @@ class ExportedMesh:
         parts: list[Any] = [loaded.sensors()[0], *lights, *shapes]
         self.shapes, self.commands = "", ""
         level = mi.log_level()
-        mi.set_log_level(mi.LogLevel.Error)  # Mitsuba warns of the roughness, for which its plugin has no place
+        mi.set_log_level(mi.LogLevel.Error)  # Mitsuba warns of the roughness, which its plugin ignores
         try:
             for i, medium in enumerate(media):
                 name = f"{Path(medium.path).stem}{i or ''}.ply"

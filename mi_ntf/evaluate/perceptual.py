@@ -23,8 +23,8 @@ def lpips(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = No
     """Return LPIPS (Zhang et al. 2018, AlexNet, version 0.1) of the sRGB-encoded, clipped images; 0 is perfect.
 
     Arguments are those of :mod:`.metrics`. With a mask, the mean is over its pixels in the map of all layers, each
-    resized to the image. Raises :class:`NotMeasured` below 31×31 pixels, and where the package ``lpips`` or the weights of
-    AlexNet are missing.
+    resized to the image. Raises :class:`NotMeasured` below 31×31 pixels, and where the package ``lpips`` or the weights
+    of AlexNet are missing.
     """
     need_pixels(image, SMALLEST)
     network = _network()

@@ -3,7 +3,7 @@
 import re
 import shlex
 from pathlib import Path
-from typing import Any
+from typing import TypeAlias
 from xml.etree import ElementTree
 from xml.sax.saxutils import quoteattr
 
@@ -11,18 +11,22 @@ import mitsuba as mi
 
 from ..render.scene import changed
 
+Value: TypeAlias = bool | int | float | str
+Properties: TypeAlias = dict[str, Value]
+"""Properties of an integrator by name."""
+
 _TAGS = {bool: "boolean", int: "integer", float: "float", str: "string"}
 
 
-def integrator_xml(plugin: str, properties: dict[str, Any]) -> str:
-    """Return the element ``<integrator>``. Properties of ``nrf`` that have their default values are left out."""
+def integrator_xml(plugin: str, properties: Properties) -> str:
+    """Return the element ``<integrator>`` without the properties of ``nrf`` that have their default values."""
     default = mi.load_dict({"type": plugin})
     lines = [f'    <{_TAGS[type(value)]} name="{name}" value={quoteattr(_text(value))}/>'
              for name, value in properties.items() if plugin != "nrf" or value != getattr(default, name)]
     return "\n".join([f'<integrator type="{plugin}">', *lines, "</integrator>"]) + "\n"
 
 
-def render_command(scene: Path, parameters: dict[str, str], properties: dict[str, Any], samples: int) -> str:
+def render_command(scene: Path, parameters: dict[str, str], properties: Properties, samples: int) -> str:
     """Return the shell command that renders a scene whose integrator is ``nrf``.
 
     Parameters
@@ -30,14 +34,14 @@ def render_command(scene: Path, parameters: dict[str, str], properties: dict[str
     scene, parameters
         The scene file, and values of its $names.
     properties
-        Properties that the integrator is to have; others are to have their defaults, so that no limits hold.
+        Properties of the integrator. All others must have their defaults, so that no limits apply.
     samples
-        Samples a pixel, where the scene has the name $spp for them.
+        Samples a pixel, if the scene takes them from $spp.
 
     Returns
     -------
     str
-        "" where the scene's $names cannot say all of the properties.
+        The command; "" where the scene's $names cannot set all of the properties.
     """
     element = ElementTree.parse(scene).getroot().find("integrator")
     texts = {} if element is None else {e.get("name", ""): e.get("value", "") for e in element}
@@ -46,30 +50,29 @@ def render_command(scene: Path, parameters: dict[str, str], properties: dict[str
     known = parameters | {names[name]: _text(value) for name, value in properties.items()
                           if name in names and written.get(name, getattr(default, name)) != value}
     for more, count in (({"spp": str(samples)}, samples), ({}, 0)):
-        if _says(scene, known | more, properties, count):
+        if _sets(scene, known | more, properties, count):
             defined = [word for name, value in (known | more).items() for word in ("-D", f"{name}={value}")]
             return shlex.join(["mi-ntf", "render", *defined, "-o", "picture.exr", str(scene)])
     return ""
 
 
-def _text(value: Any) -> str:
+def _text(value: Value) -> str:
     return str(value).lower() if isinstance(value, bool) else f"{value:.9g}" if isinstance(value, float) else str(value)
 
 
-def _integrator(scene: Path, parameters: dict[str, str]) -> tuple[dict[str, Any], list[int]]:
-    """Return the properties of a scene's integrator, and its samplers' samples a pixel."""
+def _integrator(scene: Path, parameters: dict[str, str]) -> tuple[Properties, list[int]]:
+    """Return the properties of a scene's integrator, and the samples a pixel of its samplers."""
     nodes = changed.parsed(scene, parameters).nodes
     properties = next(node.props for node in nodes if node.type == mi.ObjectType.Integrator)
     counts = [node.props.get("sample_count", 0) for node in nodes if node.type == mi.ObjectType.Sampler]
     return {name: properties[name] for name in properties.keys()}, counts
 
 
-def _says(scene: Path, parameters: dict[str, str], properties: dict[str, Any], samples: int) -> bool:
-    """Return True if the scene with `parameters` has an integrator of these properties, and so many samples a pixel
-    unless they are 0."""
+def _sets(scene: Path, parameters: dict[str, str], properties: Properties, samples: int) -> bool:
+    """Return True if the scene with `parameters` has such an integrator, and `samples` a pixel unless they are 0."""
     try:
         known, counts = _integrator(scene, parameters)
-    except RuntimeError:  # a name that the scene does not have
+    except RuntimeError:  # the scene lacks a name
         return False
     default = mi.load_dict({"type": "nrf"})
     same = all(known.get(name, getattr(default, name)) == value for name, value in properties.items())

@@ -11,7 +11,7 @@ from helpers.programs import run_program
 from helpers.variants import VARIANT
 
 from mi_ntf.core.errors import MiNtfError
-from mi_ntf.evaluate import budget, mesh_reference, recipes
+from mi_ntf.evaluate import budget, recipes
 from mi_ntf.evaluate.curves import COLOURS
 from mi_ntf.evaluate.exported_mesh import ExportedMesh
 from mi_ntf.evaluate.tradeoff import measure, references, ways
@@ -108,8 +108,9 @@ def test_the_plan_begins_with_every_method(subject):
     plan = ways.plan(subject, True)
     first = [way for way in plan if not way.changes]
     assert plan[: len(first)] == first
-    assert {way.method for way in first} == {*subject.serves, ways.STOCK, ways.MESH}
-    assert "visibility_mlp" not in subject.serves and "transmittance_map" in subject.serves  # the field lacks a network
+    assert {way.method for way in first} == {*subject.methods, ways.STOCK, ways.MESH}
+    assert "visibility_mlp" not in subject.methods  # the field lacks its network
+    assert "transmittance_map" in subject.methods
     assert not any(way.method == ways.MESH for way in ways.plan(subject, False))
     finer = [way.changes[0][0] for way in plan if way.changes]
     assert {"map_resolution", "map_components", "samples"} <= set(finer) and "environment_lights" not in finer
@@ -119,7 +120,7 @@ def test_the_plan_begins_with_every_method(subject):
 def test_many_lights_may_be_drawn_and_are_summed_by_maps(folder):
     sky = Subject(folder / "sky.xml", {})
     plan = ways.plan(sky, False)
-    drawn = {way.method for way in plan if ("light_samples", ways.DRAWN) in way.changes}
+    drawn = {way.method for way in plan if ("light_samples", ways.SAMPLED) in way.changes}
     assert {"raymarch", "transmittance_atlas"} <= drawn and "transmittance_map" not in drawn
     cells = {way.method: way.changes[0][1] for way in plan if way.changes and way.changes[0][0] == "environment_lights"}
     assert cells["transmittance_map"] == 8 and cells["raymarch"] == 128  # of 32
@@ -166,7 +167,7 @@ def test_a_scene_without_the_names_has_no_command(folder, subject):
 def test_stock_volpath_agrees_with_the_converged_march(subject):
     """By brightness; each is followed for some seconds, and the march's noise is part of the standard error."""
     marching = references.renderer(subject, references.marched(subject), 1)
-    truth, _ = references.converge(marching, 24 * 24, 2.0, lambda text: None)
+    truth, _ = references.converge(marching, 24 * 24, 96, 2.0, lambda text: None)
     curve = follow(references.renderer(subject, Way(ways.STOCK), 1), 3.0, truth=truth)
     gap, sigma = curve.shift
     assert abs(gap) < 4 * sigma and sigma < 0.03
@@ -183,7 +184,7 @@ def test_further_light_of_the_reference_is_traced(folder):
     finer = {way.method for way in ways.plan(subject, False) if ("bounces", "paths") in way.changes}
     assert "transmittance_map" in finer
     marching, between = (references.renderer(subject, way, 1) for way in (references.marched(subject), Way("raymarch")))
-    truth, _ = references.converge(marching, 24 * 24, 2.0, lambda text: None)
+    truth, _ = references.converge(marching, 24 * 24, 96, 2.0, lambda text: None)
     stock = follow(references.renderer(subject, Way(ways.STOCK), 1), 4.0, truth=truth)
     assert abs(stock.shift[0]) < 4 * stock.shift[1] and stock.shift[1] < 0.03
     assert between(1, 0)[0].mean() > 0
@@ -217,11 +218,11 @@ def test_the_picture_shrinks_until_the_reference_fits(folder):
 
 
 def test_pictures_of_the_mesh_are_taken_from_files_that_fit(folder, subject, tmp_path):
-    assert mesh_reference.shipped(subject.path, {}) is None
+    assert references.shipped(subject.path, {}) is None
     (folder / "reference_point.exr").write_bytes(b"")
     try:
-        assert mesh_reference.shipped(subject.path, {}) == folder / "reference_point.exr"  # by the default of $light
-        assert mesh_reference.shipped(subject.path, {"light": "env"}) is None
+        assert references.shipped(subject.path, {}) == folder / "reference_point.exr"  # by the default of $light
+        assert references.shipped(subject.path, {"light": "env"}) is None
     finally:
         (folder / "reference_point.exr").unlink()
     path = tmp_path / "mesh.exr"

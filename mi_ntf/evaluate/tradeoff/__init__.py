@@ -1,2 +1,4 @@
-"""``mi-ntf tradeoff``: the error of a scene's picture over the seconds that it takes, by every way to render the scene.
-Begin with :mod:`mi_ntf.evaluate.tradeoff.study`."""
+"""The study of `mi-ntf tradeoff`: error over seconds of a scene's picture, for every way to render it.
+
+It begins in :mod:`mi_ntf.evaluate.tradeoff.study`.
+"""

@@ -4,11 +4,11 @@ Let a_k be pictures of s_k samples a pixel by independent seeds, m their mean we
 V, and P = mean R² − V its power. Relative to P:
 
     error² = mean (m − R)² − V                                    of the mean
-    bias²  = mean of (a_k − R)(a_l − R) over pairs k ≠ l − V      what stays, however many samples
-    noise² = error² − bias²                                       what more samples take away
+    bias²  = mean of (a_k − R)(a_l − R) over pairs k ≠ l − V      the part that remains with more samples
+    noise² = error² − bias²                                       the part that more samples remove
 
-The pairs are weighted by s_k s_l. Each estimate is right on average, and its standard error is that of a mean over
-pixels, which are taken as independent.
+The pairs are weighted by s_k s_l. Each estimate is unbiased. Its standard error is that of a mean over pixels, which
+are assumed to be independent.
 """
 
 from collections.abc import Sequence
@@ -40,7 +40,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Truth:
-    """Picture (h, w, 3) that others are held against; its mean squared noise, 0 where that is not known; and words."""
+    """Reference picture (h, w, 3), its mean squared noise (0 where that is not known), and a description."""
 
     image: np.ndarray
     variance: float = 0.0
@@ -48,7 +48,7 @@ class Truth:
 
     @property
     def power(self) -> float:
-        """Mean square of the picture without its noise. Raises MiNtfError for a black picture."""
+        """Mean square of the picture without its noise; raises MiNtfError for a black picture."""
         power = float(np.mean(np.square(self.image, dtype=np.float64))) - self.variance
         if power <= 0:
             raise MiNtfError("the reference is black, so that no relative error exists; does light reach the object?")
@@ -56,7 +56,7 @@ class Truth:
 
     @property
     def noise(self) -> float:
-        """Relative noise."""
+        """Noise relative to the picture."""
         return sqrt(self.variance / self.power)
 
 
@@ -85,7 +85,7 @@ class Mean:
         return self._estimate((self._sum / self.samples) ** 2, self._truth.variance)
 
     def split(self) -> tuple[Estimate, Estimate]:
-        """Return noise and bias of the mean. Raises MiNtfError for a single picture, which cannot tell them apart."""
+        """Return noise and bias of the mean. Raises MiNtfError for a single picture, which does not separate them."""
         if self.pictures < 2:
             raise MiNtfError("one picture cannot tell noise from bias; render two seeds")
         pairs = (self._sum**2 - self._squares) / (self.samples**2 - self._weights)
@@ -103,23 +103,23 @@ class Mean:
 
 
 def crossing(seconds: Sequence[float], values: Sequence[float], limit: float) -> float | None:
-    """Return the seconds after which the error `values` falls to `limit`, or None where no point is below it.
+    """Return the seconds after which the errors `values` fall to `limit`, or None where no point is below it.
 
     Between two points the curve is straight on log axes. An error below half of the limit counts as half of it, since
-    the logarithm of one that is measured as 0 says nothing.
+    an error may be measured as 0, which has no logarithm.
     """
     for i, value in enumerate(values):
         if value <= limit:
             if i == 0:
                 return seconds[0]
             above, below = np.log(values[i - 1]), np.log(max(value, limit / 2))
-            way = (above - np.log(limit)) / (above - below)
-            return float(seconds[i - 1] * (seconds[i] / seconds[i - 1]) ** way)
+            weight = (above - np.log(limit)) / (above - below)
+            return float(seconds[i - 1] * (seconds[i] / seconds[i - 1]) ** weight)
     return None
 
 
 def front(points: Sequence[tuple[float, float]]) -> list[int]:
-    """Return the indices of the points (seconds, error) that no other point beats in both, by seconds."""
+    """Return the indices of the points (seconds, error) of the Pareto front, in the order of seconds."""
     best, indices = np.inf, []
     for i in sorted(range(len(points)), key=lambda i: points[i]):
         if points[i][1] < best:

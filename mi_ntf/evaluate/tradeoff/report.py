@@ -1,4 +1,4 @@
-"""The report of a study: a page to read offline with its figure of curves, a table for programs, and JSON."""
+"""The report of a study: a page with the figure of curves, a table for programs, and JSON."""
 
 import csv
 import io
@@ -6,7 +6,7 @@ import json
 import sys
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import TypeAlias
 
 import numpy as np
 
@@ -14,22 +14,27 @@ from ...core import files
 from ...data.images import levels
 from ...data.page import Page, new_figure, plain
 from ..curves import draw
+from ..limits import Json
 from . import errors
 from .measure import TIMES
 from .references import ERRORS
 from .ways import BOUND, MESH, STOCK
 
 SPREAD = 0.1
-"""Standard deviation of equal renders, over their mean, above which pyperf calls a machine too noisy to trust."""
+"""Relative standard deviation of equal renders above which a machine is noisy, as in pyperf."""
+Pictures: TypeAlias = dict[str, dict[str, np.ndarray]]
+"""Pictures of each way by the seconds after which they are compared."""
 COLUMNS = ("seconds", "samples", "error", "error_uncertainty", "noise", "noise_uncertainty", "bias", "bias_uncertainty",
            "mesh_error", "mesh_error_uncertainty", "front")
 HEADER = ("way", *(f"to {limit:.0%}" for limit in ERRORS), "error at the end", "after s", "samples", "noise", "bias",
           "to the mesh")
 
 
-def write(result: dict[str, Any], reference: np.ndarray, pictures: dict[str, dict[str, np.ndarray]], out: Path) -> None:
-    """Write ``index.html``, ``tradeoff.csv`` and ``tradeoff.json`` to `out`. `result`: the study's; `reference`:
-    (h, w, 3) linear; `pictures`: those of each way, by the seconds after which they are compared."""
+def write(result: Json, reference: np.ndarray, pictures: Pictures, out: Path) -> None:
+    """Write ``index.html``, ``tradeoff.csv`` and ``tradeoff.json`` to `out`.
+
+    `result` is that of the study, and `reference` its linear picture (h, w, 3).
+    """
     files.write(out / "tradeoff.json", json.dumps(result, indent=1) + "\n")
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -41,28 +46,28 @@ def write(result: dict[str, Any], reference: np.ndarray, pictures: dict[str, dic
     page(result, reference, pictures).write(out / "index.html")
 
 
-def page(result: dict[str, Any], reference: np.ndarray, pictures: dict[str, dict[str, np.ndarray]]) -> Page:
-    """Return the page."""
+def page(result: Json, reference: np.ndarray, pictures: Pictures) -> Page:
+    """Return the page of :func:`write`."""
     sheet = Page(f"What accuracy costs: {result['title']}")
     if not result["finished"]:
-        sheet.warning("The study was interrupted, and this is what it has measured so far. The same command goes on.")
+        sheet.warning("The study was interrupted. The page shows its results so far. The same command continues it.")
     if noisy := unsteady(result):
         sheet.warning(noisy)
     if any(row["points"] for row in result["ways"]):
         sheet.section("Error over time")
         sheet.text("Each curve is one way to render the scene, with more samples from left to right. Lower is better. "
-                   "Seconds include what is built, such as maps, and leave out the compilation of kernels. Bands are "
-                   "one standard error wide. The thick grey line, the Pareto front, joins the least errors of each "
-                   "time. Without shadows is a bound: the error of not looking for visibility at all.")
+                   "Seconds include the making of maps and exclude the compilation of kernels. Bands are one standard "
+                   "error wide. The thick grey line, the Pareto front, joins the least errors of each time. Rendering "
+                   "without shadows is a bound: the error without any visibility.")
         figure = new_figure(10.5, 5.2)
         axes = figure.add_subplot()
         plain(axes)
         draw(axes, result)
         sheet.drawing(figure, "Error over seconds, one curve for each way to render", 760)
     sheet.section("Seconds to an error")
-    sheet.text("In brackets: how early or late it may be, since errors are estimates, ± one standard error. Nothing is "
-               "extrapolated: where an error is not reached, the time of that way was over before. More samples take "
-               "noise away; bias stays.")
+    sheet.text("Brackets hold the range of the time, since errors are estimates, ± one standard error. Nothing is "
+               "extrapolated: where an error is not reached, the time of that way ended before. More samples reduce "
+               "noise; bias remains.")
     lines = ["".join(f"<th>{h}</th>" for h in HEADER)]
     for row in result["ways"]:
         lines.append("".join(f'<td style="white-space: nowrap">{escape(cell)}</td>' for cell in cells(row)))
@@ -75,8 +80,8 @@ def page(result: dict[str, Any], reference: np.ndarray, pictures: dict[str, dict
     return sheet
 
 
-def unsteady(result: dict[str, Any]) -> str:
-    """Return a warning if equal renders took unequal times on the machine, else ""."""
+def unsteady(result: Json) -> str:
+    """Return a warning if equal renders took unequal times, else an empty string."""
     spread, probes = result["machine"]["spread"], result["machine"]["probe_seconds"]
     if not spread or spread <= SPREAD:
         return ""
@@ -85,8 +90,8 @@ def unsteady(result: dict[str, Any]) -> str:
             "runs.")
 
 
-def cells(row: dict[str, Any]) -> list[str]:
-    """Return the cells of a way below `HEADER`: where it failed, its name and the reason."""
+def cells(row: Json) -> list[str]:
+    """Return the cells of a way below `HEADER`, or its name and the reason if it failed."""
     if not row["points"]:
         return [row["title"], f"failed: {row['reason']}"]
     seconds, end = [p["seconds"] for p in row["points"]], row["points"][-1]
@@ -97,8 +102,8 @@ def cells(row: dict[str, Any]) -> list[str]:
         if middle is None:
             return "not reached"
         times = [f"{early:.2g}", "not reached" if late is None else f"{late:.2g}"]
-        least = "at most " if middle == seconds[0] else ""
-        return f"{least}{middle:.2g} s" + (f" ({times[0]} to {times[1]})" if times[0] != times[1] else "")
+        bound = "at most " if middle == seconds[0] else ""
+        return f"{bound}{middle:.2g} s" + (f" ({times[0]} to {times[1]})" if times[0] != times[1] else "")
 
     def estimate(name: str) -> str:
         value = end.get(name)
@@ -109,24 +114,24 @@ def cells(row: dict[str, Any]) -> list[str]:
             *map(estimate, ("noise", "bias", "mesh_error"))]
 
 
-def _recipe(row: dict[str, Any]) -> str:
-    """Return HTML that says how a way is rendered by hand."""
-    what = " and the shapes around the fields" if row["method"] == MESH else ""
-    text = Page.code(row["xml"], f"In the scene file, in place of its integrator{what}:")
+def _recipe(row: Json) -> str:
+    """Return HTML with the scene file's element and the command that render a way."""
+    shapes = " and the shapes around the fields" if row["method"] == MESH else ""
+    text = Page.code(row["xml"], f"In the scene file, in place of its integrator{shapes}:")
     text += Page.code(row["command"], "On the command line:") if row["command"] else ""
     note = f"<p>{escape(row['note'])}</p>" if row["note"] else ""
     return f"<details><summary>How to render by {escape(row['title'])}</summary>{note}{text}</details>"
 
 
-def _pictures(sheet: Page, result, reference, pictures) -> None:
-    """Add what the ways show after equal times, those that went on for half of a time at least, and the difference."""
+def _pictures(sheet: Page, result: Json, reference: np.ndarray, pictures: Pictures) -> None:
+    """Add the pictures after equal times of the ways that rendered for half of it or more, and the differences."""
     from matplotlib import colormaps
 
     scale = 0.9 / max(float(np.percentile(reference.max(-1), 99.5)), 1e-12)
     rms = max(float(np.sqrt(np.mean(np.square(reference, dtype=np.float64)))), 1e-12)
     sheet.section("Equal time")
-    sheet.text("What each way shows after the same time, and below it the difference from the reference: white is half "
-               "of the reference's root mean square, or more. Ways that had built nothing by then, or ended well "
+    sheet.text("The picture of each way after the same time, and below it the difference from the reference: white is "
+               "half of the reference's root mean square, or more. Ways that had no picture by then, or ended well "
                "before, are left out.")
     sheet.pictures([("reference", levels(reference * scale))], 144)
     for mark in TIMES:
@@ -144,19 +149,20 @@ def _pictures(sheet: Page, result, reference, pictures) -> None:
             sheet.pictures(pairs, 144)
 
 
-def _about(sheet: Page, result: dict[str, Any]) -> None:
-    """Add what errors are held against, the machine, and what was left out."""
+def _about(sheet: Page, result: Json) -> None:
+    """Add the references, the machine, and the ways that were left out."""
     sheet.section("References and machine")
     reference, machine = result["reference"], result["machine"]
     sheet.text("Errors are root mean square differences, relative to the root mean square of the reference: the same "
-               f"field by {reference['about']}. Its noise, {reference['noise']:.2%}, is taken off.")
+               f"field by {reference['about']}. Its noise, {reference['noise']:.2%}, is subtracted.")
     sheet.text(check(result))
     if result["mesh"]:
-        sheet.text(f"Errors to the mesh, the object that was captured, hold all that is lost: {result['mesh']}.")
+        sheet.text("Errors to the mesh, the object that was captured, include those of the field: "
+                   f"{result['mesh']}.")
     (width, height), (whole, _) = result["size"], result["scene_size"]
     if width != whole:
         sheet.text(f"Pictures are {width}×{height} pixels, so that the reference fits into the budget. At the scene's "
-                   f"own size a sample takes about {whole ** 2 // width ** 2} times as long, building does not.")
+                   f"own size a sample takes about {whole ** 2 // width ** 2} times as long, but maps do not.")
     spread = "" if machine["spread"] is None else (
         f" The same small render, {len(machine['probe_seconds'])} times, varied by {machine['spread']:.0%}.")
     sheet.text(f"{machine['what']}, Mitsuba {machine['mitsuba']}. The study took {result['spent_seconds']:.0f} s of "
@@ -166,11 +172,11 @@ def _about(sheet: Page, result: dict[str, Any]) -> None:
                     f"out, since the budget has less than {TIMES[-1]} s for each")
 
 
-def check(result: dict[str, Any]) -> str:
-    """Return a sentence on the reference against stock ``volpath``, which shares no code for light with it."""
+def check(result: Json) -> str:
+    """Return a sentence on the reference and stock ``volpath``, which do not share code for light."""
     stock = next((row for row in result["ways"] if row["method"] == STOCK and row["points"]), None)
     if stock is None:
-        return "Stock volpath has not checked the reference."
+        return "The reference was not compared with stock volpath."
     gap, sigma = stock["shift"]
     text = (f"The check of the reference: the mean brightness of stock volpath, after {stock['points'][-1]['samples']} "
             f"samples a pixel, differs from it by {gap:+.2%} ± {sigma:.2%}")
@@ -179,7 +185,7 @@ def check(result: dict[str, Any]) -> str:
     return f"{text}, {'no' if abs(gap) < 2 * sigma else 'perhaps a' if abs(gap) < 3 * sigma else 'a'} difference."
 
 
-def print_table(result: dict[str, Any]) -> None:
+def print_table(result: Json) -> None:
     """Print the seconds to each error."""
     from rich.console import Console
     from rich.table import Table

@@ -1,11 +1,10 @@
-"""``mi-ntf tradeoff``: the study of one scene, from its references to its report."""
+"""The study of one scene by `mi-ntf tradeoff`, from its references to its report."""
 
 import statistics
 import sys
 import threading
 import time
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 
@@ -13,10 +12,10 @@ from ... import __version__
 from ...core import files, interruption
 from ...core.errors import MiNtfError, sentence
 from ...render.machine import machine
-from .. import mesh_reference
 from ..budget import Tell, progress
 from ..exported_mesh import ExportedMesh
 from ..kept import State
+from ..limits import Json
 from ..recipes import integrator_xml, render_command
 from . import errors, references, report
 from .errors import Truth
@@ -26,48 +25,47 @@ from .ways import BOUND, MESH, Subject, Way, plan
 print_table = report.print_table
 
 REFERENCE = 0.2
-"""Share of the budget for the reference. All errors are held against it, so that it has twice the time that one of ten
-ways gets."""
+"""Fraction of the budget for the reference: twice the time of one of ten ways, since all errors are relative to it."""
 
 
 class Study:
-    """Run of a study, which takes over what an earlier run of the same study has finished.
+    """Run of a study, which continues an earlier run of the same study.
 
-    `out`, `budget` and `reference` are those of :func:`tradeoff`; `tell` hears of the progress; `pressed` is set by
-    Ctrl-C (:mod:`mi_ntf.core.interruption`).
+    `out`, `budget` and `reference` are those of :func:`tradeoff`. `tell` is called with the progress. `pressed` is set
+    by Ctrl-C (:mod:`mi_ntf.core.interruption`).
     """
 
     def __init__(self, subject: Subject, out: Path, budget: float, reference: Path | None, tell: Tell,
                  pressed: threading.Event):
         self.subject, self.budget, self._tell, self._pressed = subject, budget, tell, pressed
-        self._mesh_path, self._must_have_mesh = reference or mesh_reference.shipped(subject.path, subject.parameters), (
-            reference is not None)
+        self._mesh_path = reference or references.shipped(subject.path, subject.parameters)
+        self._needs_mesh = reference is not None
         stamp = reference and [str(reference), reference.stat().st_mtime_ns]
         self.state = State(out, {"scene": subject.key(), "version": __version__, "machine": machine(),
                                  "budget": budget, "reference": stamp})
-        self._start = time.perf_counter() - max(line.get("clock", 0.0) for line in self.state.lines.values())
+        self._start: float = time.perf_counter() - max(line.get("clock", 0.0) for line in self.state.lines.values())
         self.truth: Truth | None = None
         self.mesh: Truth | None = None
         if self.state.fresh:
-            self.tell(f"begins anew, since what lies in {out} is of another {self.state.fresh}", True)
+            self.tell(f"begins anew, since {out} holds a study of another {self.state.fresh}", True)
         elif rows := self.lines("way"):
-            self.tell(f"goes on; {len(rows)} ways are finished", True)
+            self.tell(f"continues; {len(rows)} ways are finished", True)
 
     @property
     def spent(self) -> float:
         """Seconds of the budget that are used, those of earlier runs included."""
         return time.perf_counter() - self._start
 
-    def lines(self, kind: str) -> list[dict[str, Any]]:
-        """Return what is known of each ``way`` or each ``probe``, the render that shows how steady the machine is."""
+    def lines(self, kind: str) -> list[Json]:
+        """Return the lines of each ``way``, or of each ``probe``, a render that shows the noise of the machine."""
         return [line for name, line in self.state.lines.items() if name.startswith(f"{kind} ")]
 
     def tell(self, text: str, done: bool = False) -> None:
-        """Say what is done now, or was done."""
+        """Report the work that is done now, or that is finished."""
         self._tell(self.spent, text, done)
 
     def run(self) -> None:
-        """Do all that is not done yet."""
+        """Do the work that is not finished yet."""
         shrink, marching = self._prepare()
         if "end" in self.state.lines:
             return
@@ -77,73 +75,75 @@ class Study:
         left_out = []
         for i, way in enumerate(ways):
             always = sum(not w.changes for w in ways[i:])
-            left = max(self.budget - self.spent, 0.0)
-            more = max(0, min(int(left / TIMES[-1]) - always, len(ways) - i - always))
+            remaining = max(self.budget - self.spent, 0.0)
+            more = max(0, min(int(remaining / TIMES[-1]) - always, len(ways) - i - always))
             if way.changes and not more:
                 left_out.append(way.title)
                 continue
-            # Whatever the ways before have used, each has some time.
-            self._try(way, shrink, max(left / (always + more), self.budget / 40))
+            # Each way has some time, even if those before it have used more than theirs.
+            self._try(way, shrink, max(remaining / (always + more), self.budget / 40))
             self._probe(marching)
         self._add("end", {"left_out": left_out})
 
-    def _add(self, name: str, values: dict[str, Any]) -> None:
-        """Keep a line, unless Ctrl-C has spoilt it: Mitsuba may have turned that into an error of another kind."""
+    def _add(self, name: str, values: Json) -> None:
+        """Store a line, unless Ctrl-C was pressed, which Mitsuba may have turned into another error."""
         if self._pressed.is_set():
             raise KeyboardInterrupt
         self.state.add(name, {**values, "clock": self.spent})
 
     def _prepare(self) -> tuple[int, Renderer]:
-        """Find the size of the picture, and the references. Return the former and what renders the reference."""
-        subject, lines, share = self.subject, self.state.lines, REFERENCE * self.budget
+        """Choose the size of the picture and make the references; return the former and the reference's renderer."""
+        subject, lines, seconds = self.subject, self.state.lines, REFERENCE * self.budget
         if "picture" not in lines:
-            self.tell("how large a picture the budget allows")
-            self._add("picture", {"shrink": references.choose_shrink(subject, share / 2)})
+            self.tell("choice of the picture's size")
+            self._add("picture", {"shrink": references.choose_shrink(subject, seconds / 2)})
         shrink = lines["picture"]["shrink"]
         width, height = subject.pixels(shrink)
-        render = references.renderer(subject, references.marched(subject), shrink)
+        way = references.marched(subject)
+        render = references.renderer(subject, way, shrink)
         if "reference" not in lines or not self.state.pictures("reference"):
-            made, rate = references.converge(render, width * height, max(share - self.spent, 0.0), self.tell)
-            self.state.keep("reference", {"image": made.image})
-            self._add("reference", {"variance": made.variance, "noise": made.noise, "about": made.about,
+            truth, rate = references.converge(render, width * height, int(way.properties(subject)["samples"]),
+                                              max(seconds - self.spent, 0.0), self.tell)
+            self.state.keep("reference", {"image": truth.image})
+            self._add("reference", {"variance": truth.variance, "noise": truth.noise, "about": truth.about,
                                     "probe": max(1, int(0.25 / rate))})
-            self.tell(f"reference: {made.about}, noise {made.noise:.2%}", True)
+            self.tell(f"reference: {truth.about}, noise {truth.noise:.2%}", True)
         known = lines["reference"]
         self.truth = Truth(self.state.pictures("reference")["image"], known["variance"], known["about"])
         if self._mesh_path:
             try:
-                self.mesh = references.captured(subject, self._mesh_path, shrink, share / 5)
+                self.mesh = references.captured(subject, self._mesh_path, shrink, seconds / 5)
             except MiNtfError as error:
-                if self._must_have_mesh:
+                if self._needs_mesh:
                     raise
                 self.tell(f"no mesh to compare with: {error}", True)
         return shrink, render
 
     def _probe(self, render: Renderer) -> None:
-        """Time a small render, always the same."""
-        _, took = render(self.state.lines["reference"]["probe"], 1)
-        self._add(f"probe {len(self.lines('probe'))}", {"seconds": took})
+        """Time a small render, the same in each call."""
+        _, seconds = render(self.state.lines["reference"]["probe"], 1)
+        self._add(f"probe {len(self.lines('probe'))}", {"seconds": seconds})
 
-    def _try(self, way: Way, shrink: int, share: float) -> None:
-        """Measure a way, or note why it failed."""
+    def _try(self, way: Way, shrink: int, seconds: float) -> None:
+        """Measure a way for so many seconds, or store the reason of its failure."""
         assert self.truth is not None
-        row: dict[str, Any] = {"way": way.name, "method": way.method, "title": way.title, "finer": bool(way.changes),
-                               "points": [], "reason": "", "note": "", "command": ""}
+        row: Json = {"way": way.name, "method": way.method, "title": way.title, "finer": bool(way.changes),
+                     "points": [], "reason": "", "note": "", "command": ""}
         self.tell(way.title)
         try:
             scene, properties = None, way.properties(self.subject)
             row["xml"] = integrator_xml(way.plugin, properties)
             if way.method == MESH:
-                made = ExportedMesh(self.subject.scene(shrink), self.subject.media, self.state.folder)
-                scene, row["command"], row["xml"] = made.scene, made.commands, row["xml"] + made.shapes
-                row["note"] = (f"Making the mesh took {made.seconds:.0f} s, which are not counted, as those of the "
+                mesh = ExportedMesh(self.subject.scene(shrink), self.subject.media, self.state.folder)
+                scene, row["command"], row["xml"] = mesh.scene, mesh.commands, row["xml"] + mesh.shapes
+                row["note"] = (f"Making the mesh took {mesh.seconds:.0f} s, which are not counted, as those of the "
                                "field's voxels are not for the other ways. ")
             render = references.renderer(self.subject, way, shrink, scene)
-            curve = follow(render, self.truth, self.mesh, share, lambda e: self.tell(f"{way.title}: error {e:.1%}"))
+            curve = follow(render, self.truth, self.mesh, seconds, lambda e: self.tell(f"{way.title}: error {e:.1%}"))
             end = curve.points[-1]
             if len(curve.points) == 1:
-                row["note"] += (f"A single pass takes longer than this way's share of the budget, {share:.0f} s, so "
-                                "that its noise and bias are not known.")
+                row["note"] += (f"A single pass takes longer than this way's part of the budget, {seconds:.0f} s, so "
+                                "its noise and bias are not known.")
             if way.plugin == "nrf":
                 row["command"] = render_command(self.subject.path, self.subject.parameters, properties, end["samples"])
             self.state.keep(way.name, curve.pictures)
@@ -154,8 +154,8 @@ class Study:
         self._add(f"way {way.name}", row)
         self.tell(f"{way.title}: {text}", True)
 
-    def result(self) -> dict[str, Any]:
-        """Return what ``tradeoff.json`` holds."""
+    def result(self) -> Json:
+        """Return the content of ``tradeoff.json``."""
         lines, subject, rows = self.state.lines, self.subject, self.lines("way")
         points = [p for row in rows if row["method"] != BOUND for p in row["points"]]
         ends = errors.front([(p["seconds"], p["error"]) for p in points])
@@ -174,7 +174,7 @@ class Study:
 
 
 def tradeoff(scene: Path, out: Path = Path("tradeoff"), parameters: dict[str, str] | None = None,
-             budget: float = 300.0, reference: Path | None = None, quiet: bool = False) -> dict[str, Any]:
+             budget: float = 300.0, reference: Path | None = None, quiet: bool = False) -> Json:
     """Study what accuracy costs on a scene, and write ``index.html``, ``tradeoff.csv`` and ``tradeoff.json``.
 
     Parameters
@@ -182,16 +182,25 @@ def tradeoff(scene: Path, out: Path = Path("tradeoff"), parameters: dict[str, st
     scene, parameters
         XML file with an ``nrf`` integrator, and values of its $names.
     out
-        Folder for the report, where an interrupted study goes on.
+        Folder for the report; an interrupted study there is continued.
     budget
-        Seconds.
+        Seconds of the study.
     reference
-        The captured mesh, an EXR picture or the XML file of its scene; None: what shipped scenes have.
+        The captured mesh: an EXR picture, or the XML file of its scene. None stands for the file of shipped scenes.
     quiet
-        True: no progress on stderr.
+        True to show no progress on stderr.
 
-    Returns what ``tradeoff.json`` holds. Raises MiNtfError where the scene cannot be rendered, and KeyboardInterrupt as
-    it comes, after the report of what is there.
+    Returns
+    -------
+    dict
+        The content of ``tradeoff.json``.
+
+    Raises
+    ------
+    MiNtfError
+        If the scene cannot be rendered.
+    KeyboardInterrupt
+        After Ctrl-C, when the report of the measurements so far is written.
     """
     if reference is not None and not reference.is_file():
         raise MiNtfError(f"reference {reference} does not exist; give an EXR picture or the XML file of a mesh scene")
@@ -207,7 +216,7 @@ def tradeoff(scene: Path, out: Path = Path("tradeoff"), parameters: dict[str, st
             if not pressed.is_set():
                 raise
             done = f"{len(study.lines('way'))} ways are finished; " if study else ""
-            print(f"mi-ntf: interrupted; {done}the same command goes on", file=sys.stderr)
+            print(f"mi-ntf: interrupted; {done}the same command continues the study", file=sys.stderr)
             raise KeyboardInterrupt from None
         finally:
             if study and study.truth is not None:
