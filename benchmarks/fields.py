@@ -89,8 +89,10 @@ def lights(loaded: Any) -> dict[str, dict[str, Any]]:
 
 
 def brightness(mesh: Path, field: Path, sizes: Sizes = FULL, depth: int = 2) -> dict[str, dict[str, float]]:
-    """Return ``brightness``, ``relative_rmse`` and ``aligned`` by light, and where `depth` is not 2 ``bounces`` and
-    ``mesh_bounces``."""
+    """Return ``brightness``, ``relative_rmse`` and ``aligned`` by light.
+
+    Where `depth` is not 2, ``bounces`` and ``mesh_bounces`` are added.
+    """
     size, *samples = sizes.brightness
     original: Any = mi.load_file(str(mesh), res=str(size))
     bodies = {"mesh": {f"shape{i}": s for i, s in enumerate(original.shapes())},

@@ -87,8 +87,10 @@ def mean_over_scenes(kind: str, metric: str, method: str, dropped: bool = False)
 
 
 def ideal_speed_up(lights: int, samples: int = IMAGE_SAMPLES) -> float:
-    """Return the queries of NRF over those of TM, reflectance included (section 5): 2n/(n + 1) for one light, n for
-    many."""
+    """Return the queries of NRF over those of TM, reflectance included (section 5).
+
+    It is 2n/(n + 1) for one light, and n for many.
+    """
     return (lights * samples + samples) / (lights + samples)
 
 

@@ -32,6 +32,7 @@ TABLE = re.compile(r"(<!-- table: ([\w-]+) -->\n)(.*?)(<!-- end -->)", re.S)
 VALUE = re.compile(r"(<!-- value: (\S+) (\S+) -->)(.*?)(<!-- end -->)")
 FORMATS: dict[str, Callable[[float], str]] = {"percent": lambda v: f"{100 * v:.1f} %", "s": lambda v: _seconds(v)}
 LIGHTS = {"point": "point light", "env": "environment map"}
+METHODS = ("raymarch", "transmittance_atlas", "neural_transmittance")
 Values = dict[str, Any]
 
 
@@ -87,11 +88,17 @@ def demo_rows(rows: list[Values], full: bool) -> str:
 
 
 def speed(values: Values) -> str:
-    """Return the rows of the README."""
+    """Return the rows of the README; the first is that of `benchmarks.loops`, if it was measured."""
     def times(key: str) -> str:
         return f"{number(values[key]['median'])} ×"
 
-    rows = [
+    rows = []
+    if (record.RESULTS / "loops.json").is_file():
+        whole = record.read("loops")["values"]["whole"]["statue"]
+        named = [f"`{m}` ({percent(whole[m]['error'])} error)" for m in METHODS[1:]]
+        rows.append([f"whole picture, `raymarch` over {'; over '.join(named)}",
+                     "; ".join(f"{number(whole[m]['ratio']['median'])} ×" for m in METHODS[1:])])
+    rows += [
         ["transmittance of 500 lights, networks of the paper's size: volume over map, unculled (391 ×)",
          times("stage_unculled")],
         ["the same, whole picture: unculled (92 ×); culled on both sides",
@@ -129,9 +136,6 @@ def _loops(case: str) -> Callable[[Values], str]:
         return [spread(row["seconds"], form=_seconds), spread(row["ratio"], "×"), *more.get(case, list)()]
 
     return rows
-
-
-METHODS = ("raymarch", "transmittance_atlas", "neural_transmittance")
 
 
 def _dial(case: str) -> Callable[[Values], str]:

@@ -90,7 +90,9 @@ def converge(render: Renderer, pixels: int, steps: int, seconds: float, tell: Ca
 
 
 def shipped(scene: Path, parameters: dict[str, str]) -> Path | None:
-    """Return the file ``reference_LIGHT.exr`` beside a scene file, if it exists; LIGHT is the value of its ``$light``.
+    """Return the file ``reference_LIGHT.exr`` beside a scene file, if it exists.
+
+    LIGHT is the value of the scene's ``$light``.
     """
     text = scene.read_text(encoding="utf-8", errors="replace")
     default = re.search(r'<default\s+name="light"\s+value="([^"]*)"', text)
