@@ -274,8 +274,8 @@ def stage(costs: Costs, lights: Any, table: str, culled: bool, samples: int = ST
     `lights` is their number, or an array of numbers; `samples` are those of a volume's ray; `texels` are rays a light.
     """
     rays = lights * texels
-    own = culled or table == OURS
-    return (rays * _ray(costs, table, culled) + own * costs["voxels"],
+    needs_voxels = culled or table == OURS
+    return (rays * _ray(costs, table, culled) + needs_voxels * costs["voxels"],
             rays * _ray(costs, f"volume/{samples}", culled) + culled * costs["voxels"])
 
 
@@ -284,10 +284,10 @@ def whole(costs: Costs, lights: Any, table: str, culled: bool, side: int = SIDE)
 
     `lights` is their number, or an array of numbers.
     """
-    own = culled or table == OURS  # beside our network's culled march, camera rays are culled on both sides
-    camera = SIDE**2 * (costs["camera"] if own else IMAGE_SAMPLES * costs["query"])
-    points = SIDE**2 * (costs["points"] if own else IMAGE_SAMPLES)
-    tables = ((table, costs["shade/map"], own), (f"volume/{IMAGE_SAMPLES}", costs["shade/volume"], culled))
+    needs_voxels = culled or table == OURS  # with them, camera rays are culled on both sides
+    camera = SIDE**2 * (costs["camera"] if needs_voxels else IMAGE_SAMPLES * costs["query"])
+    points = SIDE**2 * (costs["points"] if needs_voxels else IMAGE_SAMPLES)
+    tables = ((table, costs["shade/map"], needs_voxels), (f"volume/{IMAGE_SAMPLES}", costs["shade/volume"], culled))
     by_map, by_volume = (camera + voxels * costs["voxels"] + lights * (points * shading
                          + side**2 * _ray(costs, name, culled)) for name, shading, voxels in tables)
     return by_map, by_volume

@@ -166,8 +166,8 @@ def build_table(values: Values) -> str:
 def _accuracy(values: Values, kind: str, metric: str, method: str, key: str) -> float | None:
     """Return the mean over scenes of ``mean`` or ``drop``."""
     rows = [scene.get(kind, {}).get(method, {}).get(metric, {}).get(key) for scene in values["accuracy"].values()]
-    found = [row for row in rows if row is not None]
-    return float(np.mean(found)) if found else None
+    numbers = [row for row in rows if row is not None]
+    return float(np.mean(numbers)) if numbers else None
 
 
 def accuracy_table(values: Values) -> str:

@@ -82,10 +82,10 @@ QUICK = replace(Sizes(**vars(networks.QUICK)), image=16, skies=((1, 1), (4, 2), 
                 setting_points=(1 << 8, 1 << 5), atlas=4)
 
 
-def figure(what: str, unit: str, values: list[float], extrapolated: str = "", **details: Any) -> dict[str, Any]:
+def figure(title: str, unit: str, values: list[float], extrapolated: str = "", **details: Any) -> dict[str, Any]:
     """Return a figure of repeated measurements."""
     more = {"extrapolated": extrapolated} if extrapolated else {}
-    return {"what": what, "unit": unit, **record.spread(values), **more, **details}
+    return {"title": title, "unit": unit, **record.spread(values), **more, **details}
 
 
 def measure(sizes: Sizes, say: Callable[[str], None] = lambda text: None) -> Figures:
@@ -142,7 +142,7 @@ def network_figures(rows: list[networks.Costs], sizes: Sizes) -> Figures:
         words = "rays of a map" if name == "rays" else f"samples of a volume, {name} a ray"
         figures[f"culling_{name}"] = figure(f"fraction that culling leaves of the {words}", "%",
                                             [100 * rows[0][f"fraction/{name}"]])
-    figures["costs"] = {"what": "costs of a query, a lookup or a pixel", "unit": "s", "rounds": rows}
+    figures["costs"] = {"title": "costs of a query, a lookup or a pixel", "unit": "s", "rounds": rows}
     return figures
 
 
@@ -301,16 +301,16 @@ def method_figures(scene: Any, medium: Any, sizes: Sizes) -> Figures:
     picture, table = Picture(scene, medium, sizes.error_image), table_of(spheres.fibonacci(columns * rows))
     truth = picture.image(table, building.build("raymarch", medium, table, building.Options(FINE)))
     options = building.Options(2 / SAMPLES)
-    what = f"picture of {sizes.field_image}² pixels, {columns * rows} lights, tables made anew"
+    subject = f"picture of {sizes.field_image}² pixels, {columns * rows} lights, tables made anew"
     figures: Figures = {}
     for name in METHODS:
         error = relative_rmse(picture.image(table, building.build(name, medium, table, options)), truth)
-        figures[f"method_{name}"] = figure(f"{what}, {name}", "s", times[name])
+        figures[f"method_{name}"] = figure(f"{subject}, {name}", "s", times[name])
         figures[f"method_error_{name}"] = figure(f"{columns * rows} lights, {name}, relative RMSE to a fine march on "
                                                  "the same points", "%", [100 * error])
         for other in ("raymarch", "transmittance_volume"):
             if name not in ("raymarch", other):
-                figures[f"method_{other}_over_{name}"] = {"what": f"{what}, {other} over {name}", "unit": "×",
+                figures[f"method_{other}_over_{name}"] = {"title": f"{subject}, {other} over {name}", "unit": "×",
                                                           **record.ratio(times[other], times[name])}
     return figures
 
@@ -380,7 +380,7 @@ def camera_light_figures(sizes: Sizes) -> Figures:
     times = rounds(work, sizes.repeats)
     words = {"march": "a march for each point", "map": "a map"}
     return {f"camera_light_over_{name}": {
-        "what": f"picture of {sizes.image}² pixels, a light at the camera, speed-up over {words[name]}", "unit": "×",
+        "title": f"picture of {sizes.image}² pixels, a light at the camera, speed-up over {words[name]}", "unit": "×",
         **record.ratio(times[name], times["camera"])} for name in words}
 
 
@@ -402,12 +402,12 @@ def scaling_figures(sizes: Sizes) -> Figures:
 def first_figures(sizes: Sizes) -> Figures:
     """Return the seconds of a process's first picture: without kernels and maps of earlier processes, and with them."""
     columns, rows = sizes.skies[-1]
-    what = f"first picture of a process, {sizes.image}² pixels, transmittance_map, {columns * rows} lights"
+    subject = f"first picture of a process, {sizes.image}² pixels, transmittance_map, {columns * rows} lights"
     figures: Figures = {}
     with tempfile.TemporaryDirectory() as home:
         for key, words in (("cold", "nothing in the caches"), ("warm", "kernels and maps in the caches")):
             result = one_image.run(sizes.image, columns, rows, 1, Path(home))
-            figures[f"first_{key}"] = figure(f"{what}, {words}", "s", result["seconds"],
+            figures[f"first_{key}"] = figure(f"{subject}, {words}", "s", result["seconds"],
                                              process_seconds=result["process_seconds"])
     return figures
 
@@ -416,9 +416,9 @@ def many_figures(sizes: Sizes) -> Figures:
     """Return time and peak memory of a picture under the large environment, in a process of its own."""
     columns, rows = sizes.many
     result = one_image.run(sizes.image, columns, rows, 1)
-    what = f"picture of {sizes.image}² pixels, transmittance_map, {columns} × {rows} lights"
-    return {"picture_many": figure(what, "s", result["seconds"]),
-            "memory_many": figure(f"{what}, peak memory", "GiB", [result["peak_bytes"] / 2**30])}
+    subject = f"picture of {sizes.image}² pixels, transmittance_map, {columns} × {rows} lights"
+    return {"picture_many": figure(subject, "s", result["seconds"]),
+            "memory_many": figure(f"{subject}, peak memory", "GiB", [result["peak_bytes"] / 2**30])}
 
 
 def draw(figures: Figures, path: Path) -> None:

@@ -111,7 +111,7 @@ def speed(values: Values) -> str:
 def speed_full(values: Values) -> str:
     """Return all figures."""
     return table(["what", "measured", "extrapolated from"],
-                 [[f["what"].replace("_", "\\_"), spread(f, f["unit"]), f.get("extrapolated", "")]
+                 [[f["title"].replace("_", "\\_"), spread(f, f["unit"]), f.get("extrapolated", "")]
                   for key, f in values.items() if "median" in f])
 
 

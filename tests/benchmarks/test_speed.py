@@ -31,7 +31,7 @@ def test_every_figure_is_measured(tmp_path, monkeypatch):
                  "setting_voxels_ray_network", "setting_shipped_neural_transmittance", "setting_paper_raymarch",
                  "camera_light_over_march", "per_light", "picture_many", "memory_many"):
         assert part in figures
-    assert len({f["what"] for f in figures.values()}) == len(figures)
+    assert len({f["title"] for f in figures.values()}) == len(figures)
     for key, f in figures.items():
         assert np.isfinite([f["median"], f["min"], f["max"]]).all() and f["unit"], key
         assert f["min"] <= f["median"] <= f["max"], key
