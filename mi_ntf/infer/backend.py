@@ -23,6 +23,11 @@ def module(variant: str) -> ModuleType:
     return importlib.import_module(f"drjit.{variant.partition('_')[0]}.ad")
 
 
+def module_of(array: type) -> ModuleType:
+    """Return the Dr.Jit module of an array type such as ``mi.Float``."""
+    return importlib.import_module(array.__module__)
+
+
 ALIGNMENT = 64
 """Alignment of Dr.Jit's own arrays, bytes."""
 

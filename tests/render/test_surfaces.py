@@ -1,5 +1,6 @@
 """The scene of ordinary shapes that rays are traced in: kept while no shape changes."""
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -40,3 +41,21 @@ def test_shapes_are_built_again_when_one_moves(blobs, monkeypatch, name):
     parameters.update()
     moved = scenes.render(scene)
     assert len(built) == 2 and np.abs(moved - first).max() > 0.1
+
+
+def test_no_render_of_the_same_scene_compiles_again(blobs):
+    """Nor with another integrator object, which shares nothing that was built for the scene."""
+    pane = {"type": "rectangle", "bsdf": {"type": "mask", "opacity": 0.5, "nested": {"type": "diffuse"}},
+            "to_world": mi.ScalarTransform4f().translate([0, 0, 1.5])}
+    lights = {"light": scenes.light("point"), "lamp": {"type": "point", "position": [2, 3, -1]}}
+    scene = scenes.scene(blobs, scenes.nrf(samples=64), lights, spp=2, size=12, shapes={"pane": pane})
+    compiled = []
+    for _ in range(3):
+        integrator = mi.load_dict({"type": "nrf", "samples": 64, "visibility": "raymarch"})
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            dr.eval(mi.render(scene, integrator=integrator, seed=1))
+            dr.sync_thread()
+            hashes = {k["hash"] for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT}
+        compiled.append(hashes)
+    assert compiled[2] <= compiled[0] | compiled[1]

@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...infer.backend import module_of
 from ...infer.lights import LightTable
 from ..scene.frame import Frame
 from . import environment, sun
@@ -45,7 +46,7 @@ class Rows:
         cones = self.cones
         if cones is not None:
             cones = np.concatenate([frame.world_to_field_numpy(cones[:, :3], direction=True), cones[:, 3:]], axis=1)
-        return LightTable(where, self.power, self.is_point, frame.length, mi, cones)
+        return LightTable(where, self.power, self.is_point, frame.length, module_of(mi.Float), cones)
 
     def strength(self, places: Sequence[np.ndarray]) -> np.ndarray:
         """Return the irradiance (n,) of each light at the nearest of `places`, without regard to cones."""

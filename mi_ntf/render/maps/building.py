@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...core.errors import MiNtfError
+from ...infer.backend import module_of
 from ...infer.lights import LightTable
 from ...infer.texels import DTYPES
 from ...infer.types import Visibility
@@ -105,10 +106,10 @@ def build(name: str, medium: NRFMedium, table: LightTable | None, options: Optio
 
     method = REGISTRY[name]
     if not method.numbers:
-        return method.build(medium, table, options, mi, keep)
+        return method.build(medium, table, options, module_of(mi.Float), keep)
     size = "" if method.per_field or table is None else f", {table.count} × {options.map_resolution}² texels"
     with timing.building(), log.timed(f"nrf integrator: made the {name}{size}"):
-        return method.build(medium, table, options, mi, keep)
+        return method.build(medium, table, options, module_of(mi.Float), keep)
 
 
 def march(medium: NRFMedium, table: LightTable | None, options: Options) -> Visibility:

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...core import microfacet, radiosity
 from ...infer import march, shade
-from ...infer.backend import floats, words
+from ...infer.backend import floats, module_of, words
 from ...infer.bundle import Strand
 from ...infer.grid import Density
 from ...infer.irradiance import Irradiance
@@ -116,7 +116,7 @@ class Patches:
                                          floats(rng.random(n), mi), [mi.Float(radiosity.DEPTH)] * len(self.skins),
                                          steps)
         dr.eval(hit, t, part)
-        parts = np.where(hit.numpy(), part.numpy(), -1)
+        parts = np.where(hit.numpy(), part.numpy().astype(np.int64), -1)
         result = []
         for i, skin in enumerate(self.skins):
             index = np.flatnonzero(parts == i)
@@ -152,7 +152,8 @@ class Bounced:
         direct = np.concatenate([_direct(scene, part, skin) for part, skin in pairs])
         light = radiosity.solve(patches.hits, patches.albedo, direct, max(max_depth - 2, -1))
         ends = zip(patches.first, patches.first[1:], strict=False)
-        self._irradiance = [Irradiance(s.table, light[a:b], mi) for s, (a, b) in zip(patches.skins, ends, strict=True)]
+        self._irradiance = [Irradiance(s.table, light[a:b], module_of(mi.Float))
+                            for s, (a, b) in zip(patches.skins, ends, strict=True)]
 
     def reflect(self, part: Part, points: shade.Points) -> list[Float]:
         """Return the radiance of multiple scattering that points of `part` reflect."""
