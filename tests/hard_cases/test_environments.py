@@ -1,5 +1,6 @@
 """Environment maps of any size, orientation and range: all their light arrives, from where it comes, with gradients."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import drjit as dr
@@ -250,7 +251,8 @@ def test_texels_that_are_no_numbers(blobs, value, mode):
     options = {"light_samples": 2} if mode == "drawn" else {}
     scene = scenes.scene(blobs, scenes.nrf(**options), {"sky": skies.emitter(image)}, size=4, spp=1)
     for visibility in ("raymarch", "none", "ray_network", "visibility_mlp"):
-        scene.integrator().visibility = visibility
+        context = scene.integrator().context
+        context.settings = replace(context.settings, visibility=visibility)
         with pytest.raises(MiNtfError, match=r"\(sky\): 3 texels of data are NaN or infinite.*row 5, column 0"):
             scene.integrator().render(scene)
 

@@ -59,7 +59,7 @@ def load_scene(path: Path, parameters: dict[str, str], environment: Environment 
     register()
     scene = scene_file.load(path, parameters, environment)
     integrator = scene.integrator()
-    if not hasattr(integrator, "map_resolution"):
+    if not hasattr(integrator, "context"):
         raise MiNtfError(f'{path}: its integrator is {integrator.class_name()}, expected <integrator type="nrf">')
     return scene
 
