@@ -15,11 +15,14 @@ paper, as its end points p1 and p2 (encoding `frequency` of the six coordinates)
 import math
 from dataclasses import asdict, dataclass, field
 from itertools import pairwise
-from typing import Any
+from typing import Any, TypeAlias, TypeVar
 
 from .depth_profile import FEATURES
 from .errors import MiNtfError, shown
 from .fresnel import DIELECTRIC
+
+T = TypeVar("T")
+Json: TypeAlias = dict[str, Any]
 
 FORMAT = 2
 MAX_LOG_DENSITY = 6.5
@@ -127,9 +130,9 @@ class Header:
 
     architecture: Architecture
     similarity: Similarity = Similarity()
-    provenance: dict[str, Any] = field(default_factory=dict)
+    provenance: Json = field(default_factory=dict)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """Return the header as JSON."""
         return {"format": FORMAT} | asdict(self)
 
@@ -159,7 +162,7 @@ def header_from_json(data: object, source: str) -> Header:
                          "was it written by `mi-ntf train`?") from None
 
 
-def _network(data: dict[str, Any], name: str) -> Network:
+def _network(data: Json, name: str) -> Network:
     legal = {"transmittance": ("frequency", "depth"), "visibility": ("frequency",)}.get(name, ("planes", "frequency"))
     e = _member(data, "encoding", dict)
     kind = _member(e, "kind", str)
@@ -176,12 +179,13 @@ def _network(data: dict[str, Any], name: str) -> Network:
     return Network(Encoding(kind, resolutions, channels, octaves), hidden, components)
 
 
-def _member(data: dict[str, Any], key: str, kind: type) -> Any:
+def _member(data: Json, key: str, kind: type[T]) -> T:
     if key not in data:
         raise ValueError(f"{key} is missing")
-    if not isinstance(data[key], kind):
-        raise ValueError(f"{key} is {shown(data[key])}, expected {_JSON[kind]}")
-    return data[key]
+    value = data[key]
+    if not isinstance(value, kind):
+        raise ValueError(f"{key} is {shown(value)}, expected {_JSON[kind]}")
+    return value
 
 
 def _whole(value: object, name: str, low: int, high: int = 1 << 31) -> int:
@@ -190,8 +194,8 @@ def _whole(value: object, name: str, low: int, high: int = 1 << 31) -> int:
     return value
 
 
-def _number(value: Any, name: str, above: float = -math.inf) -> float:
-    if type(value) not in (int, float) or not above < value or not abs(value) < 1e30:
+def _number(value: object, name: str, above: float = -math.inf) -> float:
+    if not isinstance(value, int | float) or isinstance(value, bool) or not above < value or not abs(value) < 1e30:
         raise ValueError(f"{name} is {shown(value)}, expected a finite number" + (" above 0" if above == 0 else ""))
     return float(value)
 

@@ -41,7 +41,7 @@ def test_sphere(voxels):
     along = np.cross(normal, [0.6, 0.8, 0.0])
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     out, side = (skin.depth(x, d, np.full(len(x), formulas.LENGTH)) for d in (normal, along))
-    expected = formulas.CHAPMAN * formulas.share(ops, out, side, skin.density(x))
+    expected = formulas.CHAPMAN * formulas.squared_horizon(ops, out, side, skin.density(x))
     # Voxels of 1/64: two of them are less than the thinner skin's three scale heights.
     np.testing.assert_allclose(found, expected, rtol=0.25)
     assert found.mean() == pytest.approx(expected.mean(), rel=0.05)

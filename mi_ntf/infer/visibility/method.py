@@ -6,7 +6,7 @@ The file of each method ends with its own :class:`Method`; :data:`mi_ntf.infer.v
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import ModuleType
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -17,6 +17,9 @@ from ..network import NetworkField
 from ..skin import Softness
 from ..tuning import FINE_MAPS, MIN_MAP_RESOLUTION
 from ..types import Visibility
+
+if TYPE_CHECKING:
+    from .transmittance_map import TransmittanceMap
 
 
 def resolution_for(lights: int, voxels: int) -> int:
@@ -111,8 +114,9 @@ class Keep(Protocol):
         Makes the map of some rows of the light table, where the texels of each light do not depend on other lights.
     """
 
-    def __call__(self, make: Callable[..., Any], *, channels: int, step: float, directions: LightTable | None = None,
-                 options: Options | None = None, make_part: Callable[[np.ndarray], Any] | None = None) -> Any:
+    def __call__(self, make: "Callable[..., TransmittanceMap]", *, channels: int, step: float,
+                 directions: LightTable | None = None, options: Options = ...,
+                 make_part: "Callable[[np.ndarray], TransmittanceMap] | None" = None) -> "TransmittanceMap":
         """Return the map."""
 
 
@@ -123,7 +127,8 @@ class Build(Protocol):
     lookups draw random numbers has an attribute ``stream``, an opaque seed that the renderer sets.
     """
 
-    def __call__(self, medium: Any, table: Any, options: Options, dj: ModuleType, keep: Any, /) -> Visibility | None:
+    def __call__(self, medium: Medium, table: Any, options: Options, dj: ModuleType, keep: Keep,
+                 /) -> Visibility | None:
         """Return the method."""
 
 
@@ -164,7 +169,7 @@ class Method:
     summary: str
     build: Build
     rays: Callable[[int, int], int] = lambda lights, resolution: 0
-    numbers: Callable[[Any, Any, Options], int] | None = None
+    numbers: Callable[[Medium, LightTable, Options], int] | None = None
     per_field: bool = False
     dials: tuple[str, ...] = ()
     resolution: Callable[[int, int], int] = resolution_for

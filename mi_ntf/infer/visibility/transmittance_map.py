@@ -165,9 +165,7 @@ def build(medium: Medium, table: LightTable, options: Options, dj: ModuleType, k
         return TransmittanceMap(table.chosen(rows), options.map_resolution, medium.field.grid.hull, source, dj)
 
     # The texels of a network depend on the places of all lights.
-    result: TransmittanceMap = keep(make, channels=width(medium, table, options), step=step,
-                                    make_part=None if network else make_part)
-    return result
+    return keep(make, channels=width(medium, table, options), step=step, make_part=None if network else make_part)
 
 
 METHOD = Method(
