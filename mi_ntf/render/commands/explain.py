@@ -114,7 +114,7 @@ def _effects(scene: mi.Scene, active: effects.Effects, settings: Settings, count
     """Return for each effect whether it is active, and the reason."""
     marched = f"; marched to {suns} that outshine the others" if suns and REGISTRY[active.visibility].per_field else ""
     use_map = active.needs_visibility and bool(REGISTRY[active.visibility].sampled)
-    others = len(ordinary_shapes(scene))
+    shapes = len(ordinary_shapes(scene))
     unlit = "no emitter has power" if active.emitters else "there is no emitter"
     answers = {
         "visibility": (active.needs_visibility and active.visibility != "none",
@@ -137,7 +137,7 @@ def _effects(scene: mi.Scene, active: effects.Effects, settings: Settings, count
             active.fresnel, "a field was trained with it" if active.fresnel else "no field was trained with it"),
         "fields in view": (any(active.in_view), f"{sum(active.in_view)} of {len(active.in_view)}"),
         "ordinary surfaces": (
-            active.surfaces, f"{others} shapes beside the fields' bounds" if others else "there are none"),
+            active.surfaces, f"{shapes} shapes beside the fields' bounds" if shapes else "there are none"),
         "multiple scattering": (
             active.bounces,
             f"max_depth is {settings.max_depth}" + (f", by {active.bounces}" if active.bounces else "")),

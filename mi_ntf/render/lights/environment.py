@@ -3,8 +3,7 @@
 Mitsuba's ``envmap`` is bilinear between its texels: their columns are the centres of equal parts of the circle, their
 first and last rows the poles. It is integrated exactly over a grid of blocks. The grid is cut into cells by a median
 cut (Debevec 2005; Viriyothai and Debevec 2009). The next cell to be cut is the one that loses most by having one
-direction, and it is cut where its two halves lose least. Suns and lamps end in cells of their own. The light of a cell
-has its whole power and comes from its centre of radiance.
+direction, and it is cut where its halves lose least. The light of a cell comes from its centre of radiance.
 """
 
 from __future__ import annotations
@@ -53,8 +52,7 @@ class Axis:
     @property
     def sums(self) -> np.ndarray:
         """Integrals of the three functions over each block, (3, blocks)."""
-        sums: np.ndarray = np.add.reduceat(self.weights.sum(axis=1), self.first).T
-        return sums
+        return np.asarray(np.add.reduceat(self.weights.sum(axis=1), self.first).T)
 
     @property
     def block(self) -> np.ndarray:
@@ -116,13 +114,22 @@ def integrate(image: np.ndarray, latitude: Axis, longitude: Axis) -> np.ndarray:
 class Cells:
     """Parts of the sphere, each of which becomes a directional light.
 
-    axes         latitudes and longitudes of the map that is cut
-    bounds       (n, 4) first and end row, first and end column of blocks
-    power        (n, 3) irradiance, ∫ L dω
-    direction    (n, 3) unit vector to the centre of radiance, in the map's own axes
-    weight       (n,) ∫ w dω, see :func:`integrate`
-    focus        (n,) |∫ w ω dω| / weight, 1 if all light comes from one point
-    solid_angle  (n,) in sr
+    Attributes
+    ----------
+    axes
+        Latitudes and longitudes of the map that is cut.
+    bounds
+        ``Bounds`` of each cell, (n, 4).
+    power
+        (n, 3) irradiance, ∫ L dω.
+    direction
+        (n, 3) unit vector to the centre of radiance, in the map's own axes.
+    weight
+        (n,) ∫ w dω, see :func:`integrate`.
+    focus
+        (n,) |∫ w ω dω| / weight, 1 if all light comes from one point.
+    solid_angle
+        (n,) in sr.
     """
 
     axes: tuple[Axis, Axis]
@@ -232,8 +239,7 @@ def image(emitter: mi.Emitter, kind: str) -> np.ndarray:
         return np.tile(radiance(emitter, np.array([[0.0, 1.0, 0.0]])), (3, 2, 1))
     parameters = mi.traverse(emitter)
     data = np.array(dr.detach(parameters["data"]))[:, 1:-1]  # Mitsuba repeats a column on either side
-    scaled: np.ndarray = data * np.float32(np.ravel(parameters["scale"])[0])
-    return scaled
+    return np.asarray(data * np.float32(np.ravel(parameters["scale"])[0]))
 
 
 def radiance(emitter: mi.Emitter, towards: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ from a map file or from the cache if possible.
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import mitsuba as mi
 import numpy as np
@@ -20,6 +20,7 @@ from ...infer.types import Visibility
 from ...infer.visibility import REGISTRY
 from ...infer.visibility.marched_suns import MarchedSuns
 from ...infer.visibility.method import Options
+from ...infer.visibility.transmittance_map import TransmittanceMap
 from .. import log, timing
 from ..scene.media import NRFMedium
 from ..scene.settings import Settings
@@ -85,8 +86,9 @@ def build(name: str, medium: NRFMedium, table: LightTable | None, options: Optio
         Lights in the same coordinates, for which the method stores tables; None for sampled lights.
     """
 
-    def keep(make: Callable[..., Any], *, channels: int, step: float, directions: LightTable | None = None,
-             options: Options = options, make_part: Callable[[np.ndarray], Any] | None = None) -> Any:
+    def keep(make: Callable[..., TransmittanceMap], *, channels: int, step: float,
+             directions: LightTable | None = None, options: Options = options,
+             make_part: Callable[[np.ndarray], TransmittanceMap] | None = None) -> TransmittanceMap:
         lights = directions or table
         assert lights is not None  # methods for sampled lights store nothing per light
         if options.map_file:

@@ -94,7 +94,7 @@ environments; ``timed_sunsky``; environments whose `to_world` shears or, among s
 
 from __future__ import annotations
 
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import mitsuba as mi
 
@@ -126,7 +126,7 @@ def integrator_class() -> type:
             except RuntimeError as error:
                 raise root(error) from None
 
-        def sample(self, *_: Any) -> NoReturn:
+        def sample(self, *_: object) -> NoReturn:
             raise MiNtfError("nrf integrator: it renders whole pictures and cannot stand inside another one, such "
                              "as aov or moment; make it the scene's own, and ask it for channels by its property "
                              '"aovs" (depth, normal, albedo, …)')
@@ -138,7 +138,7 @@ def integrator_class() -> type:
             return aovs.channel_names(tuple(known), lights)
 
         @property
-        def achieved(self) -> dict[str, Any]:
+        def achieved(self) -> dict[str, object]:
             """Result of the last render (:class:`mi_ntf.render.transport.context.RenderContext`)."""
             return self.context.achieved
 
