@@ -6,7 +6,7 @@ import os
 # the time. OpenMP reads this once, when PyTorch is imported.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-from .config import PRESETS, TrainConfig
+from .config import PRESETS, FastConfig
 from .trainer import train
 
-__all__ = ["PRESETS", "TrainConfig", "train"]
+__all__ = ["PRESETS", "FastConfig", "train"]

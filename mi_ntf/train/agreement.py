@@ -1,4 +1,4 @@
-"""Whether photographs agree with each other: what is left between each of them and the field that all of them made."""
+"""Agreement of photographs with each other, judged by what remains between each of them and the common field."""
 
 import math
 from dataclasses import dataclass
@@ -6,58 +6,54 @@ from dataclasses import dataclass
 import torch
 
 from . import device
-from .networks import Networks
-from .occupancy import Occupancy
 from .rays import Photographs
-from .scoring import Light, decibels, render_all, srgb
+from .scoring import FieldView, decibels, srgb
 
 PIXELS = 1000
-"""Pixels looked at of each photograph …"""
-FEWEST = 250
-"""… and at least, where there is little time."""
-KNOWN = 20.0
-"""dB of the median photograph from which on a field knows the object well enough to tell of the photographs."""
-BEHIND = 5.0
-"""dB under the median, and three times the usual spread, from which on a photograph disagrees with the others."""
+"""Pixels of each photograph that are compared, …"""
 FEWEST = 50
-"""Pixels of a photograph that tell anything."""
+"""… and the fewest, below which a photograph is not judged."""
+KNOWN = 20.0
+"""PSNR of the median photograph, dB, above which the field is good enough to judge photographs."""
+BEHIND = 5.0
+"""Distance below the median, dB, from which a photograph disagrees with the others; 4.5 times the usual spread, too."""
 MATTER = 0.9
-"""Alpha from which on a pixel is the object's."""
+"""Alpha above which a pixel belongs to the object."""
 MOVED = 0.25
-"""Pixels, root mean square, by which photographs are shifted against the field from which on poses are inexact: 0.07
-with exact poses (`statue`), 0.5 where they are 1.3 pixels off, half of which the field follows."""
+"""RMS shift, pixels, of the photographs against the field from which poses count as inexact. The field follows about
+half of the true shifts."""
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """`psnr`: dB of the object's pixels of each photograph for training · `shift` (views, 2): pixels by which each is
-    moved against the field, right and down."""
+    """Differences between the photographs of the training split and the field."""
 
     psnr: torch.Tensor
-    shift: torch.Tensor
+    """PSNR (views,) of the object's pixels, dB; NaN where they are too few."""
+    shift: torch.Tensor  # Shifts (views, 2) of the photographs against the field, right and down, in pixels
 
     @property
     def moved(self) -> float:
-        """Root mean square of the shifts' lengths; the mean shift is the field's own."""
+        """Root mean square of the shifts' lengths; the mean shift counts as the field's."""
         apart = self.shift - self.shift.median(0).values
         return float(apart.square().sum(1).mean().sqrt())
 
     @property
     def known(self) -> bool:
-        """Whether the field has learned enough to judge."""
+        """True if the field is good enough to judge photographs."""
         return bool(self.psnr.nanmedian() > KNOWN)
 
     def outliers(self) -> list[int]:
-        """Photographs that the others contradict."""
+        """Return the numbers of the photographs that the others contradict."""
         middle = self.psnr.nanmedian()
         spread = (self.psnr - middle).abs().nanmedian()
-        return ((middle - self.psnr) > torch.clamp(4.5 * spread, min=BEHIND)).nonzero()[:, 0].tolist()
+        numbers: list[int] = ((middle - self.psnr) > torch.clamp(4.5 * spread, min=BEHIND)).nonzero()[:, 0].tolist()
+        return numbers
 
 
 @torch.no_grad()
-def survey(networks: Networks, occupancy: Occupancy, pool: Photographs, gains: torch.Tensor | None, step: float,
-           light: Light, most: float = math.inf) -> Agreement:
-    """Compare some pixels of all photographs with the field, `most` or so in all; `gains` (views, 3): theirs."""
+def survey(field: FieldView, pool: Photographs, gains: torch.Tensor | None, most: float = math.inf) -> Agreement:
+    """Compare some pixels of all photographs with the field, about `most` in all; `gains` are (views, 3)."""
     generator, psnr, shift = device.generator(8), [], []
     each = int(max(FEWEST, min(PIXELS, most / pool.views)))
     for number in range(pool.views):
@@ -69,29 +65,31 @@ def survey(networks: Networks, occupancy: Occupancy, pool: Photographs, gains: t
             shift.append(torch.zeros(2))
             continue
         rays = pool[pixels]
-        color, *_ = render_all(networks, rays, occupancy, step, generator, light)
-        found = srgb(color if gains is None else color * gains[number])
+        color = field.render(rays, generator).color
+        predicted = srgb(color if gains is None else color * gains[number])
         target = srgb(rays.target[:, :3])
-        psnr.append(decibels(float((found - target).square().mean())))
-        shift.append(_shift(pool, pixels, (target - found).mean(1)))
+        psnr.append(decibels(float((predicted - target).square().mean())))
+        shift.append(_shift(pool, pixels, (target - predicted).mean(1)))
     return Agreement(torch.tensor(psnr), torch.stack(shift))
 
 
 def _shift(pool: Photographs, pixels: torch.Tensor, error: torch.Tensor) -> torch.Tensor:
-    """By which (2,) pixels a photograph is moved, from its `error` (n,) at `pixels` (n,) and its own slopes: least
-    squares (Lucas and Kanade 1981), twice, the second time without the largest errors."""
+    """Return the shift (2,), in pixels, that explains the `error` (n,) at `pixels` (n,) by the photograph's slopes.
+
+    It is a least-squares fit (Lucas and Kanade 1981), repeated without the largest errors.
+    """
     def beside(offset: int) -> tuple[torch.Tensor, torch.Tensor]:
-        found = pool.pixels((pixels + offset).clamp(0, len(pool) - 1))
-        return srgb(found[:, :3]).mean(1), found[:, 3] > MATTER
+        neighbour = pool.pixels((pixels + offset).clamp(0, len(pool) - 1))
+        return srgb(neighbour[:, :3]).mean(1), neighbour[:, 3] > MATTER
 
     (left, a), (right, b), (above, c), (below, d) = (beside(step) for step in (-1, 1, -pool.width, pool.width))
-    # The outline's slopes are the largest of all, and half of its errors are in pixels that are not looked at.
+    # Slopes at the outline are the largest, and half of their errors are in pixels that are not compared.
     inside = a & b & c & d
     slope, error = torch.stack([right - left, below - above], 1)[inside] / 2, error[inside]
-    kept, found = torch.ones_like(error), torch.zeros(2)
+    used, shift = torch.ones_like(error), torch.zeros(2)
     for _ in range(2 if len(error) >= FEWEST else 0):
-        weighted = slope * kept[:, None]
-        found = torch.linalg.solve(weighted.T @ slope + 1e-4 * torch.eye(2), weighted.T @ -error)
-        rest = (error + slope @ found).abs()
-        kept = (rest < 3 * rest.median()).float()
-    return found
+        weighted = slope * used[:, None]
+        shift = torch.linalg.solve(weighted.T @ slope + 1e-4 * torch.eye(2), weighted.T @ -error)
+        rest = (error + slope @ shift).abs()
+        used = (rest < 3 * rest.median()).float()
+    return shift

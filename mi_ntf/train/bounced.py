@@ -1,8 +1,8 @@
-"""Light of the flash that one part of the object throws on another: photographs hold it, and albedo must not.
+"""Light of the flash that one part of the object throws on another. Photographs contain it, and albedo must not.
 
-The radiosity of :mod:`mi_ntf.core.radiosity` between patches of the skin as it has been learned so far, for every
-photograph's flash, found anew now and then. What is learned as albedo before the first time is too much by the share of
-the bounced light, and every round leaves that share of the rest.
+This is the radiosity of :mod:`mi_ntf.core.radiosity` between patches of the skin as learned so far, for every
+photograph's flash. It is computed again a few times during training. Before the first time, the learned albedo is too
+large by the fraction of bounced light; each later round reduces the rest by that fraction.
 """
 
 import numpy as np
@@ -10,35 +10,57 @@ import torch
 
 from ..core import radiosity
 from .flash import Flash
-from .networks import Networks
+from .networks import Networks, in_parts
 from .rays import Rays
 from .transmittance_targets import TransmittanceTargets, walk
-from .volume import diffuse_albedo
 
-SEEN = 1 << 16
-"""Camera rays that look for the skin; rays from what they find look into its folds."""
+CAMERA_RAYS = 1 << 16
+"""Camera rays that search for the skin; rays from the points that they hit search its folds."""
 SIDE = 8
-"""Rays from a patch, squared."""
+"""Square root of the number of rays from a patch."""
 
 
 class Bounced:
-    """`table` (6, z, y, x), which patch stands where, `light` (views, patches + 1, 3), irradiance by other patches,
-    the last 0, and `open` (patches + 1,), the share of it that other patches leave, the last 1; from :meth:`update`.
+    """Irradiance of the skin by bounced light of all photographs' flashes.
 
-    `power` (views, 3): of the flashes, as :class:`Rays`' `light`. `room`, where it is given: ln of what the room sends
-    back of a flash, from all sides alike, over what arrives from the flash itself at the sphere's middle (3,).
+    Parameters
+    ----------
+    flash
+        The lights of all photographs.
+    power
+        Radiant intensities (views, 3), as ``Rays.light``.
+    room
+        Logarithm (3,) of the light that the room reflects from all sides, relative to the light that arrives from the
+        flash at the centre of the sphere. None: a dark room.
     """
 
     def __init__(self, flash: Flash, power: torch.Tensor, room: torch.Tensor | None = None):
         self.flash, self.power, self.room = flash, power, room
+        self.table = torch.zeros(0, dtype=torch.long)
+        """Index of the patch that is used in each cell of a grid (6, z, y, x)."""
+        self.light = torch.zeros(0)  # Irradiance by other patches (views, patches + 1, 3), the last one 0
+        self.open = torch.zeros(0)
+        """Fraction of the sky of each patch that other patches leave open (patches + 1,), the last one 1."""
 
     @property
     def known(self) -> bool:
-        return hasattr(self, "light")
+        """True after the first :meth:`update`."""
+        return self.light.numel() > 0
 
-    def __call__(self, view: torch.Tensor, x: torch.Tensor, normal: torch.Tensor, generator: torch.Generator):
-        """Irradiance (n, 3) at the points `x` (n, 3) of photographs `view` (n,), from other patches and the room: of
-        one patch near each, drawn so that the mean is what the renderer interpolates."""
+    def state(self) -> dict[str, torch.Tensor]:
+        """Return the tensors that change during training."""
+        return {"table": self.table, "light": self.light, "open": self.open}
+
+    def restore(self, state: dict[str, torch.Tensor]) -> None:
+        """Restore a :meth:`state`."""
+        self.table, self.light, self.open = state["table"], state["light"], state["open"]
+
+    def __call__(self, view: torch.Tensor, x: torch.Tensor, normal: torch.Tensor, generator: torch.Generator | None
+                 ) -> torch.Tensor:
+        """Return the irradiance (n, 3) by other patches and the room at points `x` (n, 3) of photographs `view` (n,).
+
+        It is that of one nearby patch for each point, sampled so that the mean is what the renderer interpolates.
+        """
         n, cells = len(x), radiosity.CELLS
         u = torch.rand(n, 4, generator=generator)
         squares = normal.detach().square()
@@ -53,21 +75,20 @@ class Bounced:
 
     @torch.no_grad()
     def update(self, networks: Networks, marched: TransmittanceTargets, rays: Rays, seed: int) -> None:
-        """Find the patches of the field that some SEEN camera `rays` see, what they see of each other, and what of all
-        flashes they send on."""
+        """Find the patches that camera `rays` see and solve for the light that they exchange under each flash."""
         rng = np.random.default_rng(seed)
         _, x, normal = _skin(networks, marched, rays.o, rays.d)
-        kept = radiosity.thin(x, normal)
-        _, *folds = _skin(networks, marched, *_rays(x[kept], normal[kept], 3, rng))
-        x, normal = (np.concatenate([a[kept], b]) for a, b in zip((x, normal), folds, strict=True))
-        kept = radiosity.thin(x, normal)
-        x, normal = x[kept], normal[kept]
+        patches = radiosity.thin(x, normal)
+        _, *folds = _skin(networks, marched, *_rays(x[patches], normal[patches], 3, rng))
+        x, normal = (np.concatenate([a[patches], b]) for a, b in zip((x, normal), folds, strict=True))
+        patches = radiosity.thin(x, normal)
+        x, normal = x[patches], normal[patches]
         table, hits = radiosity.table(x, normal), np.full(len(x) * SIDE**2, -1)
-        ray, *there = _skin(networks, marched, *_rays(x, normal, SIDE, rng))
-        hits[ray] = table[radiosity.place(*there)]
+        ray, hit_x, hit_normal = _skin(networks, marched, *_rays(x, normal, SIDE, rng))
+        hits[ray] = table[radiosity.place(hit_x, hit_normal)]
         # All photographs at once, three columns each.
         views, count = len(self.power), len(x)
-        albedo = diffuse_albedo(networks.reflectance(_tensor(x)), networks.fresnel).cpu().numpy()
+        albedo = networks.reflectance(_tensor(x)).diffuse_albedo(networks.fresnel).cpu().numpy()
         direct = self._direct(marched, x, normal).transpose(1, 0, 2).reshape(count, -1)
         light = radiosity.solve(hits.reshape(count, -1), np.tile(albedo, (1, views)), direct, -1)
         light = np.pad(light, [(0, 1), (0, 0)]).reshape(count + 1, views, 3).transpose(1, 0, 2)
@@ -76,32 +97,35 @@ class Bounced:
         self.light = torch.as_tensor(np.ascontiguousarray(light, np.float32))
 
     def _direct(self, marched: TransmittanceTargets, x: np.ndarray, normal: np.ndarray) -> np.ndarray:
-        """(views, patches, 3): irradiance by the flashes alone."""
+        """Return the irradiance (views, patches, 3) by the flashes alone."""
         outside, upward = _tensor(radiosity.above(x, normal)), _tensor(normal)
         result = torch.zeros(len(self.power), len(x), 3)
         for place, power, lit in zip(self.flash.place, self.power, result, strict=True):
-            away = place - outside
-            distance = away.norm(dim=1)
-            cos = (away * upward).sum(1) / distance
+            path = place - outside
+            distance = path.norm(dim=1)
+            cos = (path * upward).sum(1) / distance
             faces = (cos > 0).nonzero()[:, 0]
-            _, depth = walk(marched, outside[faces], (away / distance[:, None])[faces], 6.0)
+            _, depth = walk(marched, outside[faces], (path / distance[:, None])[faces], 6.0)
             lit[faces] = (cos[faces] / distance[faces] ** 2 * torch.exp(-depth))[:, None] * power
         return result.double().cpu().numpy()
 
 
-def _rays(x: np.ndarray, normal: np.ndarray, side: int, rng: np.random.Generator) -> list[torch.Tensor]:
-    """:func:`mi_ntf.core.radiosity.rays` as tensors."""
-    return [_tensor(v) for v in radiosity.rays(x, normal, side, rng)]
+def _rays(x: np.ndarray, normal: np.ndarray, side: int, rng: np.random.Generator
+          ) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return :func:`mi_ntf.core.radiosity.rays` as tensors, origins and directions."""
+    o, d = radiosity.rays(x, normal, side, rng)
+    return _tensor(o), _tensor(d)
 
 
-def _skin(networks: Networks, marched: TransmittanceTargets, o: torch.Tensor, d: torch.Tensor):
-    """``(ray, x, normal)``, arrays: which rays meet skin that faces them, where (k, 3), and its normals (k, 3)."""
+def _skin(networks: Networks, marched: TransmittanceTargets, o: torch.Tensor, d: torch.Tensor
+          ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return which rays (k,) hit skin that faces them, the hit points (k, 3) and the normals there (k, 3)."""
     t, _ = walk(marched, o, d, radiosity.DEPTH)
     ray = t.isfinite().nonzero()[:, 0]
     x = torch.addcmul(o[ray], d[ray], t[ray, None])
-    normal = torch.cat([networks.reflectance(part)[0] for part in x.split(65536)])
+    normal = in_parts(lambda part: networks.reflectance(part)[0], x)
     faces = (normal * d[ray]).sum(1) < 0
-    return ray[faces].cpu().numpy(), *(v[faces].double().cpu().numpy() for v in (x, normal))
+    return (ray[faces].cpu().numpy(), x[faces].double().cpu().numpy(), normal[faces].double().cpu().numpy())
 
 
 def _tensor(values: np.ndarray) -> torch.Tensor:

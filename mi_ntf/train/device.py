@@ -1,4 +1,4 @@
-"""Where training runs: on a GPU where PyTorch finds one, else on the CPU. ``CUDA_VISIBLE_DEVICES=`` keeps it off."""
+"""Device of training: a GPU where PyTorch finds one, else the CPU. ``CUDA_VISIBLE_DEVICES=`` forces the CPU."""
 
 import os
 from collections.abc import Iterator
@@ -9,7 +9,7 @@ import torch
 
 @contextmanager
 def chosen() -> Iterator[None]:
-    """Make new tensors on the device of this process: GPU number LOCAL_RANK (0 outside ``torchrun``), or the CPU."""
+    """Create new tensors on the device of this process: GPU number LOCAL_RANK (0 outside ``torchrun``), or the CPU."""
     if not torch.cuda.is_available():
         yield
         return
@@ -20,10 +20,5 @@ def chosen() -> Iterator[None]:
 
 
 def generator(seed: int) -> torch.Generator:
-    """A source of random numbers on the device of new tensors."""
+    """Return a source of random numbers on the device of new tensors."""
     return torch.Generator(torch.get_default_device()).manual_seed(seed)
-
-
-def backend() -> str:
-    """What processes of ``torchrun`` talk through."""
-    return "nccl" if torch.get_default_device().type == "cuda" else "gloo"

@@ -1,101 +1,100 @@
-"""One step of training: a batch of photographs' rays, the losses, the optimisers."""
+"""The recipe ``fast``: planes, an occupancy grid in the visual hull, transmittance after the field."""
 
 import math
-from pathlib import Path
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 
+import numpy as np
 import torch
 
-from ..core.architecture import MAX_LOG_DENSITY, Header
+from ..core.architecture import MAX_LOG_DENSITY
 from ..core.errors import MiNtfError
-from . import device, losses, offset, rays, volume
-from .bounced import SEEN, Bounced
-from .config import TrainConfig
+from . import device, losses, networks, offset, parallel, rays, volume
+from .bounced import CAMERA_RAYS, Bounced
+from .checkpoint import State
+from .config import FastConfig
 from .flash import Flash
+from .networks import Tensors
 from .normal_targets import NormalTargets
 from .occupancy import LOG_EMPTY, Occupancy, Spans
 from .photometry import Gains, trust
-from .recipe import FIELD, Recipe, total
+from .recipe import FIELD, Run, Snapshot, copy_into, total
 from .scoring import Light
 from .transmittance_targets import TransmittanceTargets
 
-ROUNDS = (0.3, 0.45, 0.6, 0.75)
-"""Shares of the run at which the light that bounced is found: the skin has formed, and albedo follows at once."""
-SPACED = 20.0
-"""Seconds of a run for each of these rounds, which take some each: the shortest runs do without."""
-ESTIMATES = (0.1, 0.2, 0.3, 0.4, 0.55)
-"""Shares of the run at which the flash's place is looked for, if that is not known: the place and the shape that is
-learned with it come nearer to the truth in turns."""
+BOUNCE_TIMES = (0.3, 0.45, 0.6, 0.75)
+"""Times, as fractions of the run, at which bounced light is computed: the skin has formed, and albedo follows."""
+BOUNCE_SECONDS = 20.0
+"""Seconds of a run for each of these rounds, which take a few each; the shortest runs do without."""
+ESTIMATE_TIMES = (0.1, 0.2, 0.3, 0.4, 0.55)
+"""Times at which the position of the flash is estimated, if it is unknown. Position and shape improve in turns."""
 NOTICED = 6.0
-"""Degrees between flash and lens that are worth a warning: nearer ones, as on cameras, change no reflectance."""
+"""Angle between flash and lens, degrees, that is worth a warning; smaller ones change no reflectance."""
 ROOM = 0.02
-"""Share of the flash that the room sends back, at the start."""
+"""Light that the room reflects, relative to the flash, at the start."""
 SURFACE_LEVEL = 3.0
-"""ln σ where skins meet the surfaces that photographs show: of `statue`, within 0.001 radii of the mesh (median)."""
+"""ln σ where skins meet the surfaces that photographs show."""
 REFRESH = 32
-"""Steps between two updates of the occupancy grid; the baked density is renewed at every fourth of them."""
-
+"""Steps between two updates of the occupancy grid; every fourth of them renews the baked density."""
 NEAR = 96
 """Camera rays a step whose pixels are also lit by the learned transmittance."""
 
 
-class Fast(Recipe):
-    """The recipe of the project's own: planes, an occupancy grid in the visual hull, transmittance after the field."""
+@dataclass
+class Course:
+    """Progress of the schedule and running averages; part of checkpoints."""
 
-    HELD = (*Recipe.HELD, "samples_per_ray", "last_bake", "rounds", "steep", "meeting", "estimates", "notes")
-    GRIDS = (("occupancy", ("sigma", "level", "stray")), ("baked", ("slope",)), ("marched", ("log_sigma", "reach")),
-             ("bounced", ("table", "light", "open")), ("flash", ("place",)))
-    config: TrainConfig
+    steep: bool  # True if skins have been made steeper, or there are none
+    rounds: int = 0  # Number of times that bounced light was computed
+    estimates: int = 0  # Number of times that the position of the flash was estimated
+    last_bake: int = 0  # Step of the last bake
+    samples_per_ray: float = 30.0
+    meeting: float = 0.5  # Fraction of the sampled pixels whose rays meet the hull
 
-    def __init__(self, dataset: Path, config: TrainConfig, minutes: float | None, steps: int | None, seed: int,
-                 reading: dict | None = None, estimate: bool = False):
-        super().__init__(dataset, config, minutes, steps, seed, reading)
-        if estimate and not self.on_lens:
+
+class Fast:
+    """The recipe ``fast``.
+
+    Parameters
+    ----------
+    estimate
+        Estimate the position of the flash beside the lens.
+    field
+        Tensors of a finished field of the same data, whose transmittance networks alone are trained.
+    """
+
+    def __init__(self, config: FastConfig, run: Run, estimate: bool = False,
+                 field: Mapping[str, np.ndarray] | None = None):
+        if estimate and not run.data.on_lens:
             raise MiNtfError("--flash-offset estimate: the data set says where its lights are; leave the option out")
-        pool = self.photographs["train"]
-        self.config = config = config.sharpened(rays.pixel_width(self.splits["train"]))
-        if config.gains and not self.splits["train"].calibrated:
-            self.gains = Gains(pool)
+        self.run, self.data, self.clock, self.learner = run, run.data, run.clock, run.learner
+        self.generator = run.generator
+        self.config = config = config.sharpened(self.data.pixel_width)
+        self.field_until = config.ntf_alone
+        self.networks = parallel.share(networks.initial(config.architecture, config.log_density, self.generator))
+        pool = self.data.train
+        self.gains = Gains(pool) if config.gains and not self.data.splits["train"].calibrated else None
         self.room = None if self.gains is None else torch.nn.Parameter(torch.full((3,), math.log(ROOM)))
-        """What the room sends back of the flash, see :class:`mi_ntf.train.bounced.Bounced`; renderings have no room."""
-        self.optimizers = {"field": self._optimizer(*FIELD), "ntf": self._optimizer("transmittance", "visibility")}
+        """Light that the room reflects, see :class:`mi_ntf.train.bounced.Bounced`; renderings have no room."""
+        self.learner.optimizers = {"field": self._optimizer(*FIELD),
+                                   "ntf": self._optimizer("transmittance", "visibility")}
         hull = rays.visual_hull(pool, config.cells)
         self.occupancy, self.spans = Occupancy(hull), Spans(hull)
         # Rays that miss the hull have nothing to teach. All others stay for good: matter may grow into any of them.
         pool.look_at(self.spans.points(), Spans.BLOCK * math.sqrt(3) / config.cells)
-        self.meeting = 0.5
-        """Share of the pixels looked at whose rays meet the hull."""
         self.baked, self.marched = NormalTargets(config.bake), TransmittanceTargets()
-        self.samples_per_ray, self.last_bake = 30.0, 0
-        self.rounds = 0
-        """How often the bounced light was found."""
-        self.steep = not self.solid
-        """Whether skins were made steeper, or there are none."""
-        everyone = list(self.photographs.values())
-        self.flash = Flash(everyone, self.solid, self.marched)
-        """Where the lights are."""
-        self.estimating, self.estimates = estimate, 0
-        """Whether the lights' place beside the lenses is to be found, and how often it was."""
-        self.lens = self.on_lens and not estimate
-        """Whether the lights are at the lenses for good."""
-        if config.bounces and self.solid:
-            self.bounced = Bounced(self.flash, torch.cat([p.light for p in everyone]), self.room)
-
-    @property
-    def light(self) -> Light:
-        return Light(self.bounced, self.elsewhere, self.gains is not None)
-
-    @property
-    def elsewhere(self) -> Flash | None:
-        """The lights, if they are not at the lenses."""
-        return None if self.lens else self.flash
-
-    def parameters(self) -> dict[str, torch.Tensor]:
-        if self.gains is None or self.room is None:
-            return self.nets.tensors
-        return self.nets.tensors | {"gains": self.gains.logs, "room": self.room}
+        self.flash = Flash(self.data.all, self.data.solid, self.marched)
+        self.estimating = estimate
+        self.at_lens = self.data.on_lens and not estimate  # True if the lights are at the lenses for the whole run
+        self.bounced: Bounced | None = None
+        if config.bounces and self.data.solid:
+            self.bounced = Bounced(self.flash, torch.cat([p.light for p in self.data.all]), self.room)
+        self.course = Course(steep=not self.data.solid)
+        if field is not None:
+            self._take(field)
 
     def _optimizer(self, *names: str) -> torch.optim.Adam:
-        tensors = {k: v for k, v in self.nets.tensors.items() if k.split(".")[0] in names}
+        tensors = {k: v for k, v in self.networks.tensors.items() if k.split(".")[0] in names}
         planes = {"params": [v for k, v in tensors.items() if ".planes." in k], "base": self.config.lr_planes}
         layers = {"params": [v for k, v in tensors.items() if ".layers." in k], "base": self.config.lr_layers}
         groups = [planes, layers]
@@ -103,191 +102,237 @@ class Fast(Recipe):
             groups.append({"params": [self.gains.logs, self.room], "base": self.config.lr_gains})
         return torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12, fused=True)
 
+    def _take(self, field: Mapping[str, np.ndarray]) -> None:
+        """Take density and reflectance of a finished field."""
+        copy_into(self.networks.tensors,
+                  {k: torch.as_tensor(v) for k, v in field.items() if k.split(".")[0] in FIELD})
+        for _ in range(11):  # skins fill a fraction of their cells
+            self.occupancy.sample(self.networks, self.generator)
+        self.occupancy.update(self.networks, self.generator)
+        self.update_bounced()
+
+    @property
+    def elsewhere(self) -> Flash | None:
+        """Lights, if they are not at the lenses."""
+        return None if self.at_lens else self.flash
+
+    @property
+    def light(self) -> Light:
+        """See :class:`mi_ntf.train.recipe.Recipe`."""
+        return Light(self.bounced, self.elsewhere, self.gains is not None)
+
+    def occupied(self) -> Occupancy:
+        """See :class:`mi_ntf.train.recipe.Recipe`."""
+        return self.occupancy
+
+    # --- state ----------------------------------------------------------------------------------------------------
+
+    def parameters(self) -> Tensors:
+        """See :class:`mi_ntf.train.recipe.Recipe`."""
+        if self.gains is None or self.room is None:
+            return self.networks.tensors
+        return self.networks.tensors | {"gains": self.gains.logs, "room": self.room}
+
+    def snapshot(self) -> Snapshot:
+        """Return a copy of the field, without its transmittance, which is yet to learn from it."""
+        field = {k: v.detach().clone() for k, v in self.networks.tensors.items() if k.split(".")[0] in FIELD}
+        return {"field": field, "occupancy": {k: v.clone() for k, v in self.occupancy.state().items()}}
+
+    def adopt(self, snapshot: Snapshot) -> None:
+        """Go back to a :meth:`snapshot`."""
+        copy_into(self.networks.tensors, snapshot["field"])
+        self.occupancy.restore(snapshot["occupancy"])
+        self.bake()
+
+    def state(self) -> State:
+        """See :class:`mi_ntf.train.recipe.Recipe`."""
+        return {"course": asdict(self.course), "occupancy": self.occupancy.state(), "slope": self.baked.slope,
+                "log_sigma": self.marched.log_sigma, "reach": self.marched.reach, "place": self.flash.place,
+                "bounced": None if self.bounced is None else self.bounced.state()}
+
+    def restore(self, state: State) -> None:
+        """Restore a :meth:`state`."""
+        self.course = Course(**state["course"])
+        self.occupancy.restore(state["occupancy"])
+        self.baked.slope, self.flash.place = state["slope"], state["place"]
+        self.marched.log_sigma, self.marched.reach = state["log_sigma"], state["reach"]
+        if self.bounced is not None:
+            self.bounced.restore(state["bounced"])
+
+    # --- schedule -------------------------------------------------------------------------------------------------
+
     def carve(self, steps: int = 300, points: int = 4096) -> None:
-        """Give the density the shape of the visual hull, ln σ by regression: seconds that save minutes."""
+        """Give the density the shape of the visual hull, by regression of ln σ: seconds that save minutes."""
         occupancy, generator = self.occupancy, self.generator
         for step in range(steps):
             inside = occupancy.index[torch.randint(len(occupancy.index), (points,), generator=generator)]
             x = torch.cat([occupancy.positions(inside, generator), occupancy.must_be_empty(points, generator)])
-            raw = self.nets.log_density(x)
-            wanted = torch.full_like(raw, self.config.log_density)
-            wanted[points:] = LOG_EMPTY - 2
-            self._descend("field", (raw - wanted).square().mean(), 1 - 0.9 * step / steps)
-        self.optimizers["field"] = self._optimizer(*FIELD)
-
-    def take(self, path: Path, header: Header, tensors: dict) -> None:
-        super().take(path, header, tensors)
-        for _ in range(11):  # skins fill a fraction of their cells
-            self.occupancy.look(self.nets, self.generator)
-        self.occupancy.update(self.nets, self.generator)
-        self.find_bounced()
-
-    def occupied(self) -> Occupancy:
-        return self.occupancy
-
-    def snapshot(self) -> dict:
-        """The field, without its transmittance, which has yet to learn from it."""
-        tensors = {k: v for k, v in super().snapshot()["tensors"].items() if k.split(".")[0] in FIELD}
-        return {"tensors": tensors, "occupancy": {k: getattr(self.occupancy, k).clone() for k in self.GRIDS[0][1]}}
-
-    def adopt(self, snapshot: dict) -> None:
-        super().adopt(snapshot)
-        for name, value in snapshot["occupancy"].items():
-            setattr(self.occupancy, name, value)
-        self.bake()
+            raw = self.networks.log_density(x)
+            target = torch.full_like(raw, self.config.log_density)
+            target[points:] = LOG_EMPTY - 2
+            self.learner.descend("field", (raw - target).square().mean(), 1 - 0.9 * step / steps)
+        self.learner.optimizers["field"] = self._optimizer(*FIELD)
 
     def refresh(self) -> None:
-        """Bring the no-gradient copies of the density up to date."""
-        done = self.progress() >= self.config.ntf_alone
-        if self.step % REFRESH == 0 and not done:
-            self.occupancy.update(self.nets, self.generator)
-        if not self.steep and not done and self.progress() >= self.config.steepen_at:
+        """Bring all that is computed from the density without gradients up to date."""
+        progress, course = self.clock.progress, self.course
+        finished = progress >= self.field_until
+        if self.clock.step % REFRESH == 0 and not finished:
+            self.occupancy.update(self.networks, self.generator)
+        if not course.steep and not finished and progress >= self.config.steepen_at:
             self.make_steep()
-        due = self.step % (4 * REFRESH) == 0 and not (done and self.step > self.last_bake + 8 * REFRESH)
-        if due or (self.progress() >= self.config.ntf_from and not self.marched.known):
+        due = self.clock.step % (4 * REFRESH) == 0
+        due &= not (finished and self.clock.step > course.last_bake + 8 * REFRESH)
+        if due or (progress >= self.config.ntf_from and not self.marched.known):
             self.bake()
-        if not done and self.rounds < len(ROUNDS) and self.progress() >= ROUNDS[self.rounds]:
-            # Runs given in steps are the same whatever the clock says.
-            if self.minutes == math.inf or self.spent >= SPACED * (self.rounds + 1):
-                self.find_bounced()
-        looked = self.solid and (self.estimating or not self.splits["train"].located)
-        if looked and not done and self.estimates < len(ESTIMATES) and self.progress() >= ESTIMATES[self.estimates]:
-            self.find_flash()
+        if finished:
+            return
+        if course.rounds < len(BOUNCE_TIMES) and progress >= BOUNCE_TIMES[course.rounds]:
+            # Runs given in steps do not depend on the time that they take.
+            if not self.clock.timed or self.clock.spent >= BOUNCE_SECONDS * (course.rounds + 1):
+                self.update_bounced()
+        unknown = self.data.solid and (self.estimating or not self.data.splits["train"].located)
+        if unknown and course.estimates < len(ESTIMATE_TIMES) and progress >= ESTIMATE_TIMES[course.estimates]:
+            self.estimate_flash()
 
-    def find_flash(self) -> None:
-        """Find where the flash stands beside the lens, and put it there; or warn if the lens was taken for its place.
-        """
-        self.estimates += 1
-        self.baked.update(self.nets, self.occupancy)
-        self.marched.update(self.nets, self.occupancy)
-        pool = self.photographs["train"]
-        some = self.draw(4 * offset.POINTS, device.generator(7 + self.estimates))
-        seen = offset.observe(pool, some, self.baked, self.marched)
+    def estimate_flash(self) -> None:
+        """Estimate the position of the flash relative to the lens. Use it, or warn if it is assumed at the lens."""
+        self.course.estimates += 1
+        self.baked.update(self.networks, self.occupancy)
+        self.marched.update(self.networks, self.occupancy)
+        pool, notes = self.data.train, self.run.notes
+        sampled = self.sample_rays(4 * offset.POINTS, device.generator(7 + self.course.estimates))
+        observed = offset.observe(pool, sampled, self.baked, self.marched)
         distance = float(pool.origin.norm(dim=1).median())
-        found = offset.estimate(seen, self.flash, pool.views, distance)
-        if found is None:
-            return self.note("the photographs show too little of the same points to tell where the flash stands")
-        angle = math.degrees(math.atan2(float(found.norm()), distance))
-        lengths = ",".join(f"{v * self.similarity.radius:.4g}" for v in found.tolist())
+        place = offset.estimate(observed, self.flash, pool.views, distance)
+        if place is None:
+            return notes.add("the photographs show too little of the same points to tell where the flash stands")
+        angle = math.degrees(math.atan2(float(place.norm()), distance))
+        lengths = ",".join(f"{v * self.data.similarity.radius:.4g}" for v in place.tolist())
         if self.estimating:
-            self.flash.move(found)
-            self.notes = [text for text in self.notes if not text.startswith("the flash is found")]
-            self.note(f"the flash is found {angle:.1f} degrees off the lens: --flash-offset {lengths}")
-        elif angle > NOTICED and self.estimates == len(ESTIMATES):
-            self.note(f"warning: the photographs look like those of a flash {angle:.0f} degrees off the lens, which is "
+            self.flash.move(place)
+            notes.texts = [text for text in notes.texts if not text.startswith("the flash is found")]
+            notes.add(f"the flash is found {angle:.1f} degrees off the lens: --flash-offset {lengths}")
+        elif angle > NOTICED and self.course.estimates == len(ESTIMATE_TIMES):
+            notes.add(f"warning: the photographs look like those of a flash {angle:.0f} degrees off the lens, which is "
                       f"taken for its place; give --flash-offset {lengths} or --flash-offset estimate")
 
     @torch.no_grad()
     def make_steep(self) -> None:
-        """Multiply the slopes of ln σ, around SURFACE_LEVEL, which stays where it is."""
+        """Multiply the slopes of ln σ around SURFACE_LEVEL, where it does not change."""
         layer = f"density.layers.{len(self.config.architecture.density.hidden)}"
-        self.nets.tensors[f"{layer}.weight"] *= self.config.steepen
-        bias = self.nets.tensors[f"{layer}.bias"]
+        self.networks.tensors[f"{layer}.weight"] *= self.config.steepen
+        bias = self.networks.tensors[f"{layer}.bias"]
         bias += (self.config.steepen - 1) * (bias - SURFACE_LEVEL)
-        self.optimizers["field"] = self._optimizer(*FIELD)  # the old one's steps are of other slopes
-        self.steep = True
+        self.learner.optimizers["field"] = self._optimizer(*FIELD)  # the old moments belong to other slopes
+        self.course.steep = True
 
-    def find_bounced(self) -> None:
-        """Bring the light that bounced up to date."""
+    def update_bounced(self) -> None:
+        """Bring the bounced light up to date."""
         if self.bounced is not None:
-            self.marched.update(self.nets, self.occupancy)
-            some = self.draw(SEEN, device.generator(self.rounds))
-            self.bounced.update(self.nets, self.marched, some, self.rounds)
-        self.rounds += 1
+            self.marched.update(self.networks, self.occupancy)
+            sampled = self.sample_rays(CAMERA_RAYS, device.generator(self.course.rounds))
+            self.bounced.update(self.networks, self.marched, sampled, self.course.rounds)
+        self.course.rounds += 1
 
     def bake(self) -> None:
-        self.baked.update(self.nets, self.occupancy)
-        if self.progress() >= (self.config.ntf_from if self.lens else self.config.shadows_from):
-            self.marched.update(self.nets, self.occupancy)
-        self.last_bake = self.step
+        """Bring the baked densities up to date."""
+        self.baked.update(self.networks, self.occupancy)
+        if self.clock.progress >= (self.config.ntf_from if self.at_lens else self.config.shadows_from):
+            self.marched.update(self.networks, self.occupancy)
+        self.course.last_bake = self.clock.step
 
-    def draw(self, count: int, generator: torch.Generator) -> rays.Rays:
-        """About `count` random camera rays that meet the visual hull, and where they do."""
-        pool = self.photographs["train"]
-        looked = pool[pool.random(int(count / self.meeting) + 16, generator)]
-        _, found = self.spans(looked)
-        self.meeting = max(0.9 * self.meeting + 0.1 * len(found) / len(looked), 0.01)
-        return found[slice(count)]
+    # --- steps ----------------------------------------------------------------------------------------------------
 
-    def batch(self):
-        """Random camera rays and their samples, about ``config.samples`` of them: ``(rays, (ray, t, width))``."""
-        batch = self.draw(min(8192, max(256, int(self.config.samples / self.samples_per_ray))), self.generator)
-        count = len(batch)
-        cells = self.occupancy.visible(batch, self.config.step, self.generator)
-        samples = volume.unspent(self.nets, batch, cells, self.config.step, self.generator)
-        self.samples_per_ray = 0.9 * self.samples_per_ray + 0.1 * max(1.0, len(samples[0]) / count)
-        self.trained[0] += count
-        self.trained[1] += len(samples[0])
+    def sample_rays(self, count: int, generator: torch.Generator) -> rays.Rays:
+        """Return about `count` random camera rays that meet the visual hull, with the pieces that do."""
+        pool = self.data.train
+        candidates = pool[pool.random(int(count / self.course.meeting) + 16, generator)]
+        _, meeting = self.spans(candidates)
+        self.course.meeting = max(0.9 * self.course.meeting + 0.1 * len(meeting) / len(candidates), 0.01)
+        return meeting[slice(count)]
+
+    def batch(self) -> tuple[rays.Rays, volume.Samples]:
+        """Return random camera rays and their samples, about ``config.samples`` of them."""
+        course, step = self.course, self.config.step
+        batch = self.sample_rays(min(8192, max(256, int(self.config.samples / course.samples_per_ray))), self.generator)
+        cells = self.occupancy.visible(batch, step, self.generator)
+        samples = volume.unspent(self.networks, batch, cells, step, self.generator)
+        course.samples_per_ray = 0.9 * course.samples_per_ray + 0.1 * max(1.0, len(samples.ray) / len(batch))
+        self.learner.rays += len(batch)
+        self.learner.samples += len(samples.ray)
         return batch, samples
 
+    @property
     def fading(self) -> float:
-        """1 at the start, ``config.lr_end`` when the field is finished: of learning rates, and of the cost of sharp
-        lobes. It says what is glossy at all; how much so, photographs alone should say."""
-        return self.config.lr_end ** (self.progress() / self.config.ntf_alone)
+        """Factor of the field's learning rates and of the cost of sharp lobes, from 1 to ``config.lr_end``.
 
-    def field_loss(self, batch: rays.Rays, samples):
-        """``(terms, image)``: name → weighted term of the photographs; see :mod:`mi_ntf.train.losses`."""
-        c, g = self.config, self.generator
-        image = volume.render(self.nets, batch, samples, self.bounced, g, self.progress() >= c.lobes_from,
+        The cost says what is glossy at all; how much so, photographs alone should say.
+        """
+        return float(self.config.lr_end ** (self.clock.progress / self.field_until))
+
+    def field_loss(self, batch: rays.Rays, samples: volume.Samples) -> tuple[Tensors, volume.Image]:
+        """Return the weighted loss terms of the photographs by name, and the rendered image."""
+        c, g, nets = self.config, self.generator, self.networks
+        image = volume.render(nets, batch, samples, self.bounced, g, self.clock.progress >= c.lobes_from,
                               self.elsewhere)
-        pool, target = self.photographs["train"], batch.target
+        pool, target = self.data.train, batch.target
         color = image.color if self.gains is None else image.color * self.gains(batch.view)
-        trusted = trust(color, target) if pool.levels else 1.0
+        weight = trust(color, target) if pool.quantized else 1.0
         known = 1.0 if pool.masked else ((target[:, 3] == 0) | (target[:, 3] == 1)).float()
-        terms = {"colour": losses.color(color, target[:, :3], self.exposure, trusted),
+        terms = {"colour": losses.color(color, target[:, :3], self.data.exposure, weight),
                  "alpha": c.alpha * (known * (image.alpha - target[:, 3]).square()).mean()}
-        toward, away = losses.normals(image, batch.d, self.baked)
-        terms["normal"], terms["facing"] = c.normal * toward, c.facing * away
+        error, backward = losses.normals(image, batch.d, self.baked)
+        terms["normal"], terms["facing"] = c.normal * error, c.facing * backward
         terms["bounds"] = c.empty * torch.relu(image.raw - MAX_LOG_DENSITY).mean()
-        terms["even"] = c.even * losses.evenness(self.nets, image, c.even_over, 2048, g)
+        terms["even"] = c.even * losses.evenness(nets, image, c.even_over, 2048, g)
         matter = image.raw[image.index].clamp(max=MAX_LOG_DENSITY)
-        terms["sharp"] = -c.sharp * self.opaque * (image.weight.detach() * matter).sum() / len(batch)
-        terms["gloss"] = c.gloss * losses.gloss(image, c.architecture.least_specular, self.fading(), len(batch))
+        terms["sharp"] = -c.sharp * self.data.opaque * (image.weight.detach() * matter).sum() / len(batch)
+        terms["gloss"] = c.gloss * losses.gloss(image, c.architecture.least_specular, self.fading, len(batch))
         x = self.occupancy.must_be_empty(1536, g)
         if len(x):
-            terms["empty"] = c.empty * losses.emptiness(self.nets, x)
-        if self.step % 4 == 0:
-            terms["smooth"] = 4 * c.smooth * losses.total_variation(self.nets)
+            terms["empty"] = c.empty * losses.emptiness(nets, x)
+        if self.clock.step % 4 == 0:
+            terms["smooth"] = 4 * c.smooth * losses.total_variation(nets)
         return terms, image
 
-    def ntf_loss(self, image: volume.Image, batch: rays.Rays) -> dict[str, torch.Tensor]:
-        """Name → weighted term of the networks that learn transmittance."""
+    def ntf_loss(self, image: volume.Image, batch: rays.Rays) -> Tensors:
+        """Return the weighted loss terms of the networks that learn transmittance, by name."""
         c, g = self.config, self.generator
         o, d = losses.training_rays(self.marched, batch, c.ntf_rays, c.augmentation, g)
         targets = losses.targets(self.marched, o, d, g)
-        terms = {"transmittance": losses.transmittance(self.nets, targets)}
+        terms = {"transmittance": losses.transmittance(self.networks, targets)}
         if c.architecture.visibility is not None:
-            terms["visibility"] = losses.visibility(self.nets, targets)
-        if c.colour_loss and self.lens:  # its light comes by the camera's own rays, which the image knows
+            terms["visibility"] = losses.visibility(self.networks, targets)
+        if c.colour_loss and self.at_lens:  # light comes along the camera's rays, which the image knows
             near = min(NEAR, len(batch))
             gain = 1.0 if self.gains is None else self.gains(batch.view[:near]).detach()
-            lit = losses.transmittance_color(self.nets, self.marched, image, batch, self.exposure, near, gain)
-            terms["lit colour"] = 0.1 * lit
+            terms["lit colour"] = 0.1 * losses.transmittance_color(self.networks, self.marched, image, batch,
+                                                                   self.data.exposure, near, gain)
         return terms
 
     def advance(self) -> float:
-        """One optimiser step of whatever the schedule trains now; returns the loss. Raises Fault."""
-        c, done = self.config, self.progress()
-        alone = done >= c.ntf_alone
+        """See :class:`mi_ntf.train.recipe.Recipe`."""
+        c, progress, learner = self.config, self.clock.progress, self.learner
         self.refresh()
         value = 0.0
         batch, samples = self.batch()
-        if alone:
-            few = samples[0] < NEAR
+        if progress >= self.field_until:
+            few = samples.ray < NEAR
             with torch.no_grad():
-                image = volume.render(self.nets, batch[slice(NEAR)], tuple(part[few] for part in samples), self.bounced,
-                                      self.generator, flash=self.elsewhere)
-            self.terms = {}
+                image = volume.render(self.networks, batch[slice(NEAR)],
+                                      volume.Samples(*(part[few] for part in samples)), self.bounced, self.generator,
+                                      flash=self.elsewhere)
+            learner.terms = {}
         else:
-            self.terms, image = self.field_loss(batch, samples)
-            # Of all terms these two are positive and of a known size.
-            self.watch.check("field", float((self.terms["colour"] + self.terms["alpha"]).detach()), self.step)
-            rate = self.fading() * min(1.0, (self.step + 1) / 50)
-            value += self._descend("field", total(self.terms), rate)
-        if done >= c.ntf_from:
+            learner.terms, image = self.field_loss(batch, samples)
+            learner.check("field", learner.terms["colour"] + learner.terms["alpha"])
+            rate = self.fading * min(1.0, (self.clock.step + 1) / 50)
+            value += learner.descend("field", total(learner.terms), rate)
+        if progress >= c.ntf_from:
             terms = self.ntf_loss(image, batch)
             loss = total(terms)
-            self.watch.check("ntf", float(loss.detach()), self.step)
-            value += self._descend("ntf", loss, c.lr_end ** ((done - c.ntf_from) / (1 - c.ntf_from)))
-            self.terms |= terms
+            learner.check("ntf", loss)
+            value += learner.descend("ntf", loss, c.lr_end ** ((progress - c.ntf_from) / (1 - c.ntf_from)))
+            learner.terms |= terms
         return value

@@ -1,15 +1,14 @@
-"""Light of a flash that is not at the lens: where it comes from, what of it is in the shadow, what points send on.
+"""Light of a flash that is not at the lens: its position, its shadows, and the light that points scatter.
 
-A cell of the camera's ray at the optical depth D from the camera is D c_o/c_i deep for light that falls in at the
-cosine c_i to the normal, where the viewer's is c_o: skins are flat and thin beside what throws shadows. So what the
-field's phase function ρ (c_i + c_o) sends back from the whole skin is
+A cell of the camera's ray at the optical depth D from the camera has the depth D c_o/c_i for light that falls in at the
+cosine c_i to the normal, where the viewer's is c_o: skins are flat and thin compared with objects that throw shadows.
+So the whole skin, with the phase function ρ (c_i + c_o) of the field, scatters
 
     L = Σ_j (e^{−(1 + c_o/c_i) D_j} − e^{−(1 + c_o/c_i) D_{j+1}}) V ρ c_i I/d²
 
-with V the share of the flash's light that reaches the skin from outside, of opaque things that of one march a ray, from
-above the mean point that the ray sees. With flash and lens in one place c_o = c_i and V is 1:
-:mod:`mi_ntf.train.volume` has that case without all this. Smoke has no skin: its points are marched to themselves, each
-of them.
+with V the fraction of the flash's light that reaches the skin from outside. Of opaque objects V is one march per ray,
+from above the mean point that the ray sees. With flash and lens in one place c_o = c_i and V is 1, which
+:mod:`mi_ntf.train.volume` computes directly. Smoke has no skin: each of its points is marched to.
 """
 
 from collections.abc import Sequence
@@ -19,92 +18,99 @@ import torch.nn.functional as F
 
 from ..core import fresnel, microfacet
 from . import ops
+from .networks import Reflectance
 from .normal_targets import fetch
 from .optical import Optical
 from .rays import Photographs
 from .transmittance_targets import TransmittanceTargets, walk
 
 LEAST_COSINE = 0.03
-"""Light that grazes the skin goes through as much of it as at this cosine."""
+"""Least cosine of incidence; grazing light crosses as much of the skin as at this cosine."""
 DARK = 6.0
-"""Optical depth from which on marched light counts as gone."""
+"""Optical depth at which marched light counts as absorbed."""
 LIFTS = (0.015, 0.025, 0.04, 0.06)
-"""Heights above the skin, in radii of the unit sphere, at the first of which that is out of matter shadow rays begin:
-early skins are thick, and coarse voxels make all of them so."""
+"""Heights above the skin, in radii of the unit sphere, at which shadow rays may begin: at the first one outside of
+matter. Early skins are thick, and coarse voxels make all of them so."""
 CLEAR = 1.0
-"""σ under which a place is out of matter."""
+"""Density σ below which a place is outside of matter."""
 
 
 class Flash:
-    """The lights of all photographs, the splits' one after the other.
+    """Lights of all photographs, split after split, in field coordinates.
 
-    `camera`, `rotation`: the cameras (views, 3) and their axes (views, 3, 3) · `place` (views, 3): the lights, field
-    coordinates · `marched`: the density that throws shadows; none before it is known.
+    Parameters
+    ----------
+    photographs
+        The photographs of all splits.
+    solid
+        True if the object has a skin.
+    marched
+        Density that throws shadows; it throws none before it is known.
     """
 
     def __init__(self, photographs: Sequence[Photographs], solid: bool, marched: TransmittanceTargets):
-        self.camera = torch.cat([p.origin for p in photographs]).float()
-        self.rotation = torch.cat([p.rotation for p in photographs]).float()
-        self.place = torch.cat([p.flash for p in photographs]).float()
+        self.camera = torch.cat([p.origin for p in photographs]).float()  # Lenses (views, 3)
+        self.rotation = torch.cat([p.rotation for p in photographs]).float()  # Axes of the cameras (views, 3, 3)
+        self.place = torch.cat([p.flash for p in photographs]).float()  # Positions of the lights (views, 3)
         self.solid, self.marched = solid, marched
 
     def places(self, offset: torch.Tensor) -> torch.Tensor:
-        """Where lights at `offset` (3,) from their lenses are (views, 3): right, up, forward in field lengths."""
+        """Return the positions (views, 3) of lights at `offset` (3,) from their lenses: right, up, forward."""
         return self.camera + self.rotation @ (offset * torch.tensor([1.0, 1.0, -1.0]))
 
     def move(self, offset: torch.Tensor) -> None:
-        """Put every light at `offset` from its lens, as of :meth:`places`."""
+        """Put every light at `offset` from its lens, see :meth:`places`."""
         self.place = self.places(offset)
 
     def toward(self, view: torch.Tensor, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """``(direction (n, 3), distance (n, 1))`` of the lights of photographs `view` (n,), from `x` (n, 3)."""
-        away = self.place[view] - x
-        distance = away.norm(dim=1, keepdim=True)
-        return away / distance, distance
+        """Return direction (n, 3) and distance (n, 1) from `x` (n, 3) to the lights of photographs `view` (n,)."""
+        path = self.place[view] - x
+        distance = path.norm(dim=1, keepdim=True)
+        return path / distance, distance
 
     @torch.no_grad()
     def reaching(self, view: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
-        """Share (n,) of the light of photographs `view` that arrives at `x` (n, 3)."""
+        """Return the fraction (n,) of the light of photographs `view` (n,) that arrives at `x` (n, 3)."""
         if not self.marched.known:
             return torch.ones(len(x))
         direction, distance = self.toward(view, x)
         _, depth = walk(self.marched, x, direction, DARK, distance[:, 0])
         return torch.exp(-depth)
 
-    def send(self, seen: Optical, reflectance: tuple, d: torch.Tensor, x: torch.Tensor, view: torch.Tensor,
+    def send(self, optical: Optical, reflectance: Reflectance, d: torch.Tensor, x: torch.Tensor, view: torch.Tensor,
              light: torch.Tensor, rim: bool) -> torch.Tensor:
-        """Radiance (n, 3) that samples at `x` (n, 3) of rays along `d` send to the camera.
+        """Return the radiance (n, 3) that samples at `x` (n, 3) of rays along `d` send to the camera.
 
-        `seen`: their cells' optical depths · `reflectance`: of :meth:`Networks.reflectance` · `light` (n, 3): as of
-        :class:`Rays` · `rim`: whether the field has a Fresnel term.
+        `optical` are the samples' optical depths, `light` (n, 3) radiant intensities. `rim` is true if the field has a
+        Fresnel term. Shadows on skins are left out, see :meth:`lit`.
         """
         normal, albedo, roughness, specular = reflectance
         toward, distance = self.toward(view, x)
         wi, wo, n = toward.unbind(1), (-d).unbind(1), normal.unbind(1)
-        of_diffuse, of_gloss = fresnel.weights(ops, wi, wo, n, roughness, specular, rim)
+        diffuse_weight, gloss_weight = fresnel.weights(ops, wi, wo, n, roughness, specular, rim)
         if self.solid:
             diffuse, glossy = microfacet.lobes(ops, wi, wo, n, roughness)
             with torch.no_grad():
                 cos_i, cos_o = ((normal * v).sum(1).clamp(min=LEAST_COSINE) for v in (toward, -d))
                 ratio = 1 + cos_o / cos_i
             faces = (normal.detach() * d).sum(1) < 0
-            weight = torch.exp(-ratio * seen.front) * -torch.expm1(-ratio * seen.depth) * faces
+            weight = torch.exp(-ratio * optical.front) * -torch.expm1(-ratio * optical.depth) * faces
         else:
             diffuse, glossy = microfacet.scattering(ops, wi, wo, n, roughness)
-            weight = torch.exp(-seen.front) * -torch.expm1(-seen.depth) * self.reaching(view, x)
-        lobe = (of_diffuse * diffuse)[:, None] * albedo + (of_gloss * glossy)[:, None]
+            weight = torch.exp(-optical.front) * -torch.expm1(-optical.depth) * self.reaching(view, x)
+        lobe: torch.Tensor = (diffuse_weight * diffuse)[:, None] * albedo + (gloss_weight * glossy)[:, None]
         return weight[:, None] * lobe * light / distance**2
 
     @torch.no_grad()
     def lit(self, view: torch.Tensor, x: torch.Tensor, normal: torch.Tensor) -> torch.Tensor:
-        """V (n,): what reaches opaque skins at `x` (n, 3) of mean `normal` (n, 3), out of their own matter."""
+        """Return V (n,), the fraction of light that reaches opaque skins at `x` (n, 3) with mean `normal` (n, 3)."""
         if not self.solid or not self.marched.known:
             return torch.ones(len(x))
         return self.reaching(view, above(self.marched, x, F.normalize(normal, dim=1)))
 
 
 def above(marched: TransmittanceTargets, x: torch.Tensor, normal: torch.Tensor) -> torch.Tensor:
-    """Where shadow rays begin (n, 3) over points of skin at `x` (n, 3) with unit `normal` (n, 3)."""
+    """Return origins (n, 3) of shadow rays for points of skin at `x` (n, 3) with unit `normal` (n, 3)."""
     places = x + torch.tensor(LIFTS)[:, None, None] * normal
     sigma = fetch(marched.log_sigma, places.reshape(-1, 3))[0].view(len(LIFTS), -1).exp()
     inside = (sigma > CLEAR).to(torch.uint8)

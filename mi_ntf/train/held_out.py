@@ -1,44 +1,44 @@
-"""How well the transmittance network knows the field: on points and lights that no training has seen."""
+"""Accuracy of the transmittance network on points and lights that training has not seen."""
 
 import torch
 
 from . import device
 from .losses import tau
-from .networks import Networks, crossings
+from .networks import Networks, depth_at, free_flight
 from .occupancy import Occupancy
 from .rays import Photographs
 from .transmittance_targets import TransmittanceTargets, chords, uniform_directions
 
 STEPS = 2048
+PAIRS = 4096
+"""Pairs of a shading point and a light, at most …"""
+CHUNK = 512
+"""… and how many of them are evaluated at once."""
 
 
 @torch.no_grad()
-def score(networks: Networks, occupancy: Occupancy, photographs: Photographs, count: int = 4096,
-          chunk: int = 512) -> dict[str, float]:
-    """``rms`` and ``bias`` of τ_nt against the field's own marched τ, on about `count` pairs of a shading point of the
-    (held-out) `photographs` and a light in a random direction; `occupancy`: of
-    :func:`mi_ntf.train.scoring.occupied`. Empty where no ray sees matter."""
+def score(networks: Networks, occupancy: Occupancy, photographs: Photographs) -> dict[str, float]:
+    """Return ``rms`` and ``bias`` of τ_nt against the marched τ of the field; empty if no ray sees matter.
+
+    They are taken over PAIRS pairs of a shading point of the held-out `photographs` and a light in a random
+    direction. `occupancy` comes from :func:`mi_ntf.train.scoring.occupied`.
+    """
     generator = device.generator(4)
     marched = TransmittanceTargets()
     marched.update(networks, occupancy)
     errors = [torch.zeros(0)]
-    for _ in range(0, count, chunk):
-        some = photographs[photographs.random(16 * chunk, generator)]
-        some = some[(some.target[:, 3] > 0.5).nonzero()[:chunk, 0]]
-        m, h = chords(some.o, some.d)
-        profile = marched.march(m, -some.d, h, STEPS)
-        lost = torch.rand(len(some), 1, generator=generator) * -torch.expm1(-profile[:, :1])
-        x = m - crossings(profile, h, -torch.log1p(-lost)) * some.d
-        d = uniform_directions(len(some), generator)
+    for _ in range(0, PAIRS, CHUNK):
+        rays = photographs[photographs.random(16 * CHUNK, generator)]
+        rays = rays[(rays.target[:, 3] > 0.5).nonzero()[:CHUNK, 0]]
+        m, h = chords(rays.o, rays.d)
+        x = m - free_flight(marched.march(m, -rays.d, h, STEPS), h, 1, generator) * rays.d
+        d = uniform_directions(len(rays), generator)
         m, h = chords(x, d)
         profile = marched.march(m, d, h, STEPS)
         t = (x * d).sum(1, keepdim=True)
-        place = ((t / h[:, None] + 1) * (STEPS / 2)).clamp(0, STEPS - 1e-3)
-        lower = place.floor().long()
-        depth = torch.lerp(profile.gather(1, lower), profile.gather(1, lower + 1), place - lower)
         hit, mixture = networks.ray_mixture(x, d, profile)
-        found = torch.where(hit[:, None], tau(mixture, t), 1.0)
-        errors.append((found - torch.exp(-depth))[:, 0])
+        predicted = torch.where(hit[:, None], tau(mixture, t), 1.0)
+        errors.append((predicted - torch.exp(-depth_at(profile, h, t)))[:, 0])
     error = torch.cat(errors)
     if not len(error):
         return {}

@@ -1,4 +1,4 @@
-"""A run that is watched in a browser: the trainer's own picture, as often as it costs next to nothing."""
+"""Page in a browser that shows pictures of the field while it trains, as often as it costs next to nothing."""
 
 import time
 from collections.abc import Callable
@@ -6,12 +6,12 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-SHARE = 0.05
-"""Of a run's time, what its pictures may take."""
+PICTURE_TIME = 0.05
+"""Fraction of the run's time that pictures may take."""
 
 
 class Live:
-    """A page with the latest picture. `address`: where it is served."""
+    """Page with the latest picture, at `address`."""
 
     def __init__(self) -> None:
         from ..page_server import serve
@@ -21,13 +21,13 @@ class Live:
         self._next = 0.0
 
     def show(self, step: int, psnr: float, picture: Callable[[], torch.Tensor]) -> None:
-        """Put up ``picture()`` (h, w, 3), sRGB, of `step`, if it is time for one; `psnr` of the last validation."""
+        """Show ``picture()`` (h, w, 3), sRGB, of `step`, if one is due; `psnr` is that of the last validation."""
         start = time.monotonic()
         if start < self._next:
             return
         image = (255 * picture()).round().to(torch.uint8).cpu().numpy()
         height, width = image.shape[:2]
-        # The page stretches a background: room above and below keeps its shape.
+        # The page stretches a background: margins above and below keep its shape.
         framed = np.zeros((max(height, round(width / 1.4)), width, 3), np.uint8)
         top = (framed.shape[0] - height) // 2
         framed[top : top + height] = image
@@ -35,7 +35,8 @@ class Live:
         validation = "" if psnr != psnr else f", validation {psnr:.2f} dB"
         self._status.content = f"Photograph, field, normals: step {step}{validation}"
         now = time.monotonic()
-        self._next = now + (now - start) / SHARE
+        self._next = now + (now - start) / PICTURE_TIME
 
     def close(self) -> None:
+        """Stop the server."""
         self._server.stop()

@@ -1,4 +1,4 @@
-"""Photographs as camera rays in field coordinates, and what of space they leave possibly occupied."""
+"""Photographs as camera rays in field coordinates, and the visual hull that they leave."""
 
 import functools
 import math
@@ -17,69 +17,70 @@ from . import ops
 
 @dataclass(frozen=True)
 class Rays:
-    """n camera rays: `o`, `d` (n, 3) field coordinates, `t0`, `t1` (n,) the piece to march, `target` (n, 4) linear
-    premultiplied RGBA, `light` (n, 3) the light's radiant intensity over radius²: I/d² = light/t² in scene units;
-    `view` (n,): number of the photograph among those of all splits."""
+    """Camera rays (n) in field coordinates."""
 
-    o: torch.Tensor
-    d: torch.Tensor
-    t0: torch.Tensor
-    t1: torch.Tensor
-    target: torch.Tensor
-    light: torch.Tensor
-    view: torch.Tensor
+    o: torch.Tensor  # Origins (n, 3)
+    d: torch.Tensor  # Unit directions (n, 3)
+    t0: torch.Tensor  # Distance (n,) at which the march begins
+    t1: torch.Tensor  # Distance (n,) at which the march ends
+    target: torch.Tensor  # Pixels (n, 4), linear premultiplied RGBA
+    light: torch.Tensor  # Radiant intensity of the light over radius² (n, 3): I/d² in scene units is light/t²
+    view: torch.Tensor  # Numbers (n,) of the photographs, counted over all splits
 
     def __len__(self) -> int:
         return len(self.o)
 
-    def __getitem__(self, index) -> "Rays":
-        return Rays(*(getattr(self, k)[index] for k in ("o", "d", "t0", "t1", "target", "light", "view")))
+    def __getitem__(self, index: torch.Tensor | slice) -> "Rays":
+        return Rays(self.o[index], self.d[index], self.t0[index], self.t1[index], self.target[index],
+                    self.light[index], self.view[index])
 
 
 ON_LENS = 0.02
-"""Object radii between light and lens up to which they count as one."""
+"""Distance between light and lens, in object radii, up to which they count as one."""
 
 
 class Photographs:
-    """The photographs of a split, as they are stored, and the camera rays through their pixels: frame by frame, row by
-    row. Pixels are decoded and rays made when they are asked for, so that a data set takes 4 to 8 bytes a pixel.
+    """Photographs of a split, as they are stored, and the camera rays through their pixels, frame by frame, row by row.
 
-    `views`: their number · `height`, `width` in pixels · `first`: the number of the first of them among all splits'.
+    Pixels are decoded and rays computed on demand, so that a data set takes 4 to 8 bytes a pixel. `views` is the number
+    of photographs, `height` and `width` are in pixels, and `first` is the number of the first photograph among those
+    of all splits.
     """
 
     def __init__(self, split: Split, first: int = 0):
         self.views, self.height, self.width = split.images.shape[:3]
         self.first, self.names, self.masked = first, split.names, split.masked
         self.stored = torch.as_tensor(split.images).reshape(-1, 4)
-        self.levels = self.stored.dtype == torch.uint8
-        """Whether pixels are 8-bit levels, which end at both ends."""
+        self.quantized = self.stored.dtype == torch.uint8
+        """True if pixels are 8-bit levels, which are clipped at both ends."""
         exact = functools.partial(torch.as_tensor, dtype=torch.float64)
         self.rotation = exact(split.c2w[:, :3, :3])
         self.origin = exact((split.c2w[:, :3, 3] - split.center) / split.radius)
         self.focal, self.principal = exact(split.focal), exact(split.principal)
         self.flash = exact((split.light_pos - split.center) / split.radius)
-        """Where the light is (views, 3), field coordinates."""
+        """Positions of the lights (views, 3), field coordinates."""
         self.light = torch.as_tensor(split.light_intensity / split.radius**2).float()
         self.windows = torch.tensor([0, self.height, 0, self.width]).expand(self.views, 4)
-        """First and last row and column (exclusive) that :meth:`random` draws from, (views, 4)."""
+        """First and last row, first and last column of the pixels that :meth:`random` samples (views, 4), the last
+        ones exclusive."""
 
     def __len__(self) -> int:
         return len(self.stored)
 
     @property
     def on_lens(self) -> bool:
-        """Whether all lights are at their cameras."""
+        """True if all lights are at their lenses."""
         return bool((self.flash - self.origin).norm(dim=1).max() <= ON_LENS)
 
     def pixels(self, index: torch.Tensor) -> torch.Tensor:
-        """Linear premultiplied RGBA (n, 4) of the pixels `index` (n,)."""
-        found = self.stored[index]
-        if not self.levels:
-            return found.float()
-        return torch.cat([torch.as_tensor(LINEAR)[found[:, :3].int()], found[:, 3:] / 255.0], 1)
+        """Return the linear premultiplied RGBA (n, 4) of the pixels `index` (n,)."""
+        stored: torch.Tensor = self.stored[index]
+        if not self.quantized:
+            return stored.float()
+        return torch.cat([torch.as_tensor(LINEAR)[stored[:, :3].int()], stored[:, 3:] / 255.0], 1)
 
     def __getitem__(self, index: torch.Tensor | slice) -> Rays:
-        """The rays through pixels (n,), with `t0`, `t1` where they are inside the unit sphere."""
+        """Return the rays through the pixels `index` (n,); `t0` and `t1` are their ends within the unit sphere."""
         if isinstance(index, slice):
             index = torch.arange(len(self))[index]
         frame, place = index // (self.height * self.width), index % (self.height * self.width)
@@ -91,17 +92,18 @@ class Photographs:
         return Rays(o, d, *sphere_span(o, d), self.pixels(index), self.light[frame], frame + self.first)
 
     def random(self, count: int, generator: torch.Generator) -> torch.Tensor:
-        """`count` random pixels of the windows, all equally likely."""
+        """Return `count` random pixels of the windows, all equally likely."""
         top, bottom, left, right = self.windows.unbind(1)
         ends = ((bottom - top) * (right - left)).cumsum(0)
         pick = torch.randint(int(ends[-1]), (count,), generator=generator)
         frame = torch.searchsorted(ends, pick, right=True)
         place = ends[frame] - 1 - pick
         wide = (right - left)[frame]
-        return (frame * self.height + top[frame] + place // wide) * self.width + left[frame] + place % wide
+        row: torch.Tensor = frame * self.height + top[frame] + place // wide
+        return row * self.width + left[frame] + place % wide
 
     def look_at(self, points: torch.Tensor, margin: float) -> None:
-        """Set the windows around all `points` (n, 3), each with `margin` around it, field coordinates."""
+        """Set the windows around all `points` (n, 3), each with a `margin` around it, in field coordinates."""
         windows = []
         for rotation, origin, focal, principal in zip(self.rotation, self.origin, self.focal, self.principal,
                                                       strict=True):
@@ -120,14 +122,14 @@ class Photographs:
         self.windows = torch.stack(windows)
 
     def frame(self, number: int, stride: int = 1) -> tuple[torch.Tensor, int, int]:
-        """``(pixels, rows, columns)`` of photograph `number` (0 to views − 1), every `stride`-th row and column."""
+        """Return ``(pixels, row count, column count)`` of photograph `number`, every `stride`-th row and column."""
         rows, columns = (torch.arange(stride // 2, n, stride) for n in (self.height, self.width))
         pixels = ((number * self.height + rows[:, None]) * self.width + columns).reshape(-1)
         return pixels, len(rows), len(columns)
 
 
 def sphere_span(o: torch.Tensor, d: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """``(t0, t1)`` where the rays are inside the unit sphere and in front of their origin; t1 = t0 where they miss."""
+    """Return the ends ``(t0, t1)`` of rays in the unit sphere, in front of their origins; t1 = t0 for a miss."""
     hit, m, h = spheres.chord(ops, o.unbind(1), d.unbind(1))
     middle = ((torch.stack(m, 1) - o) * d).sum(1)
     t0 = (middle - h).clamp(min=0.01)
@@ -135,18 +137,24 @@ def sphere_span(o: torch.Tensor, d: torch.Tensor) -> tuple[torch.Tensor, torch.T
 
 
 def pixel_width(split: Split) -> float:
-    """Width of a pixel of the median photograph at the unit sphere's centre, field units."""
+    """Return the width of a pixel of the median photograph at the centre of the unit sphere, in field units."""
     distance = np.linalg.norm(split.c2w[:, :3, 3] - split.center, axis=1) / split.radius
     return float(np.median(distance / split.focal.max(1)))
 
 
-def visual_hull(photographs: Photographs, cells: int) -> torch.Tensor:
-    """Cells (cells, cells, cells) bool, [x, y, z], of [−1, 1]³ that no photograph shows empty.
-
-    A cell is empty if some image that contains it has alpha 0 wherever the cell can project to.
-    """
+def cell_centers(cells: int) -> torch.Tensor:
+    """Return the centres (cells, cells, cells, 3), [x, y, z], of a grid over [−1, 1]³."""
     axis = (torch.arange(cells) + 0.5) * (2 / cells) - 1
-    x = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+    return torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
+
+
+def visual_hull(photographs: Photographs, cells: int) -> torch.Tensor:
+    """Return the cells (cells, cells, cells) bool, [x, y, z], of [−1, 1]³ that no photograph shows empty.
+
+    A cell is empty if an image that contains it has alpha 0 wherever the cell can project to. Raises MiNtfError if no
+    cell remains.
+    """
+    x = cell_centers(cells).reshape(-1, 3)
     inside = (x.norm(dim=1) < 1 + 2 / cells).nonzero()[:, 0]
     x = x[inside]
     height, width = photographs.height, photographs.width
@@ -162,8 +170,8 @@ def visual_hull(photographs: Photographs, cells: int) -> torch.Tensor:
             shown = F.max_pool2d(shown, size, 1, (size[0] // 2, size[1] // 2))
         u = (cx + fx * local[:, 0] / depth).floor().long()
         v = (cy - fy * local[:, 1] / depth).floor().long()
-        seen = (u >= 0) & (u < width) & (v >= 0) & (v < height) & (local[:, 2] < 0)
-        empty = seen & (shown[0, 0, v.clamp(0, height - 1), u.clamp(0, width - 1)] == 0)
+        visible = (u >= 0) & (u < width) & (v >= 0) & (v < height) & (local[:, 2] < 0)
+        empty = visible & (shown[0, 0, v.clamp(0, height - 1), u.clamp(0, width - 1)] == 0)
         x, inside = x[~empty], inside[~empty]
     if not len(inside):
         raise MiNtfError("no point in space is covered by the object in all photographs; check 'transform_matrix' "

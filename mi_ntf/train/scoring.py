@@ -1,7 +1,9 @@
-"""How well a field reproduces photographs: PSNR of images rendered as the renderer does, from the networks alone."""
+"""Reproduction error of photographs: PSNR of images rendered from the networks alone, as the renderer does."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 
@@ -17,75 +19,114 @@ from .transmittance_targets import CUT
 from .volume import render, scatter_sum, unspent
 
 CELLS = 128
-"""Cells along an edge of the occupancy grid that finished fields are seen through."""
+"""Cells along an edge of the occupancy grid of finished fields."""
 
 
 def srgb(x: torch.Tensor) -> torch.Tensor:
-    """sRGB-encoded, clipped to [0, 1], of linear values."""
-    return curve.encode(ops, x)
+    """Return the sRGB encoding of linear values, clipped to [0, 1]."""
+    encoded: torch.Tensor = curve.encode(ops, x)
+    return encoded
 
 
 @dataclass(frozen=True)
 class Light:
-    """What lights the photographs besides a flash at the lens: further bounces, and where the flash is if it is
-    elsewhere. `fit`: whether each photograph has gains of its own, which those held back are fitted."""
+    """Light of the photographs, besides a flash at the lens."""
 
-    bounced: Bounced | None = None
+    bounced: Bounced | None = None  # Further bounces of the flash's light
     flash: Flash | None = None
-    fit: bool = False
+    """Lights beside the lenses; None: all are at the lens."""
+    fit: bool = False  # True if each photograph has gains, which are fitted to held-out photographs
 
 
-@torch.no_grad()
-def render_all(networks: Networks, rays: Rays, occupancy: Occupancy, step: float, generator: torch.Generator,
-               light: Light = Light(), passes: int = 1, chunk: int = 8192):
-    """``(color (n, 3), alpha (n,), normal (n, 3), albedo (n, 3))`` of all rays; `passes` jittered evaluations are
-    averaged."""
-    index, kept = occupancy.tighten(rays)
-    found = torch.zeros(len(rays), 10)
-    for first in range(0, len(kept), chunk):
-        part = kept[slice(first, first + chunk)]
-        where = index[first:first + chunk]
-        for _ in range(passes):
-            cells = occupancy.visible(part, step, generator)
-            image = render(networks, part, unspent(networks, part, cells, step, generator), light.bounced, generator,
-                           flash=light.flash)
-            seen = torch.cat([image.normal, image.albedo], 1)
-            seen = scatter_sum(image.weight[:, None] * seen, image.shaded, len(part))
-            found[where] += torch.cat([image.color, image.alpha[:, None], seen], 1) / passes
-    return found[:, :3], found[:, 3], found[:, 4:7], found[:, 7:]
+class Pixels(NamedTuple):
+    """Rendered pixels of n rays."""
+
+    color: torch.Tensor  # (n, 3), linear RGB
+    alpha: torch.Tensor  # (n,)
+    normal: torch.Tensor  # (n, 3), premultiplied
+    albedo: torch.Tensor  # (n, 3), premultiplied
+
+
+@dataclass(frozen=True)
+class FieldView:
+    """A field with all that is needed to render photographs of it."""
+
+    networks: Networks
+    occupancy: Occupancy
+    step: float  # Length of the quadrature's cells
+    light: Light = Light()
+
+    @torch.no_grad()
+    def render(self, rays: Rays, generator: torch.Generator, passes: int = 1, chunk: int = 8192) -> Pixels:
+        """Render all `rays`; `passes` jittered evaluations are averaged."""
+        index, meeting = self.occupancy.tighten(rays)
+        total = torch.zeros(len(rays), 10)
+        for first in range(0, len(meeting), chunk):
+            part = meeting[slice(first, first + chunk)]
+            rows = index[first:first + chunk]
+            for _ in range(passes):
+                cells = self.occupancy.visible(part, self.step, generator)
+                samples = unspent(self.networks, part, cells, self.step, generator)
+                image = render(self.networks, part, samples, self.light.bounced, generator, flash=self.light.flash)
+                surface = torch.cat([image.reflectance.normal, image.reflectance.albedo], 1)
+                surface = scatter_sum(image.weight[:, None] * surface, image.shaded, len(part))
+                total[rows] += torch.cat([image.color, image.alpha[:, None], surface], 1) / passes
+        return Pixels(total[:, :3], total[:, 3], total[:, 4:7], total[:, 7:])
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Means over photographs of their PSNR in dB, and the error of alpha."""
+
+    srgb: float  # PSNR of sRGB-encoded images clipped to [0, 1], as papers report it
+    linear: float  # PSNR of linear images with peak 1
+    object: float  # As `srgb`, of the object's pixels alone
+    alpha_rmse: float
+    each: tuple[float, ...]  # `srgb` of each photograph
+
+    def rounded(self) -> dict[str, float]:
+        """Return the means, rounded for the report."""
+        return {"srgb": round(self.srgb, 3), "linear": round(self.linear, 3), "object": round(self.object, 3),
+                "alpha_rmse": round(self.alpha_rmse, 5)}
 
 
 def decibels(mean_square: float) -> float:
-    """PSNR of peak 1."""
+    """Return the PSNR of a mean squared error, of peak 1."""
     return -10 * math.log10(max(mean_square, 1e-12))
 
 
 def occupied(networks: Networks) -> Occupancy:
-    """Where the networks put matter, and be it outside the visual hull: a renderer sees that too."""
+    """Return the occupancy of finished networks; like a renderer, it sees matter outside the visual hull, too."""
     return from_networks(networks, CELLS, CUT, device.generator(1))
 
 
 @torch.no_grad()
-def score(networks: Networks, occupancy: Occupancy, photographs: Photographs, step: float, light: Light = Light(),
-          most: float = math.inf, views: int | None = None, passes: int = 2, tell=lambda done: None) -> dict:
-    """How near the field comes to the photographs of a split, or the first `views` of them.
+def score(field: FieldView, photographs: Photographs, most: float = math.inf, views: int | None = None,
+          passes: int = 2, tell: Callable[[float], None] = lambda done: None) -> Scores:
+    """Compare the field with the photographs of a split.
 
-    Means over photographs of their PSNR in dB: `srgb` of sRGB-encoded images clipped to [0, 1], as papers report it,
-    `linear` of linear ones with peak 1, `object` as `srgb`, of the object's pixels alone; and `alpha_rmse`. Each
-    photograph's own `srgb` is in `each`. At most `most` pixels are looked at, random ones, the same in every call.
-    `tell` is called with the share that is done.
+    Parameters
+    ----------
+    most
+        Limit of the number of pixels. They are random, and the same in every call.
+    views
+        Number of photographs, the first ones; None: all.
+    passes
+        Jittered evaluations to average.
+    tell
+        Called with the fraction that is done.
     """
     count = photographs.views if views is None else min(views, photographs.views)
     each, generator = [], device.generator(1)
     for number in range(count):
         pixels, *_ = photographs.frame(number)
         if len(pixels) * count > most:
-            some = torch.randperm(len(pixels), generator=device.generator(6))[:max(1, int(most / count))]
-            pixels = pixels[some]
+            pick = torch.randperm(len(pixels), generator=device.generator(6))[:max(1, int(most / count))]
+            pixels = pixels[pick]
         rays = photographs[pixels]
-        color, alpha, *_ = render_all(networks, rays, occupancy, step, generator, light, passes)
+        color, alpha, *_ = field.render(rays, generator, passes)
         target = rays.target
-        color = color * fitted(color, target[:, :3]) if light.fit else color
+        color = color * fitted(color, target[:, :3]) if field.light.fit else color
         matter = target[:, 3] > (0.5 if photographs.masked else 0.99)
         error = (srgb(color) - srgb(target[:, :3])).square().mean(1)
         known = matter | (target[:, 3] == 0) if not photographs.masked else torch.ones_like(matter)
@@ -93,6 +134,6 @@ def score(networks: Networks, occupancy: Occupancy, photographs: Photographs, st
                      decibels(float(error[matter].mean())) if bool(matter.any()) else math.nan,
                      float((alpha - target[:, 3])[known].square().mean())))
         tell((number + 1) / count)
-    srgb_, linear, object_, mean_square = torch.tensor(each).T
-    return {"srgb": float(srgb_.mean()), "linear": float(linear.mean()), "object": float(object_.nanmean()),
-            "alpha_rmse": math.sqrt(float(mean_square.nanmean())), "each": srgb_.tolist()}
+    whole, linear, object_, mean_square = torch.tensor(each).T
+    return Scores(float(whole.mean()), float(linear.mean()), float(object_.nanmean()),
+                  math.sqrt(float(mean_square.nanmean())), tuple(whole.tolist()))

@@ -1,13 +1,17 @@
 """The training loop: photographs in, one field file out."""
 
+import copy
 import dataclasses
 import hashlib
 import json
 import math
 import os
 import time
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypedDict
 
+import numpy as np
 import torch
 
 from ..core import field_file, files
@@ -15,51 +19,83 @@ from ..core.architecture import Header
 from ..core.errors import MiNtfError
 from ..data.schema import fingerprint
 from . import checkpoint, device, held_out, networks, parallel, scoring
-from .config import HierarchicalConfig, TrainConfig, configured, transmittance_alone
+from .checkpoint import State
+from .config import Config, FastConfig, configured, transmittance_alone
 from .fast import Fast
 from .hierarchical import Hierarchical
-from .monitor import Display, Fault, Log
-from .recipe import SCORING, Recipe
-from .report import photographs, publish
+from .monitor import Display, Fault, Log, Notes, Validation
+from .recipe import SCORING_TIME, Clock, Learner, Recipe, Run, Snapshot, copy_into
+from .report import Report, judge, publish
+from .scoring import FieldView
+from .training_data import Reading, TrainingData
 
 KEEP = 128
 """Steps between two copies of the run's state in memory, to which a fault rolls back."""
 INTERVAL = 50.0
 """Seconds between two checkpoints, each the latest copy in memory …"""
 LATEST = 75.0
-"""… or, where steps are slow, a copy made for it after so many."""
+"""… or, where steps are slow, a copy made for it after this time."""
 FAULTS = 3
 """Rolled-back faults after which the next one ends the run."""
 VALIDATED = 1 << 17
-"""Pixels of a validation in the course of the run."""
+"""Pixels of a validation during the run."""
 SCORED = 1 << 14
-"""Pixels at least that a split of the finished field is scored by, in the shortest runs."""
+"""Least number of pixels by which a split of the finished field is scored, in the shortest runs."""
 BETTER = 0.02
-"""dB by which an earlier field must be better in validation to be taken in place of the last one."""
+"""Validation gain, dB, for which an earlier field replaces the last one."""
 
 
 def train(dataset: Path, out: Path, *, preset: str = "fast", minutes: float | None = None, steps: int | None = None,
-          seed: int = 0, tensorboard: Path | None = None, field: Path | None = None, reading: dict | None = None,
-          estimate: bool = False, view: bool = False, **variant) -> dict:
-    """Train a field on the photographs in `dataset` and write it to `out`. Returns the report (JSON types).
+          seed: int = 0, tensorboard: Path | None = None, field: Path | None = None, reading: Reading | None = None,
+          estimate: bool = False, view: bool = False, ntf: str | None = None, augmentation: bool = True,
+          colour_loss: bool = True, visibility_mlp: bool = False, bounces: bool = True, fresnel: bool = True,
+          gains: bool = True) -> Report:
+    """Train a field on photographs and write it.
 
-    The run lasts `minutes` (10 unless told) or `steps`; runs given in steps are reproducible, bit for bit on one CPU.
-    A checkpoint ``OUT.ckpt`` is written every minute, taken up by the same command, deleted at the end.
-    Faults (see :class:`mi_ntf.train.monitor.Fault`) are rolled back, listed in the report, and end the run when they
-    keep coming. `tensorboard`: a folder for its events. `view`: show the field in a browser while it learns. `field`:
-    a field file to keep as it is; its transmittance networks alone are trained, anew. `reading`: options of
-    :func:`mi_ntf.data.readers.load_dataset`. `estimate`: find where the flash stands beside the lens. `variant`:
-    ablations, see :func:`config.configured`.
+    Parameters
+    ----------
+    dataset, out
+        Folder of the data set; field file to write.
+    preset
+        Recipe and settings, a key of ``PRESETS``.
+    minutes, steps
+        Limit of the run, one of them; 10 minutes by default. Runs given in steps are reproducible, bit for bit on one
+        CPU.
+    seed
+        Seed of the initial networks and of all samples.
+    tensorboard
+        Folder for TensorBoard events.
+    field
+        Field file to keep as it is; its transmittance networks alone are trained, from the beginning.
+    reading
+        Options of :func:`mi_ntf.data.readers.load_dataset`.
+    estimate
+        Estimate the position of the flash beside the lens.
+    view
+        Show the field in a browser while it learns.
+    ntf, augmentation, colour_loss, visibility_mlp, bounces, fresnel, gains
+        Changes of the preset, see :func:`mi_ntf.train.config.configured`.
+
+    Returns
+    -------
+    Report
+        The report, JSON types, which the header of the field file holds too.
+
+    Notes
+    -----
+    A checkpoint ``OUT.ckpt`` is written every minute. The same command continues it, and it is deleted at the end.
+    Faults (:class:`mi_ntf.train.monitor.Fault`) are rolled back and listed in the report; several of them end the run.
 
     Under ``torchrun --nproc-per-node=N -m mi_ntf train DATASET -o FIELD …`` (or any launcher that sets RANK,
-    WORLD_SIZE, MASTER_ADDR and MASTER_PORT) N processes share the work of every step and average their gradients; see
-    :mod:`mi_ntf.train.parallel`. It is the run of one process with the same seed, up to rounding. The first process
-    prints and writes; the others return an empty report. All must see the same files.
+    WORLD_SIZE, MASTER_ADDR and MASTER_PORT) N processes share the work of every step, see :mod:`mi_ntf.train.parallel`.
+    The result is that of one process with the same seed, up to rounding. The first process prints and writes; the
+    others return an empty report. All must see the same files.
     """
-    config = configured(preset, **variant)
-    given = None if field is None else field_file.load(field)
-    if given is not None:
-        config = transmittance_alone(config, given[0].architecture)
+    config = configured(preset, ntf=ntf, augmentation=augmentation, colour_loss=colour_loss,
+                        visibility_mlp=visibility_mlp, bounces=bounces, fresnel=fresnel, gains=gains)
+    finished = None if field is None else FinishedField.load(field)
+    if finished is not None:
+        config = transmittance_alone(config, finished.header.architecture)
     if minutes is not None and steps is not None:
         raise MiNtfError(f"both --minutes {minutes:g} and --steps {steps} are given; a run is limited by one of them")
     limit = steps if steps is not None else 10.0 if minutes is None else minutes
@@ -69,170 +105,253 @@ def train(dataset: Path, out: Path, *, preset: str = "fast", minutes: float | No
         if parallel.first():
             files.check(out)
         torch.set_num_threads(_threads() if steps is None and parallel.count() == 1 else 1)
-        kind = _HierarchicalRun if isinstance(config, HierarchicalConfig) else _Run
-        before = None if field is None else hashlib.sha256(Path(field).read_bytes()).hexdigest()
-        run = kind(Path(dataset), Path(out), config, preset, minutes=None if steps is not None else float(limit),
-                   steps=steps, seed=seed, tensorboard=tensorboard, given=before, reading=reading, estimate=estimate,
-                   view=view)
-        if field is not None and given is not None:
-            run.take(field, *given)
-        run.resume()
-        if not run.step and given is None:
-            run.carve()
-        run.loop()
-        return run.finish() if parallel.first() else {}
+        trainer = Trainer(Path(dataset), Path(out), config, preset, minutes=None if steps is not None else float(limit),
+                          steps=steps, seed=seed, tensorboard=tensorboard, finished=finished, reading=reading,
+                          estimate=estimate, view=view)
+        trainer.resume()
+        trainer.loop()
+        return trainer.finish() if parallel.first() else {}
 
 
-class _Loop(Recipe):
-    """One training run around a stepper, which a subclass adds: its loop, its validation, its files."""
+@dataclass(frozen=True)
+class FinishedField:
+    """A field file whose density and reflectance a run keeps."""
 
-    OWN = ("history", "validated", "best", "kept", "faults", "trace")
+    path: Path
+    header: Header
+    tensors: dict[str, np.ndarray]
 
-    def __init__(self, dataset: Path, out: Path, config: TrainConfig | HierarchicalConfig, preset: str, *, minutes,
-                 steps, seed, tensorboard=None, given=None, reading=None, estimate=False, view=False):
+    @classmethod
+    def load(cls, path: Path) -> "FinishedField":
+        """Read the field file `path`. Raises MiNtfError."""
+        return cls(path, *field_file.load(path))
+
+    def check(self, data: TrainingData) -> None:
+        """Raise MiNtfError if the field was not trained on the data set `data`."""
+        here, there = ((*s.center, s.radius) for s in (data.similarity, self.header.similarity))
+        if max(abs(a - b) for a, b in zip(here, there, strict=True)) > 1e-4 * data.similarity.radius:
+            raise MiNtfError(f"{self.path} has its unit sphere (centre, radius) at {there}, the data set has it at "
+                             f"{here}; --field needs the data set that the field was trained on")
+
+
+class FaultEntry(TypedDict):
+    """Entry of the list of faults."""
+
+    step: int
+    reason: str
+
+
+class Best(TypedDict):
+    """The field of the best validation so far."""
+
+    psnr: float
+    entry: Validation
+    snapshot: Snapshot
+
+
+@dataclass
+class Record:
+    """Course of a run; part of checkpoints."""
+
+    history: list[Validation] = field(default_factory=list)
+    trace: list[tuple[int, float]] = field(default_factory=list)
+    """Steps and running means of the loss, a hundred in a run."""
+    faults: list[FaultEntry] = field(default_factory=list)
+    validated: float = 0.0  # Progress at the last validation
+    best: Best | None = None
+    chosen: Validation | None = None
+    """Validation of the finished field; None before."""
+
+
+class Trainer:
+    """One training run: it has a recipe, and adds the loop, validation, roll-backs, checkpoints and reports.
+
+    Parameters are those of :func:`train`. A checkpoint of the same run is continued by :meth:`resume`.
+    """
+
+    def __init__(self, dataset: Path, out: Path, config: Config, preset: str, *, minutes: float | None = None,
+                 steps: int | None = None, seed: int = 0, tensorboard: Path | None = None,
+                 finished: FinishedField | None = None, reading: Reading | None = None, estimate: bool = False,
+                 view: bool = False):
+        start = time.monotonic()
         self.log = Log(tensorboard if parallel.first() else None, view and parallel.first())
-        # The stepper's, next in line.
-        super().__init__(dataset, config, minutes, steps, seed, reading, estimate)  # type: ignore[call-arg]
-        self.out, self.checkpoint = out, Path(f"{out}.ckpt")
-        identity = {"preset": preset, "minutes": minutes, "steps": steps, "seed": seed,
-                    "config": dataclasses.asdict(config), "field": given, "estimate": estimate,
-                    "views": {k: len(s.images) for k, s in self.splits.items()}, "data": fingerprint(self.splits)}
-        self.identity = json.loads(json.dumps(identity, sort_keys=True))
-        self.history: list[dict] = []
-        self.trace: list[list[float]] = []
-        """Step and running mean of the loss, now and then."""
-        self.validated = 0.0
-        self.faults: list[dict] = []
-        self.best: dict | None = None
-        """The field of the best validation so far."""
-        self.saved = time.monotonic()
-        """When the last checkpoint was written."""
-        self.speed = 0.0
-        """Pixels a second of the last validation."""
-        self.last = float("nan")
-        """PSNR of the last validation."""
-        self.kept: dict | None = None
-        """The validation of the field that was kept when it was finished; None before."""
-        self.good: dict = {}
-        """The latest good state of the run."""
+        self.notes = Notes(parallel.first())
+        self.data = TrainingData.load(dataset, self.notes, reading or {})
+        self.clock = Clock(minutes or math.inf, steps or math.inf)
+        self.learner = Learner(self.clock)
+        self.generator = device.generator(seed)
+        if finished is not None:
+            finished.check(self.data)
+        run = Run(self.data, self.clock, self.learner, self.notes, self.generator)
+        self.recipe: Recipe
+        if isinstance(config, FastConfig):
+            self.recipe = Fast(config, run, estimate, None if finished is None else finished.tensors)
+        else:
+            self.recipe = Hierarchical(config, run, estimate)
+        self.out, self.checkpoint, self.finished = out, Path(f"{out}.ckpt"), finished
+        digest = None if finished is None else hashlib.sha256(finished.path.read_bytes()).hexdigest()
+        self.settings: State = {"preset": preset, "minutes": minutes, "steps": steps, "seed": seed,
+                                "views": {k: len(s.images) for k, s in self.data.splits.items()}}
+        identity = self.settings | {"config": dataclasses.asdict(config), "field": digest, "estimate": estimate,
+                                    "data": fingerprint(self.data.splits)}
+        self.identity: State = json.loads(json.dumps(identity, sort_keys=True))
+        self.record = Record()
+        self.good: State = {}  # Latest good state of the run
+        self.speed = 0.0  # Pixels a second of the last validation
+        self.last = math.nan  # PSNR of the last validation, dB
+        self.saved = time.monotonic()  # Time of the last checkpoint
+        self.clock.spent = time.monotonic() - start
 
     # --- the loop -------------------------------------------------------------------------------------------------
 
     def loop(self) -> None:
         """Step until the limit; show progress, validate, save checkpoints, roll back faults."""
-        self.log.start(self.step)
+        clock = self.clock
+        if not clock.step and self.finished is None:
+            self.recipe.carve()
+        self.log.start(clock.step)
         self.keep()
-        self.saved, traced, average = time.monotonic(), self.progress(), None
+        self.saved, traced, average = time.monotonic(), clock.progress, math.nan
         with Display(parallel.first()) as display:
             try:
-                while self.progress() < 1:
+                while clock.progress < 1:
                     try:
                         value = self.turn(display)
                     except Fault as fault:
                         display.say(self.roll_back(fault))
                         continue
-                    average = value if average is None else 0.98 * average + 0.02 * value
-                    if self.progress() - traced > 0.01:
-                        traced = self.progress()
-                        self.trace.append([self.step, average])
-                    if self.step % 20 == 0:
-                        display.update(self.progress(), self.step, average)
+                    average = value if math.isnan(average) else 0.98 * average + 0.02 * value
+                    if clock.progress - traced > 0.01:
+                        traced = clock.progress
+                        self.record.trace.append((clock.step, average))
+                    if clock.step % 20 == 0:
+                        display.update(clock.progress, clock.step, average)
                     if self.due():
                         self.save()
                         self.saved = time.monotonic()
-                if self.kept is None:  # field and transmittance have learnt together to the end
+                if self.record.chosen is None:  # field and transmittance have learnt together to the end
                     display.validated(self.validate())
                     display.say(self.choose())
-                display.update(self.progress(), self.step, average or 0.0)
+                display.update(clock.progress, clock.step, 0.0 if math.isnan(average) else average)
             except KeyboardInterrupt:
                 self.save()
                 raise
         self.log.close()
 
     def turn(self, display: Display) -> float:
-        """One step and what is due around it; returns the loss. Raises Fault."""
-        start = time.monotonic()
-        finished = self.progress() >= self.config.ntf_alone
-        validate = self.kept is None if finished else self.progress() - self.validated > 0.1
+        """Take one step, do what is due around it, and return the loss. Raises Fault."""
+        start, clock, record = time.monotonic(), self.clock, self.record
+        finished = clock.progress >= self.recipe.field_until
+        validate = record.chosen is None if finished else clock.progress - record.validated > 0.1
         if validate:
-            self.validated = self.progress()
+            record.validated = clock.progress
             display.validated(self.validate())
             if finished:
                 display.say(self.choose())
-        value = self.advance()
-        self.step += 1
-        if self.step % 20 == 0:
+        value = self.recipe.advance()
+        clock.step += 1
+        if clock.step % 20 == 0:
             self.log_scalars()
-            self.log.look(self.step, self.last, self.picture)
-        self.spent += time.monotonic() - start
-        if self.minutes < math.inf:
-            self.spent = parallel.agreed(self.spent)
-        if validate and self.minutes < math.inf:
-            self.validated = self.progress()  # however long it took, the next one is a tenth of the run away
-        if self.step % KEEP == 0 or self.progress() >= 1 or self.due():
+            self.log.show(clock.step, self.last, self.picture)
+        clock.spent += time.monotonic() - start
+        if clock.timed:
+            clock.spent = parallel.agreed(clock.spent)
+            if validate:
+                record.validated = clock.progress  # the next validation is a tenth of the run later than its end
+        if clock.step % KEEP == 0 or clock.progress >= 1 or self.due():
             self.keep()
         return value
 
     def due(self) -> bool:
-        """Whether it is time for a checkpoint. Processes whose clocks differ copy their states at the same steps."""
+        """Return True if it is time for a checkpoint. Processes whose clocks differ copy states at the same steps."""
         age = time.monotonic() - self.saved
-        return age >= (INTERVAL if self.step % KEEP == 0 else LATEST if parallel.count() == 1 else math.inf)
+        if self.clock.step % KEEP == 0:
+            return age >= INTERVAL
+        return age >= LATEST and parallel.count() == 1
 
     def log_scalars(self) -> None:
-        values = {f"loss/{k}": float(v.detach()) for k, v in self.terms.items()}
-        values |= {f"learning rate/{k}": o.param_groups[0]["lr"] for k, o in self.optimizers.items()}
-        self.log.scalars(self.step, values, *self.trained)
+        """Write losses and learning rates to TensorBoard."""
+        learner = self.learner
+        values = {f"loss/{k}": float(v.detach()) for k, v in learner.terms.items()}
+        values |= {f"learning rate/{k}": float(o.param_groups[0]["lr"]) for k, o in learner.optimizers.items()}
+        self.log.scalars(self.clock.step, values, learner.rays, learner.samples)
 
-    def validate(self) -> dict:
-        """PSNR of some validation views with the current occupancy. Remembers the field if it is the best yet."""
-        pool, start = self.photographs["val"], time.monotonic()
+    # --- validation -----------------------------------------------------------------------------------------------
+
+    @property
+    def view(self) -> FieldView:
+        """The field as learned so far, ready to be rendered."""
+        recipe = self.recipe
+        return FieldView(recipe.networks, recipe.occupied(), recipe.config.step, recipe.light)
+
+    def validate(self) -> Validation:
+        """Measure the PSNR of some validation views, and remember the field if it is the best so far."""
+        pool, start, record = self.data.photographs["val"], time.monotonic(), self.record
         views = min(4, pool.views)
-        scores = scoring.score(self.nets, self.occupied(), pool, self.config.step, self.light, VALIDATED, views, 1)
-        exact = scores["srgb"]
+        self.last = scoring.score(self.view, pool, VALIDATED, views, 1).srgb
         self.speed = min(VALIDATED, views * pool.height * pool.width) / max(time.monotonic() - start, 1e-6)
-        entry = {"step": self.step, "psnr": round(exact, 4)}
-        self.history.append(entry)
+        entry: Validation = {"step": self.clock.step, "psnr": round(self.last, 4)}
+        record.history.append(entry)
         self.log.validated(entry, self.picture)
-        if self.best is None or exact > self.best["psnr"]:
-            self.best = {"psnr": exact, "entry": entry} | self.snapshot()
-        self.last = exact
+        if record.best is None or self.last > record.best["psnr"]:
+            record.best = {"psnr": self.last, "entry": entry, "snapshot": self.recipe.snapshot()}
         return entry
 
     def picture(self) -> torch.Tensor:
-        """A held-back photograph, the field's and its normals, side by side (h, w, 3), sRGB, small."""
-        pool = self.photographs["val"]
-        pixels, *shape = pool.frame(0, max(1, round(max(pool.height, pool.width) / 256)))
-        seen = pool[pixels]
-        color, _, normal, _ = scoring.render_all(self.nets, seen, self.occupied(), self.config.step,
-                                                  device.generator(2), self.light)
-        parts = scoring.srgb(seen.target[:, :3]), scoring.srgb(color), (normal + 1) / 2
-        return torch.cat([p.view(*shape, 3) for p in parts], 1).clamp(0, 1)
+        """Return a small picture (h, w, 3), sRGB: a held-out photograph, the field's, and its normals."""
+        pool = self.data.photographs["val"]
+        pixels, rows, columns = pool.frame(0, max(1, round(max(pool.height, pool.width) / 256)))
+        rays = pool[pixels]
+        rendered = self.view.render(rays, device.generator(2))
+        parts = scoring.srgb(rays.target[:, :3]), scoring.srgb(rendered.color), (rendered.normal + 1) / 2
+        return torch.cat([p.view(rows, columns, 3) for p in parts], 1).clamp(0, 1)
 
     def choose(self) -> str:
-        """The field is finished: go back to the best one in validation if that is not the last; says what was done."""
-        self.kept = self.history[-1]
-        best, self.best = self.best, None
+        """Finish the field, which is that of the best validation if the last one is worse; return a message."""
+        record, step = self.record, self.clock.step
+        best, record.best = record.best, None
+        record.chosen = record.history[-1]
         if best is None or best["psnr"] - self.last <= BETTER:
-            return f"step {self.step}: the field is finished"
-        kept = self.kept = best["entry"]
-        self.adopt(best)
-        return (f"step {self.step}: the field is finished; the one of step {kept['step']} is kept, since it is "
+            return f"step {step}: the field is finished"
+        record.chosen = best["entry"]
+        self.recipe.adopt(best["snapshot"])
+        return (f"step {step}: the field is finished; the one of step {record.chosen['step']} is kept, since it is "
                 f"better by {best['psnr'] - self.last:.2f} dB in validation")
 
     # --- state ----------------------------------------------------------------------------------------------------
 
+    def state(self) -> State:
+        """Return a copy of all that decides the next step: a run that restores it is the same run."""
+        return copy.deepcopy({
+            "step": self.clock.step, "spent": self.clock.spent, "record": vars(self.record), "notes": self.notes.texts,
+            "random": self.generator.get_state(), "learner": self.learner.state(), "recipe": self.recipe.state(),
+            "parameters": {k: v.detach() for k, v in self.recipe.parameters().items()}})
+
+    def restore(self, state: State) -> None:
+        """Restore a :meth:`state`."""
+        state = copy.deepcopy(state)
+        copy_into(self.recipe.parameters(), state["parameters"])
+        self.recipe.restore(state["recipe"])
+        self.learner.restore(state["learner"])
+        self.clock.step, self.clock.spent = state["step"], state["spent"]
+        self.record, self.notes.texts = Record(**state["record"]), state["notes"]
+        self.generator.set_state(state["random"].cpu())
+
     def keep(self) -> None:
-        """Copy the state, to go back to. Raises Fault where a parameter is not finite."""
-        for name, value in self.parameters().items():
+        """Copy the state as one to go back to. Raises Fault if a parameter is not finite."""
+        for name, value in self.recipe.parameters().items():
             if not bool(value.isfinite().all()):
-                raise Fault(f"{name} is not finite at step {self.step}")
+                raise Fault(f"{name} is not finite at step {self.clock.step}")
         self.good = self.state()
 
     def roll_back(self, fault: Fault) -> str:
-        """Go back to the last good state with half the learning rates; says so. The generator goes on, so that the same
-        batch does not come again. Raises MiNtfError when there were too many faults."""
-        entry = {"step": self.step, "reason": str(fault)}
-        faults, spent, rate, random = [*self.faults, entry], self.spent, self.rate / 2, self.generator.get_state()
+        """Go back to the last good state with half the learning rates and return a message.
+
+        Random numbers go on, so that the same batch does not come again. Raises MiNtfError after too many faults.
+        """
+        entry: FaultEntry = {"step": self.clock.step, "reason": str(fault)}
+        faults, spent, factor = [*self.record.faults, entry], self.clock.spent, self.learner.factor / 2
+        random = self.generator.get_state()
         if len(faults) > FAULTS:
             if parallel.first():
                 checkpoint.delete(self.checkpoint)
@@ -240,68 +359,64 @@ class _Loop(Recipe):
                              f"time: {fault}; nothing was written to {self.out}. Try another --seed; if it persists, "
                              "check the light intensities")
         self.restore(self.good)
-        self.faults, self.spent, self.rate = faults, spent, rate
+        self.record.faults, self.clock.spent, self.learner.factor = faults, spent, factor
         self.generator.set_state(random)
         self.keep()
-        return f"{fault}: back to step {self.step}, learning rates × {rate:g}"
+        return f"{fault}: back to step {self.clock.step}, learning rates × {factor:g}"
 
     # --- files ----------------------------------------------------------------------------------------------------
 
     def save(self) -> None:
-        """Write the checkpoint: the last good state."""
+        """Write the last good state as a checkpoint."""
         if parallel.first():
             checkpoint.write(self.checkpoint, self.identity, self.good)
 
     def resume(self) -> None:
-        """Take up a checkpoint if there is one."""
-        state, reading = checkpoint.read(self.checkpoint, self.identity), self.spent
+        """Continue a checkpoint if there is one. Raises MiNtfError if it belongs to another run."""
+        state, reading = checkpoint.read(self.checkpoint, self.identity), self.clock.spent
         if state is not None:
             self.restore(state)
-            self.spent += reading
-        if parallel.agreed(self.step) != self.step:
-            raise MiNtfError(f"{self.checkpoint} is at step {self.step} for this process and at another for the first; "
+            self.clock.spent += reading
+        step = self.clock.step
+        if parallel.agreed(step) != step:
+            raise MiNtfError(f"{self.checkpoint} is at step {step} for this process and at another for the first; "
                              "put it where all processes see it, or delete it")
 
-    def affordable(self) -> float:
-        """Pixels of a split that there is time to look at, of both splits twice each."""
-        return math.inf if self.minutes == math.inf else max(SCORED, self.speed * 60 * self.minutes * SCORING / 10)
-
-    def finish(self) -> dict:
+    def finish(self) -> Report:
         """Write the field, read it back, measure it, and store the report in its header."""
-        tensors = networks.to_tensors(self.nets)
-        report = {k: v for k, v in self.identity.items() if k not in ("config", "field", "data", "estimate")}
-        if self.given is not None:
-            report["field"] = self.given
-        report["bounces"] = self.bounced is not None
-        report |= {"steps_done": self.step, "seconds": round(self.spent, 1), "history": self.history,
-                   "kept": self.kept, "faults": self.faults}
-        header = Header(self.config.architecture, self.similarity, report)
+        data, recipe, record = self.data, self.recipe, self.record
+        architecture, tensors = recipe.config.architecture, networks.to_tensors(recipe.networks)
+        report: Report = dict(self.settings)
+        if self.finished is not None:
+            report["field"] = self.finished.header.provenance
+        report |= {"bounces": recipe.light.bounced is not None, "steps_done": self.clock.step,
+                   "seconds": round(self.clock.spent, 1), "history": record.history, "kept": record.chosen,
+                   "faults": record.faults}
+        header = Header(architecture, data.similarity, report)
         field_file.save(self.out, header, tensors)
-        stored = networks.from_tensors(self.config.architecture, field_file.load(self.out)[1])
-        occupancy = scoring.occupied(stored)
+        stored = networks.from_tensors(architecture, field_file.load(self.out)[1])
+        field = FieldView(stored, scoring.occupied(stored), recipe.config.step, recipe.light)
+        # There is time to look at this many pixels of a split, of both splits twice each.
+        most = max(SCORED, self.speed * 60 * self.clock.minutes * SCORING_TIME / 10) if self.clock.timed else math.inf
         with Display(parallel.first(), "score") as display:
             for i, name in enumerate(("val", "test")):
-                scores = scoring.score(stored, occupancy, self.photographs[name], self.config.step, self.light,
-                                        self.affordable(), tell=lambda done, i=i: display.update((i + done) / 2))
-                scores.pop("each")
-                report[name] = {k: round(v, 3 if k != "alpha_rmse" else 5) for k, v in scores.items()}
-        report["transmittance"] = held_out.score(stored, occupancy, self.photographs["val"])
-        agreement = photographs(self, stored, occupancy, report, self.affordable())
-        field_file.save(self.out, Header(self.config.architecture, self.similarity, report), tensors)
-        publish(self, stored, occupancy, agreement, report, self.trace, self.out)
+                def tell(done: float, splits: int = i) -> None:
+                    display.update((splits + done) / 2)
+
+                report[name] = scoring.score(field, data.photographs[name], most, tell=tell).rounded()
+        report["transmittance"] = held_out.score(stored, field.occupancy, data.photographs["val"])
+        gains = None if recipe.gains is None else recipe.gains.all().detach()
+        agreement = judge(field, data, gains, self.notes, report, most)
+        field_file.save(self.out, header, tensors)
+        publish(field, data, gains, agreement, report, record.trace, self.out)
         checkpoint.delete(self.checkpoint)
         return report
 
 
-class _Run(_Loop, Fast):
-    """A run of the project's own recipe."""
-
-
-class _HierarchicalRun(_Loop, Hierarchical):
-    """A run of the paper's recipe."""
-
-
 def _threads() -> int:
-    """Idle cores, 1 or 2. Two threads that wait for each other on a busy machine are five times slower than one; runs
-    given in steps take one always, so that their sums have one order."""
+    """Return the number of idle cores, 1 or 2.
+
+    Two threads that wait for each other on a busy machine are far slower than one. Runs given in steps use one thread
+    always, so that their sums have one order.
+    """
     return 2 if (os.cpu_count() or 1) - os.getloadavg()[0] > 1.5 else 1

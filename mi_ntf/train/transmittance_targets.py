@@ -1,4 +1,4 @@
-"""Marched transmittance, without gradients: what the transmittance network learns from, and on which rays."""
+"""Marched transmittance, without gradients, from which the transmittance network learns, and rays to march."""
 
 import torch
 import torch.nn.functional as F
@@ -6,33 +6,37 @@ import torch.nn.functional as F
 from ..core import spheres
 from ..core.architecture import LOG_FLOOR, MAX_LOG_DENSITY
 from . import ops
-from .networks import Networks
+from .networks import Networks, in_parts
 from .normal_targets import fetch
 from .occupancy import Occupancy
 from .rays import sphere_span
 
 CUT = 0.1
-"""The renderer treats σ below this as empty."""
+"""Density σ below which the renderer treats space as empty."""
 STEP = 1 / 128
-"""Of :func:`walk`."""
+"""Step of :func:`walk`, in radii of the unit sphere."""
 BLOCK = 16
-"""Its steps between two looks at which rays have ended."""
+"""Steps of :func:`walk` after which finished rays are dropped."""
 SCALE = 2
-"""Voxels per cell of the occupancy grid, along an edge: 192³ in all, 288³ for photographs of 512². The renderer has
-384³."""
+"""Voxels per cell of the occupancy grid, along an edge."""
 
 
 class TransmittanceTargets:
-    """`log_sigma` (1, 1, k, k, k), ln σ on [−1, 1]³ as [z, y, x], baked as the renderer does, and `reach`, the radius
-    of the ball around the origin that holds all matter; both from :meth:`update`."""
+    """Density on a grid, baked as the renderer does it; filled by :meth:`update`."""
+
+    def __init__(self) -> None:
+        self.log_sigma = torch.zeros(0)
+        """ln σ (1, 1, k, k, k) on [−1, 1]³ as [z, y, x]; empty before an update."""
+        self.reach = 1.0  # Radius of the ball around the origin that holds all matter
 
     @property
     def known(self) -> bool:
-        return hasattr(self, "log_sigma")
+        """True once the grid is filled."""
+        return self.log_sigma.numel() > 0
 
     @torch.no_grad()
     def update(self, networks: Networks, occupancy: Occupancy) -> None:
-        """Evaluate the density at the voxels of the cells that the occupancy grid calls full."""
+        """Evaluate the density at the voxels of the cells that the occupancy grid marks as full."""
         n = occupancy.cells
         full = (occupancy.sigma >= 0).view(n, n, n).permute(2, 1, 0)
         for axis in range(3):
@@ -40,12 +44,12 @@ class TransmittanceTargets:
         k = n * SCALE
         index = full.reshape(-1).nonzero()[:, 0]
         x = (torch.stack([index % k, index // k % k, index // (k * k)], 1) + 0.5) * (2 / k) - 1
-        value = torch.cat([networks.log_density(p) for p in x.split(65536)])
+        value = in_parts(networks.log_density, x)
         grid = torch.full((k**3,), LOG_FLOOR)
         grid[index] = value.clamp(LOG_FLOOR, MAX_LOG_DENSITY)
         grid = grid.view(1, 1, k, k, k)
         highest = grid.max()
-        for axis in range(2, 5):  # as the renderer's voxels: right on average where they are interpolated
+        for axis in range(2, 5):  # like the renderer's voxels, which are right on average after interpolation
             ends = grid.narrow(axis, 0, 1), grid.narrow(axis, k - 1, 1)
             wide = torch.cat([ends[0], grid, ends[1]], axis)
             grid = (14 * grid - wide.narrow(axis, 0, k) - wide.narrow(axis, 2, k)) / 12
@@ -55,9 +59,10 @@ class TransmittanceTargets:
 
     @torch.no_grad()
     def march(self, m: torch.Tensor, d: torch.Tensor, h: torch.Tensor, steps: int) -> torch.Tensor:
-        """Optical depth (n, steps + 1) from equidistant points of the chords, −h … h, to their light-side ends +h.
+        """Return optical depths (n, steps + 1) from equidistant points of chords, −h … h, to their light-side ends.
 
-        One density, trilinear in ln σ, in the middle of each step.
+        `m`, `d` (n, 3) are midpoints and directions, `h` (n,) half chords. One density, trilinear in ln σ, is taken in
+        the middle of each step.
         """
         width = 2 * h / steps
         t = (torch.arange(steps) + 0.5) * width[:, None] - h[:, None]
@@ -69,15 +74,15 @@ class TransmittanceTargets:
 
 
 def uniform_directions(n: int, generator: torch.Generator) -> torch.Tensor:
-    """`n` unit vectors (n, 3), uniform on the sphere."""
+    """Return `n` unit vectors (n, 3), uniform on the sphere."""
     return F.normalize(torch.randn(n, 3, generator=generator), dim=1)
 
 
-def random_chords(n: int, reach: float, generator: torch.Generator):
-    """Chords of two uniform points on the sphere (method.md, section 5) that meet the ball of radius `reach`.
+def random_chords(n: int, reach: float, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return a point and the direction, (n, 3) each, of random chords that meet the ball of radius `reach`.
 
-    Returns a point and the direction of each, (n, 3). Such a line has a uniform direction, and the square of its
-    distance from the centre is uniform too: so no chord has to be drawn in vain.
+    They are distributed as chords of two uniform points on the sphere (method.md, section 5): directions are uniform,
+    and so is the square of the distance from the centre. So no sample has to be rejected.
     """
     d = uniform_directions(n, generator)
     across = F.normalize(torch.linalg.cross(d, uniform_directions(n, generator)), dim=1)
@@ -85,17 +90,31 @@ def random_chords(n: int, reach: float, generator: torch.Generator):
     return across * radius[:, None], d
 
 
-def chords(o: torch.Tensor, d: torch.Tensor):
-    """``(m, h)``, midpoints (n, 3) and half chords (n,) of lines that meet the sphere."""
+def chords(o: torch.Tensor, d: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return midpoints (n, 3) and half chords (n,) of the lines through `o` along `d` (n, 3), which meet the sphere."""
     _, m, h = spheres.chord(ops, o.unbind(1), d.unbind(1))
     return torch.stack(m, 1), h
 
 
 def walk(marched: TransmittanceTargets, o: torch.Tensor, d: torch.Tensor, until: float,
-         reach: torch.Tensor | float = torch.inf):
-    """``(t, depth)`` of rays from `o` (n, 3) along `d`, which end at the distance `reach`: where they pass the optical
-    depth `until` (infinity: nowhere within the unit sphere), and the depth at their ends, that of a ray which passes
-    `until` within the next BLOCK steps."""
+         reach: torch.Tensor | float = torch.inf) -> tuple[torch.Tensor, torch.Tensor]:
+    """March rays to a given optical depth.
+
+    Parameters
+    ----------
+    o, d
+        Origins and unit directions (n, 3).
+    until
+        Optical depth at which a ray ends.
+    reach
+        Distance at which a ray ends, (n,) or one number.
+
+    Returns
+    -------
+    t, depth
+        The distance (n,) at which the ray passes `until`; infinity if it does not within the unit sphere. The optical
+        depth (n,) at the end of the ray, up to BLOCK steps behind the place where it passes `until`.
+    """
     t, depth = torch.full((len(o),), torch.inf), torch.zeros(len(o))
     start, end = sphere_span(o, d)
     start = torch.where((o * o).sum(1) < 1, 0.0, start)
@@ -109,12 +128,12 @@ def walk(marched: TransmittanceTargets, o: torch.Tensor, d: torch.Tensor, until:
         sigma = torch.where((sigma > CUT) & (along < end[active, None]), sigma, 0.0)
         total = depth[active, None] + (sigma * STEP).cumsum(1)
         passed = total >= until
-        some = passed.any(1)
+        stopped = passed.any(1)
         place = passed.to(torch.uint8).argmax(1, keepdim=True)
         over = (total.gather(1, place) - until) / (sigma.gather(1, place) * STEP).clamp(min=1e-9)
         at = along.gather(1, place) + (0.5 - over.clamp(0, 1)) * STEP
-        t[active] = torch.where(some, at[:, 0], t[active])
+        t[active] = torch.where(stopped, at[:, 0], t[active])
         depth[active] = total[:, -1]
         first += BLOCK
-        active = active[~some & (start[active] + first * STEP < end[active])]
+        active = active[~stopped & (start[active] + first * STEP < end[active])]
     return t, depth

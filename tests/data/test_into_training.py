@@ -11,7 +11,7 @@ from mi_ntf.data import images  # noqa: E402
 from mi_ntf.data.readers import load_dataset  # noqa: E402
 from mi_ntf.data.schema import Split  # noqa: E402
 from mi_ntf.train import rays  # noqa: E402
-from mi_ntf.train.config import TrainConfig  # noqa: E402
+from mi_ntf.train.config import FastConfig  # noqa: E402
 
 
 def test_rays_of_all_forms_are_the_same_lines(tmp_path):
@@ -66,7 +66,7 @@ def test_finer_photographs_are_learned_on_finer_grids():
     split.c2w[:, :3, 3] = [0.5, 0, 8]
     pixel = rays.pixel_width(split)
     assert pixel == pytest.approx(1 / 128)
-    recipe = TrainConfig(step=0.01, cells=96, bake=128)
+    recipe = FastConfig(step=0.01, cells=96, bake=128)
     found = [(c.step, c.cells, c.bake) for c in (recipe.sharpened(pixel * s) for s in (4, 2, 1, 0.5, 0.1))]
     finest = (0.01 / 1.5, 144, 192)
     for (step, *cells), wanted in zip(found, [(0.01, 96, 128)] * 2 + [(0.00707, 136, 181)] + [finest] * 2, strict=True):

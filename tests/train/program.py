@@ -19,23 +19,24 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from train import two_spheres
 
-from mi_ntf.train import networks, parallel, train, trainer
+from mi_ntf.train import fast, networks, parallel, train, trainer
 
 trainer.KEEP, trainer.INTERVAL = 4, 0.0
 
 
 def main(dataset: str, out: str, steps: str, death: str = "") -> None:
     losses, writes = {}, []
-    advance, finish, replace = trainer._Run.advance, trainer._Run.finish, os.replace
+    advance, finish, replace = fast.Fast.advance, trainer.Trainer.finish, os.replace
 
     def die_if(event: str) -> None:
         if event == death:
             os.kill(os.getpid(), signal.SIGKILL)
 
-    def recorded(run):
-        die_if(f"step {run.step}")
-        losses[run.step] = advance(run)
-        return losses[run.step]
+    def recorded(recipe):
+        step = recipe.clock.step
+        die_if(f"step {step}")
+        losses[step] = advance(recipe)
+        return losses[step]
 
     def replaced(source, target):
         writes.append(target)
@@ -43,12 +44,12 @@ def main(dataset: str, out: str, steps: str, death: str = "") -> None:
         replace(source, target)
 
     def finished(run):
-        np.savez(f"{out}.npz", **networks.to_tensors(run.nets))
-        Path(f"{out}.json").write_text(json.dumps({"losses": losses, "history": run.history}))
+        np.savez(f"{out}.npz", **networks.to_tensors(run.recipe.networks))
+        Path(f"{out}.json").write_text(json.dumps({"losses": losses, "history": run.record.history}))
         return finish(run)
 
-    trainer._Run.advance, trainer._Run.finish, os.replace = recorded, finished, replaced
-    trainer._Run.carve = functools.partialmethod(trainer._Run.carve, steps=20)
+    fast.Fast.advance, trainer.Trainer.finish, os.replace = recorded, finished, replaced
+    fast.Fast.carve = functools.partialmethod(fast.Fast.carve, steps=20)
     two_spheres.coarsen(pytest.MonkeyPatch())
     two_spheres.glance(pytest.MonkeyPatch())
     report = train(Path(dataset), Path(out), steps=int(steps))

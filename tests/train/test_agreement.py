@@ -37,21 +37,21 @@ def pictures(moved: np.ndarray, factor: int = 4) -> np.ndarray:
 @pytest.fixture(autouse=True)
 def field(monkeypatch):
     """The field is that world, seen through pixels as wide as the photographs'."""
-    def render_all(networks, rays, *_):
+    def render(view, rays, *_):
         o, d = rays.o.double().numpy(), rays.d.double().numpy()
         right = np.cross(d, (0.31, 0.5, 0.81))
         right /= np.linalg.norm(right, axis=1, keepdims=True)
         place = (np.arange(4) - 1.5) / 4 / FOCAL
         seen = [world(o, d + a * right + b * np.cross(right, d)) for a in place for b in place]
-        return torch.as_tensor(np.mean(seen, 0)[:, :3], dtype=torch.float32), None, None, None
+        return scoring.Pixels(torch.as_tensor(np.mean(seen, 0)[:, :3], dtype=torch.float32), None, None, None)
 
-    monkeypatch.setattr(agreement, "render_all", render_all)
+    monkeypatch.setattr(scoring.FieldView, "render", render)
 
 
 def survey(images: np.ndarray, gains: torch.Tensor | None = None) -> tuple[agreement.Agreement, list[str]]:
     """What is found, and what is said of it."""
     split = shots.split(images, FOCAL, C2W, names=NAMES)
-    found = agreement.survey(None, None, shots.Photographs(split), gains, 0.01, scoring.Light())
+    found = agreement.survey(scoring.FieldView(None, None, 0.01), shots.Photographs(split), gains)
     assert found.psnr.shape == (VIEWS,) and found.shift.shape == (VIEWS, 2)
     return found, report.complaints(found, {"train": split})
 

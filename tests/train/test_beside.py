@@ -13,7 +13,7 @@ torch = pytest.importorskip("torch", reason="training needs PyTorch: pip install
 from train import two_spheres  # noqa: E402
 
 from mi_ntf.core import field_file  # noqa: E402
-from mi_ntf.train import config, train, trainer  # noqa: E402
+from mi_ntf.train import config, fast, train, trainer  # noqa: E402
 
 OFFSET = (1.0, 1.4, 0.0)
 """Right and up of lenses that are some 3 from the middle of the spheres: 30° off."""
@@ -24,7 +24,7 @@ def learn(folder, name: str, left_out: tuple[str, ...], steps: int) -> dict:
     with pytest.MonkeyPatch.context() as patch:
         two_spheres.coarsen(patch)
         patch.setitem(config.PRESETS, "fast", dataclasses.replace(config.PRESETS["fast"], samples=8000))
-        patch.setattr(trainer._Run, "carve", functools.partialmethod(trainer._Run.carve, steps=100))
+        patch.setattr(fast.Fast, "carve", functools.partialmethod(fast.Fast.carve, steps=100))
         views = {"train": 24, "val": 2, "test": 4}
         photographs = two_spheres.write(folder / f"{name}-set", views, 32, OFFSET, left_out)
         return train(photographs, folder / name, steps=steps, bounces=False)
@@ -73,12 +73,12 @@ def test_a_checkpoint_beside_the_lens_continues_bit_for_bit(tmp_path, monkeypatc
     torch.set_num_threads(1)
 
     def run():
-        return trainer._Run(photographs, tmp_path / "f", config.PRESETS["fast"], "fast", minutes=None, steps=40, seed=3,
-                            estimate=True)
+        return trainer.Trainer(photographs, tmp_path / "f", config.PRESETS["fast"], "fast", steps=40, seed=3,
+                               estimate=True)
 
-    def step(state):
-        value = state.advance()
-        state.step += 1
+    def step(run):
+        value = run.recipe.advance()
+        run.clock.step += 1
         return value
 
     first = run()
@@ -89,8 +89,8 @@ def test_a_checkpoint_beside_the_lens_continues_bit_for_bit(tmp_path, monkeypatc
     second.save()
     third = run()
     third.resume()
-    assert third.step == 13 and torch.equal(third.flash.place, second.flash.place)
-    assert third.notes == second.notes
+    assert third.clock.step == 13 and torch.equal(third.recipe.flash.place, second.recipe.flash.place)
+    assert third.notes.texts == second.notes.texts
     assert [step(third) for _ in range(5)] == expected[13:]
 
 

@@ -66,7 +66,7 @@ class Outward:
     def reflectance(self, x):
         centre = torch.where(x[:, :1] < 0, PLACES[0], PLACES[1]) * torch.tensor([1.0, 0, 0])
         n = x - centre
-        return n / n.norm(dim=1, keepdim=True), *self._nets.reflectance(x)[1:]
+        return networks.Reflectance(n / n.norm(dim=1, keepdim=True), *self._nets.reflectance(x)[1:])
 
 
 @pytest.fixture(scope="module")
@@ -159,7 +159,7 @@ def test_albedo_learns_of_the_bounced_light(spheres, light):
     assert float(whole.bounced.max()) > 0.01 and without.bounced == 0.0
     albedo = torch.tensor([[0.5, 0.5, 0.5]], requires_grad=True)
     one = torch.ones(1)
-    sent = volume.diffuse_albedo((None, albedo, 0.9 * one, 0.0 * one), False)
+    sent = networks.Reflectance(None, albedo, 0.9 * one, 0.0 * one).diffuse_albedo(False)
     sent.sum().backward()
     assert sent.tolist()[0] == pytest.approx([0.5] * 3) and albedo.grad.tolist()[0] == pytest.approx([1] * 3)
 

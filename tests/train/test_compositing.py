@@ -17,7 +17,7 @@ from mi_ntf.core.architecture import Encoding, Network  # noqa: E402
 from mi_ntf.train import held_out, losses, networks, scoring, volume  # noqa: E402
 from mi_ntf.train.config import PRESETS  # noqa: E402
 from mi_ntf.train.normal_targets import NormalTargets  # noqa: E402
-from mi_ntf.train.occupancy import Occupancy, widest  # noqa: E402
+from mi_ntf.train.occupancy import Occupancy, neighbour_maximum  # noqa: E402
 from mi_ntf.train.optical import Optical  # noqa: E402
 from mi_ntf.train.rays import Rays, sphere_span  # noqa: E402
 from mi_ntf.train.transmittance_targets import TransmittanceTargets, chords, uniform_directions  # noqa: E402
@@ -50,7 +50,8 @@ class Slab:
 
     def reflectance(self, x):
         one = torch.ones(len(x))
-        return torch.tensor([0.0, 0.0, -1.0]).expand(len(x), 3), ALBEDO * torch.ones(len(x), 3), one, 0 * one
+        normal = torch.tensor([0.0, 0.0, -1.0]).expand(len(x), 3)
+        return networks.Reflectance(normal, ALBEDO * torch.ones(len(x), 3), one, 0 * one)
 
 
 def test_packed_weights_equal_a_double_loop():
@@ -119,7 +120,7 @@ def test_rays_end_where_they_are_spent_and_steep_cells_are_split():
 @pytest.mark.parametrize("shape", [(5, 5, 5), (1, 1, 1)])
 def test_the_most_of_the_neighbours(shape):
     grid = torch.rand(shape, generator=torch.Generator().manual_seed(0))
-    assert (widest(grid) == F.max_pool3d(grid[None, None], 3, 1, 1)[0, 0]).all()
+    assert (neighbour_maximum(grid) == F.max_pool3d(grid[None, None], 3, 1, 1)[0, 0]).all()
 
 
 def test_an_opaque_plane_looks_like_its_surface():
@@ -146,7 +147,7 @@ def test_a_field_without_matter_is_black():
     grid = Occupancy(torch.zeros((32,) * 3, dtype=torch.bool))
     index, kept = grid.tighten(rays(5))
     assert len(index) == len(kept) == 0
-    found = scoring.render_all(Slab(), rays(5), grid, 0.01, torch.Generator().manual_seed(0))
+    found = scoring.FieldView(Slab(), grid, 0.01).render(rays(5), torch.Generator().manual_seed(0))
     assert [v.shape for v in found] == [(5, 3), (5,), (5, 3), (5, 3)] and not any(v.any() for v in found)
 
 
@@ -257,9 +258,9 @@ def test_evenness_sees_slopes_along_the_surface_alone():
 
     def image(normal):
         n = 500
+        surface = networks.Reflectance(torch.tensor(normal).expand(n, 3), None, None, None)
         return volume.Image(color=None, alpha=None, x=torch.zeros(n, 3), shaded=None, index=None, weight=torch.ones(n),
-                            gloss=None, normal=torch.tensor(normal).expand(n, 3), albedo=None, radiance=None, raw=None,
-                            bounced=0.0)
+                            reflectance=surface, radiance=None, raw=None, bounced=0.0)
 
     generator = torch.Generator().manual_seed(0)
     # float32 rounding of offsets of 0.02
@@ -277,25 +278,26 @@ def test_psnr_of_a_known_error(monkeypatch):
     pictures[1, 0, 0, :3] = 0.5
     pool = shots.photographs(pictures)
 
-    def constant(networks, rays, *_):
-        return torch.full((len(rays), 3), 0.5), torch.full((len(rays),), 0.75), None, None
+    def constant(view, rays, *_):
+        return scoring.Pixels(torch.full((len(rays), 3), 0.5), torch.full((len(rays),), 0.75), None, None)
 
-    monkeypatch.setattr(scoring, "render_all", constant)
+    monkeypatch.setattr(scoring.FieldView, "render", constant)
+    field = scoring.FieldView(None, None, 0.01)
     told = []
-    found = scoring.score(None, None, pool, 0.01, views=1, tell=told.append)
-    assert found["linear"] == pytest.approx(20.0, abs=1e-3)
+    found = scoring.score(field, pool, views=1, tell=told.append)
+    assert found.linear == pytest.approx(20.0, abs=1e-3)
     # sRGB of 0.5 and 0.6: 0.73536 and 0.79774 → −20 lg 0.06238
-    assert found["srgb"] == found["object"] == found["each"][0] == pytest.approx(24.10, abs=0.01)
-    assert found["alpha_rmse"] == pytest.approx(0.25) and told == [1.0]
-    found = scoring.score(None, None, pool, 0.01)
-    assert found["each"] == pytest.approx([24.10, 24.10 + 10 * math.log10(4 / 3)], abs=0.01)
-    assert found["srgb"] == pytest.approx(np.mean(found["each"])) and found["linear"] == pytest.approx(20.625, abs=1e-3)
-    assert found["object"] == pytest.approx((24.10 + 120) / 2, abs=0.01)  # no error counts as 1e-12
-    assert found["alpha_rmse"] == pytest.approx(math.sqrt((0.25**2 + (0.25**2 + 3 * 0.75**2) / 4) / 2))
+    assert found.srgb == found.object == found.each[0] == pytest.approx(24.10, abs=0.01)
+    assert found.alpha_rmse == pytest.approx(0.25) and told == [1.0]
+    found = scoring.score(field, pool)
+    assert found.each == pytest.approx([24.10, 24.10 + 10 * math.log10(4 / 3)], abs=0.01)
+    assert found.srgb == pytest.approx(np.mean(found.each)) and found.linear == pytest.approx(20.625, abs=1e-3)
+    assert found.object == pytest.approx((24.10 + 120) / 2, abs=0.01)  # no error counts as 1e-12
+    assert found.alpha_rmse == pytest.approx(math.sqrt((0.25**2 + (0.25**2 + 3 * 0.75**2) / 4) / 2))
     # Three pixels of each at most, the same ones in every call; with gains of their own, constants are met exactly.
-    assert scoring.score(None, None, pool, 0.01, most=6) == scoring.score(None, None, pool, 0.01, most=6)
-    fit = scoring.score(None, None, pool, 0.01, scoring.Light(fit=True), views=1)
-    assert fit["srgb"] == pytest.approx(120, abs=20)  # float32
+    assert scoring.score(field, pool, most=6) == scoring.score(field, pool, most=6)
+    fit = scoring.score(dataclasses.replace(field, light=scoring.Light(fit=True)), pool, views=1)
+    assert fit.srgb == pytest.approx(120, abs=20)  # float32
 
 
 @pytest.mark.parametrize("rim", [False, True])
@@ -338,9 +340,9 @@ def test_rough_lobes_cost_more():
     """Σ w ((fading + 60 α⁴) s + (−5 − ln s)²/10) per ray, the square where s lies below e^−5; s above the least."""
     gloss = torch.tensor([1.0, 0.5, 1.0]), torch.tensor([0.2, 0.4, math.exp(-7)])
     image = volume.Image(color=None, alpha=None, x=None, shaded=None, index=None,
-                         weight=torch.tensor([0.5, 0.25, 0.25]),
-                         normal=None, albedo=None, gloss=gloss, radiance=None, raw=None, bounced=0.0)
+                         weight=torch.tensor([0.5, 0.25, 0.25]), reflectance=networks.Reflectance(None, None, *gloss),
+                         radiance=None, raw=None, bounced=0.0)
     wanted = 0.5 * 0.2 * 60.5 + 0.25 * 0.4 * (0.5 + 60 / 256) + 0.25 * (math.exp(-7) * 60.5 + 0.4)
     assert float(losses.gloss(image, 0.0, 0.5, 4)) == pytest.approx(wanted / 4)
-    above = dataclasses.replace(image, gloss=(gloss[0], 0.04 + 0.96 * gloss[1]))
+    above = dataclasses.replace(image, reflectance=networks.Reflectance(None, None, gloss[0], 0.04 + 0.96 * gloss[1]))
     assert float(losses.gloss(above, 0.04, 0.5, 4)) == pytest.approx(wanted / 4, rel=1e-5)

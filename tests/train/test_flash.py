@@ -11,6 +11,7 @@ from train import shots  # noqa: E402
 from mi_ntf.core import fresnel, microfacet  # noqa: E402
 from mi_ntf.core import ops as numpy_ops  # noqa: E402
 from mi_ntf.train import flash, rays, volume  # noqa: E402
+from mi_ntf.train.networks import Reflectance  # noqa: E402
 from mi_ntf.train.optical import Optical  # noqa: E402
 from mi_ntf.train.transmittance_targets import TransmittanceTargets, walk  # noqa: E402
 
@@ -56,8 +57,8 @@ class Skin:
 
     def reflectance(self, x):
         roughness, specular = (torch.full((len(x),), v) for v in self.gloss)
-        return (torch.tensor([0.0, 0.0, 1.0]).expand(len(x), 3), torch.tensor([0.7, 0.5, 0.2]).expand(len(x), 3),
-                roughness, specular)
+        normal, albedo = (torch.tensor(v).expand(len(x), 3) for v in ([0.0, 0.0, 1.0], [0.7, 0.5, 0.2]))
+        return Reflectance(normal, albedo, roughness, specular)
 
 
 def toward(degrees: float) -> np.ndarray:

@@ -14,6 +14,7 @@ from mi_ntf.core import field_file  # noqa: E402
 from mi_ntf.core.architecture import FAST, PAPER, VISIBILITY, Architecture, Encoding, Network  # noqa: E402
 from mi_ntf.core.errors import MiNtfError  # noqa: E402
 from mi_ntf.train import config, hierarchical, losses, scoring, train, trainer  # noqa: E402
+from mi_ntf.train.networks import Reflectance  # noqa: E402
 from mi_ntf.train.rays import Rays, sphere_span  # noqa: E402
 
 NETWORK = Network(Encoding("frequency", octaves=3), (32, 32))
@@ -28,7 +29,7 @@ def photographs(tmp_path_factory):
 
 def run(photographs, out, steps=40, settings=SMALL):
     torch.set_num_threads(1)
-    return trainer._HierarchicalRun(photographs, out, settings, "paper", minutes=None, steps=steps, seed=3)
+    return trainer.Trainer(photographs, out, settings, "paper", steps=steps, seed=3)
 
 
 def test_the_preset_is_the_papers():
@@ -46,10 +47,10 @@ def test_the_preset_is_the_papers():
 def test_draw_at_known_places():
     """Weights 0, 1, 3, 0 on quarters of [0, 1]: a quarter of the samples in the second, the rest in the third."""
     u = torch.tensor([[0.0, 0.125, 0.25, 0.625, 0.9985]])
-    found = hierarchical.draw(torch.tensor([[0.0, 1.0, 3.0, 0.0]]), u)
+    found = hierarchical.inverse_cdf(torch.tensor([[0.0, 1.0, 3.0, 0.0]]), u)
     # Every cell gets a weight of 1e-5 besides, which moves shares by as much.
     np.testing.assert_allclose(found[0, 1:], [0.375, 0.5, 0.625, 0.7495], atol=1e-4)
-    even = hierarchical.draw(torch.zeros(1, 4), u)
+    even = hierarchical.inverse_cdf(torch.zeros(1, 4), u)
     np.testing.assert_allclose(even, u, atol=1e-6)  # float32
 
 
@@ -58,7 +59,7 @@ def test_draw_follows_the_weights():
     weight = torch.tensor([0.5, 2.0, 0.1, 1.0, 4.0, 0.3, 0.02, 1.5])
     n = 20000
     u = torch.rand(1, n, generator=torch.Generator().manual_seed(0))
-    counts = torch.histc(hierarchical.draw(weight[None], u)[0], 8, 0, 1)
+    counts = torch.histc(hierarchical.inverse_cdf(weight[None], u)[0], 8, 0, 1)
     expected = n * weight / weight.sum()
     assert float(((counts - expected) ** 2 / expected).sum()) < 24.3
 
@@ -73,7 +74,8 @@ class Slab:
 
     def reflectance(self, x):
         one = torch.ones(len(x))
-        return torch.tensor([0.0, 0.0, -1.0]).expand(len(x), 3), one[:, None].expand(-1, 3) / 2, one, 0 * one
+        normal = torch.tensor([0.0, 0.0, -1.0]).expand(len(x), 3)
+        return Reflectance(normal, one[:, None].expand(-1, 3) / 2, one, 0 * one)
 
 
 def test_view_of_a_half_space():
@@ -98,14 +100,14 @@ def test_view_of_a_half_space():
 
 
 def test_gradients_of_the_transmittance_loss_stay_in_its_network(photographs, tmp_path):
-    state = run(photographs, tmp_path / "f")
-    batch = state.patches()
-    seen = hierarchical.view(state.coarse, state.nets, batch, (16, 16), state.generator)
-    terms = state.ntf_loss(seen, batch, batch.target[:, :3])
+    recipe = run(photographs, tmp_path / "f").recipe
+    batch = recipe.patches()
+    seen = hierarchical.view(recipe.coarse, recipe.networks, batch, (16, 16), recipe.generator)
+    terms = recipe.ntf_loss(seen, batch, batch.target[:, :3])
     assert set(terms) == {"transmittance", "lit colour"}
     for term in terms.values():
-        grown = torch.autograd.grad(term, list(state.parameters().values()), retain_graph=True, allow_unused=True)
-        for name, gradient in zip(state.parameters(), grown, strict=True):
+        grown = torch.autograd.grad(term, list(recipe.parameters().values()), retain_graph=True, allow_unused=True)
+        for name, gradient in zip(recipe.parameters(), grown, strict=True):
             if name.startswith("transmittance"):
                 assert gradient.abs().sum() > 0, name
             else:
@@ -114,24 +116,24 @@ def test_gradients_of_the_transmittance_loss_stay_in_its_network(photographs, tm
 
 def test_transmittance_learns_from_a_field(photographs, tmp_path):
     """One batch, again and again: the loss falls to less than half."""
-    state = run(photographs, tmp_path / "f")
-    rays = state.random_rays()
+    recipe = run(photographs, tmp_path / "f").recipe
+    rays = recipe.random_rays()
     with torch.no_grad():
-        seen = hierarchical.view(state.coarse, state.nets, rays, (16, 16), state.generator)
-    values = [state._descend("ntf", state.ntf_loss(seen, rays, seen.fine.color)["transmittance"], 1.0)
+        seen = hierarchical.view(recipe.coarse, recipe.networks, rays, (16, 16), recipe.generator)
+    values = [recipe.learner.descend("ntf", recipe.ntf_loss(seen, rays, seen.fine.color)["transmittance"], 1.0)
               for _ in range(60)]
     assert values[-1] < 0.5 * values[0]
 
 
 def test_patches_and_random_rays(photographs, tmp_path):
-    state = run(photographs, tmp_path / "f")
-    batch = state.patches()
+    recipe = run(photographs, tmp_path / "f").recipe
+    batch = recipe.patches()
     assert len(batch) == 4 * 8 * 8
     origins = batch.o.view(4, 64, 3)
     assert (origins == origins[:, :1]).all() and len(origins[:, 0].unique(dim=0)) == 4, "four photographs"
     neighbours = batch.d.view(4, 8, 8, 3)
     assert float(neighbours.diff(dim=1).norm(dim=-1).max()) < 2 * 0.62 / 16, "squares of adjacent pixels"
-    rays = state.random_rays()
+    rays = recipe.random_rays()
     assert len(rays) == 32
     for t in (rays.t0, rays.t1):
         np.testing.assert_allclose((rays.o + t[:, None] * rays.d).norm(dim=1), 1, atol=1e-5)  # float32 at distance 3
@@ -140,14 +142,14 @@ def test_patches_and_random_rays(photographs, tmp_path):
 def test_a_short_run_learns_and_is_written(photographs, tmp_path, monkeypatch):
     monkeypatch.setitem(config.PRESETS, "paper", SMALL)
     history = []
-    advance = trainer._HierarchicalRun.advance
+    advance = hierarchical.Hierarchical.advance
 
-    def recorded(state):
-        value = advance(state)
-        history.append({k: float(v.detach()) for k, v in state.terms.items()})
+    def recorded(recipe):
+        value = advance(recipe)
+        history.append({k: float(v.detach()) for k, v in recipe.learner.terms.items()})
         return value
 
-    monkeypatch.setattr(trainer._HierarchicalRun, "advance", recorded)
+    monkeypatch.setattr(hierarchical.Hierarchical, "advance", recorded)
     monkeypatch.setattr(scoring, "CELLS", 32)  # of 128³: seconds
     report = train(photographs, tmp_path / "f", preset="paper", steps=120)
     terms = ("coarse colour", "colour", "transmittance", "lit colour", "random transmittance", "random lit colour")
@@ -173,12 +175,12 @@ def test_a_checkpoint_continues_the_run(photographs, tmp_path):
     expected = [step(first) for _ in range(3)]
     second = run(photographs, tmp_path / "f", 8)
     second.resume()
-    assert second.step == 3 and [step(second) for _ in range(3)] == expected
+    assert second.clock.step == 3 and [step(second) for _ in range(3)] == expected
 
 
-def step(state):
-    value = state.advance()
-    state.step += 1
+def step(run):
+    value = run.recipe.advance()
+    run.clock.step += 1
     return value
 
 
@@ -197,23 +199,23 @@ def test_the_baselines_network_learns_beside_and_is_stored(photographs, tmp_path
     settings = config.configured(preset, visibility_mlp=True)
     if preset == "fast":
         settings = dataclasses.replace(settings, ntf_from=0.2, ntf_alone=0.5)
-    kind = {"fast": trainer._Run, "paper": trainer._HierarchicalRun}[preset]
-    state = kind(photographs, tmp_path / "f", settings, preset, minutes=None, steps=20, seed=3)
+    run = trainer.Trainer(photographs, tmp_path / "f", settings, preset, steps=20, seed=3)
+    recipe, learner = run.recipe, run.learner
     values = []
-    state.carve()
-    while state.progress() < 0.8:
-        step(state)
-        if "visibility" in state.terms:
-            values.append(float(state.terms["visibility"].detach()))
+    recipe.carve()
+    while run.clock.progress < 0.8:
+        step(run)
+        if "visibility" in learner.terms:
+            values.append(float(learner.terms["visibility"].detach()))
     if preset == "fast":  # its steps see other rays each: the same ones, then
-        o, d = losses.training_rays(state.marched, state.draw(2000, state.generator), 128, True, state.generator)
-        rays = losses.targets(state.marched, o, d, state.generator)
+        o, d = losses.training_rays(recipe.marched, recipe.sample_rays(2000, run.generator), 128, True, run.generator)
+        rays = losses.targets(recipe.marched, o, d, run.generator)
         assert values
-        values = [state._descend("ntf", losses.visibility(state.nets, rays), 1.0) for _ in range(80)]
+        values = [learner.descend("ntf", losses.visibility(recipe.networks, rays), 1.0) for _ in range(80)]
     assert values[-1] < 0.8 * values[0], values
     two_spheres.glance(monkeypatch)
-    state.finish()
+    run.finish()
     header, tensors = field_file.load(tmp_path / "f")
     assert header.architecture.visibility == VISIBILITY
     np.testing.assert_array_equal(tensors["visibility.layers.0.weight"],
-                                  state.nets.tensors["visibility.layers.0.weight"].detach().numpy())
+                                  recipe.networks.tensors["visibility.layers.0.weight"].detach().numpy())

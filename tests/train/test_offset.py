@@ -43,7 +43,7 @@ def observed(place: tuple[float, float, float], points: int = 500, outliers: flo
     value = np.where(kind < outliers / 2, value - rng.uniform(0.5, 3, value.shape), value)
     value = np.where(kind > 1 - outliers / 2, value + rng.uniform(0.3, 2, value.shape), value)
     toward = C2W[:, None, :3, 3] - x
-    seen = (toward * normal).sum(2) / np.linalg.norm(toward, axis=2) > offset.SEEN
+    seen = (toward * normal).sum(2) / np.linalg.norm(toward, axis=2) > offset.FACING
     return offset.Observed(*(torch.as_tensor(v, dtype=torch.float32) for v in (x, normal, value * seen, seen)))
 
 
@@ -124,8 +124,8 @@ def test_what_photographs_show_of_points():
         at = local[:, :2] / -local[:, 2:] * torch.tensor([1, -1]) * torch.as_tensor(focal) + size / 2
         inside = (at > 1).all(1) & (at < size - 1).all(1)
         dark = (at < 21).all(1)
-        sure[number] = (cosine > offset.SEEN + 0.2) & inside & ~dark
-        never[number] = (cosine < offset.SEEN - 0.2) | ((at < -1) | (at > size + 1)).any(1) | (at < 19).all(1)
+        sure[number] = (cosine > offset.FACING + 0.2) & inside & ~dark
+        never[number] = (cosine < offset.FACING - 0.2) | ((at < -1) | (at > size + 1)).any(1) | (at < 19).all(1)
     never &= ~sure
     assert 0.15 < float(sure.float().mean()) < float(1 - never.float().mean()) < 0.6
     assert used[sure].float().mean() > 0.99 and not used[never].any()

@@ -64,7 +64,7 @@ def test_pixels_are_decoded_as_the_readers_say(kind):
     np.testing.assert_array_equal(pool[:].target, expected)
     some = torch.tensor([300, 2, 2, len(pool) - 1])
     found = pool.pixels(some)
-    assert found.dtype == torch.float32 and pool.levels == (kind == "uint8")
+    assert found.dtype == torch.float32 and pool.quantized == (kind == "uint8")
     np.testing.assert_array_equal(found, expected[some])
 
 

@@ -59,7 +59,7 @@ def test_a_finished_field_learns_another_transmittance(photographs, tmp_path, mo
 
 
 def run(photographs, out, steps):
-    return trainer._Run(photographs, out, config.PRESETS["fast"], "fast", minutes=None, steps=steps, seed=3)
+    return trainer.Trainer(photographs, out, config.PRESETS["fast"], "fast", steps=steps, seed=3)
 
 
 def test_same_seed_gives_the_same_losses_and_a_checkpoint_continues_them(photographs, tmp_path):
@@ -73,7 +73,7 @@ def test_same_seed_gives_the_same_losses_and_a_checkpoint_continues_them(photogr
     second.save()
     third = run(photographs, tmp_path / "a", 20)
     third.resume()
-    assert third.step == 6
+    assert third.clock.step == 6
     assert [_step(third) for _ in range(6)] == expected[6:]
     with pytest.raises(MiNtfError, match=r"belongs to a run with other settings.*delete the file"):
         run(photographs, tmp_path / "a", 21).resume()
@@ -83,14 +83,14 @@ def test_a_checkpoint_is_not_taken_up_on_other_data(tmp_path):
     """By content: the same pictures in new files go on; one pixel changed does not, and is named."""
     data = two_spheres.write(tmp_path / "data", {"train": 2, "val": 1, "test": 1}, size=8)
     first = run(data, tmp_path / "f", 20)
-    first.step = 7
+    first.clock.step = 7
     first.keep()
     first.save()
     for path in data.rglob("*.exr"):
         schema.write_exr(path, schema.read_image(path))
     again = run(data, tmp_path / "f", 20)
     again.resume()
-    assert again.step == 7
+    assert again.clock.step == 7
     path = data / "train" / "0000.exr"
     schema.write_exr(path, schema.read_image(path) * np.where(np.arange(64).reshape(8, 8, 1) == 27, 0.9, 1))
     with pytest.raises(MiNtfError, match=r"f\.ckpt belongs to a run on other data: photographs or masks changed since; "
@@ -98,9 +98,9 @@ def test_a_checkpoint_is_not_taken_up_on_other_data(tmp_path):
         run(data, tmp_path / "f", 20).resume()
 
 
-def _step(state):
-    value = state.advance()
-    state.step += 1
+def _step(run):
+    value = run.recipe.advance()
+    run.clock.step += 1
     return value
 
 

@@ -12,7 +12,7 @@ from train import two_spheres  # noqa: E402
 
 from mi_ntf.core import field_file  # noqa: E402
 from mi_ntf.core.errors import MiNtfError  # noqa: E402
-from mi_ntf.train import config, fast, live, monitor, recipe, train, trainer  # noqa: E402
+from mi_ntf.train import config, fast, live, monitor, recipe, train, trainer, training_data  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -24,24 +24,28 @@ def photographs(tmp_path_factory):
 def quick(monkeypatch):
     two_spheres.coarsen(monkeypatch)
     monkeypatch.setattr(trainer, "KEEP", 4)
-    monkeypatch.setattr(trainer._Run, "carve", functools.partialmethod(trainer._Run.carve, steps=5))
+    monkeypatch.setattr(fast.Fast, "carve", functools.partialmethod(fast.Fast.carve, steps=5))
     two_spheres.glance(monkeypatch)
 
 
+def start(photographs, folder, steps=40):
+    return trainer.Trainer(photographs, folder / "f", config.PRESETS["fast"], "fast", steps=steps, seed=3)
+
+
 def tamper(monkeypatch, name, change):
-    """Have ``change(run, loss)`` replace the loss `name`, "field" or "ntf", before every descent."""
-    descend = trainer._Run._descend
+    """Replace the loss `name`, "field" or "ntf", by ``change(learner, loss)`` before every descent."""
+    descend = recipe.Learner.descend
 
-    def changed(self, which, loss, rate):
-        return descend(self, which, change(self, loss) if which == name else loss, rate)
+    def changed(learner, loss_name, loss, rate):
+        return descend(learner, loss_name, change(learner, loss) if loss_name == name else loss, rate)
 
-    monkeypatch.setattr(trainer._Run, "_descend", changed)
+    monkeypatch.setattr(recipe.Learner, "descend", changed)
 
 
 @pytest.mark.parametrize(("name", "step"), [("field", 6), ("ntf", 14)])
 def test_a_nan_is_rolled_back_and_reported(photographs, tmp_path, monkeypatch, capsys, name, step):
-    def once(run, loss):
-        return loss * float("nan") if run.step == step and not run.faults else loss
+    def once(learner, loss):
+        return loss * float("nan") if learner.clock.step == step and learner.factor == 1 else loss
 
     tamper(monkeypatch, name, once)
     out = tmp_path / "f"
@@ -56,35 +60,35 @@ def test_a_nan_is_rolled_back_and_reported(photographs, tmp_path, monkeypatch, c
 
 
 def test_rolling_back_restores_the_state_and_halves_the_rate(photographs, tmp_path):
-    run = trainer._Run(photographs, tmp_path / "f", config.PRESETS["fast"], "fast", minutes=None, steps=40, seed=3)
-    run.advance()
-    run.step = 1
+    run = start(photographs, tmp_path)
+    run.recipe.advance()
+    run.clock.step = 1
     run.keep()
     before, drawn = run.state(), torch.rand(1, generator=run.generator)
     run.generator.set_state(before["random"])
     rates = []
     for _ in range(2):
-        run.advance()
-        run.step += 1
-        rates.append(run.optimizers["field"].param_groups[0]["lr"])
+        run.recipe.advance()
+        run.clock.step += 1
+        rates.append(run.learner.optimizers["field"].param_groups[0]["lr"])
     random = run.generator.get_state()
     run.roll_back(monitor.Fault("a test"))
     after = run.state()
-    assert run.step == 1 and run.rate == 0.5
-    for name, value in before["tensors"].items():
-        assert torch.equal(value, after["tensors"][name]), name
+    assert run.clock.step == 1 and run.learner.factor == 0.5
+    for name, value in before["parameters"].items():
+        assert torch.equal(value, after["parameters"][name]), name
     for name in ("field", "ntf"):
-        for index, moments in before["optimizers"][name]["state"].items():
+        for index, moments in before["learner"]["optimizers"][name]["state"].items():
             for key, value in moments.items():
-                assert torch.equal(value, after["optimizers"][name]["state"][index][key]), (name, index, key)
+                assert torch.equal(value, after["learner"]["optimizers"][name]["state"][index][key]), (name, index, key)
     assert torch.equal(random, after["random"]), "the batch that failed does not come again"
     assert not torch.equal(drawn, torch.rand(1, generator=run.generator))
-    run.advance()
-    assert run.optimizers["field"].param_groups[0]["lr"] == rates[0] / 2
+    run.recipe.advance()
+    assert run.learner.optimizers["field"].param_groups[0]["lr"] == rates[0] / 2
 
 
 def test_four_faults_end_the_run_without_a_file(photographs, tmp_path, monkeypatch):
-    tamper(monkeypatch, "field", lambda run, loss: loss * (float("inf") if run.step == 5 else 1))
+    tamper(monkeypatch, "field", lambda learner, loss: loss * (float("inf") if learner.clock.step == 5 else 1))
     with pytest.raises(MiNtfError, match=r"diverged 4 times.*the field loss is inf.*nothing was written.*--seed"):
         train(photographs, tmp_path / "f", steps=16)
     assert not list(tmp_path.iterdir())
@@ -92,12 +96,12 @@ def test_four_faults_end_the_run_without_a_file(photographs, tmp_path, monkeypat
 
 def test_a_gradient_that_is_not_finite_changes_no_parameter(photographs, tmp_path, monkeypatch):
     """A finite loss with an infinite slope: the square root at 0."""
-    run = trainer._Run(photographs, tmp_path / "f", config.PRESETS["fast"], "fast", minutes=None, steps=40, seed=3)
-    before = {k: v.detach().clone() for k, v in run.nets.tensors.items()}
-    tamper(monkeypatch, "field", lambda run, loss: loss + (loss - loss.detach()).sqrt())
+    run = start(photographs, tmp_path)
+    before = {k: v.detach().clone() for k, v in run.recipe.networks.tensors.items()}
+    tamper(monkeypatch, "field", lambda learner, loss: loss + (loss - loss.detach()).sqrt())
     with pytest.raises(monitor.Fault, match=r"the field loss is \d\.\d+ and its gradient's length (nan|inf) at step 0"):
-        run.advance()
-    assert all(torch.equal(v, before[k]) for k, v in run.nets.tensors.items())
+        run.recipe.advance()
+    assert all(torch.equal(v, before[k]) for k, v in run.recipe.networks.tensors.items())
 
 
 def test_watch_finds_a_loss_that_runs_away_and_forgives_outliers():
@@ -118,22 +122,25 @@ def test_watch_finds_a_loss_that_runs_away_and_forgives_outliers():
 @pytest.mark.slow
 def test_the_best_field_is_the_one_that_is_written(photographs, tmp_path, monkeypatch):
     """The field is spoilt after step 30 of 40, all its matter thinned out; the one before is kept."""
-    def spoil(run, loss):
-        if run.step >= 30:
+    tensors = {}
+
+    def spoil(learner, loss):
+        if learner.clock.step >= 30:
             with torch.no_grad():
-                run.nets.tensors["density.layers.1.bias"] -= 3
+                tensors["density.layers.1.bias"] -= 3
         return loss
 
     tamper(monkeypatch, "field", spoil)
-    monkeypatch.setattr(trainer._Run, "carve", functools.partialmethod(trainer._Run.carve, steps=60))
+    monkeypatch.setattr(fast.Fast, "carve", functools.partialmethod(fast.Fast.carve, steps=60))
     fields = {}
-    validate = trainer._Run.validate
+    validate = trainer.Trainer.validate
 
     def validated(run):
-        fields[run.step] = {k: v.detach().clone() for k, v in run.nets.tensors.items()}
+        tensors.update(run.recipe.networks.tensors)
+        fields[run.clock.step] = {k: v.detach().clone() for k, v in tensors.items()}
         return validate(run)
 
-    monkeypatch.setattr(trainer._Run, "validate", validated)
+    monkeypatch.setattr(trainer.Trainer, "validate", validated)
     report = train(photographs, tmp_path / "f", steps=40)
     best = max(report["history"], key=lambda entry: entry["psnr"])
     assert report["kept"] == best and best["step"] <= 30 and report["history"][-1]["psnr"] < best["psnr"] - 0.02
@@ -194,21 +201,19 @@ def test_no_tensorboard_is_a_clear_error(photographs, tmp_path, monkeypatch):
 def test_skins_get_steeper_once_around_the_surface(photographs, tmp_path, monkeypatch):
     """ln σ → SURFACE_LEVEL + steepen (ln σ − SURFACE_LEVEL) everywhere, at its share of the run and never again; smoke
     has no skin."""
-    def start():
-        return trainer._Run(photographs, tmp_path / "f", config.PRESETS["fast"], "fast", minutes=None, steps=8, seed=3)
-
-    run = start()
+    run = start(photographs, tmp_path, 8)
+    method = run.recipe
     x = torch.rand(100, 3) - 0.5
-    while run.step < 4:
-        run.advance()
-        run.step += 1
-    assert not run.steep
-    before = run.nets.log_density(x).detach()
-    run.refresh()
-    assert run.steep
-    expected = fast.SURFACE_LEVEL + run.config.steepen * (before - fast.SURFACE_LEVEL)
-    torch.testing.assert_close(run.nets.log_density(x).detach(), expected, rtol=1e-4, atol=1e-4)
-    run.refresh()
-    torch.testing.assert_close(run.nets.log_density(x).detach(), expected, rtol=1e-4, atol=1e-4)
-    monkeypatch.setattr(recipe, "SOLID", 1.0)
-    assert start().steep
+    while run.clock.step < 4:
+        method.advance()
+        run.clock.step += 1
+    assert not method.course.steep
+    before = method.networks.log_density(x).detach()
+    method.refresh()
+    assert method.course.steep
+    expected = fast.SURFACE_LEVEL + method.config.steepen * (before - fast.SURFACE_LEVEL)
+    torch.testing.assert_close(method.networks.log_density(x).detach(), expected, rtol=1e-4, atol=1e-4)
+    method.refresh()
+    torch.testing.assert_close(method.networks.log_density(x).detach(), expected, rtol=1e-4, atol=1e-4)
+    monkeypatch.setattr(training_data, "SOLID", 1.0)
+    assert start(photographs, tmp_path, 8).recipe.course.steep

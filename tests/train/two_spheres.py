@@ -28,8 +28,8 @@ def glance(monkeypatch) -> None:
 
     whole = scoring.score
 
-    def score(networks, occupancy, photographs, step, light, most, views=None, passes=1, tell=None):
-        return whole(networks, occupancy, photographs, step, light, 500 if views is None else most, views, passes)
+    def score(field, photographs, most, views=None, passes=1, tell=None):
+        return whole(field, photographs, 500 if views is None else most, views, passes)
 
     monkeypatch.setattr(scoring, "score", score)
 
