@@ -6,15 +6,15 @@ from helpers.variants import VARIANT
 
 import mi_ntf.render
 from benchmarks import loops
-from mi_ntf.infer.visibility import transmittance_atlas
+from mi_ntf.infer import tuning
 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
     mi.set_variant(VARIANT)
     mi_ntf.render.register()
-    monkeypatch.setattr(transmittance_atlas, "SIDE", 8)
-    monkeypatch.setattr(transmittance_atlas, "RESOLUTION", 16)
+    monkeypatch.setattr(tuning, "ATLAS_SIDE", 8)
+    monkeypatch.setattr(tuning, "ATLAS_RESOLUTION", 16)
     monkeypatch.setenv("MI_NTF_CACHE", "memory")
 
 
