@@ -144,8 +144,8 @@ def test_samples_of_a_pixel_spread_evenly(blobs):
 
     def quadrature(spp, count):
         camera = Camera(loaded.sensors()[0], spp)
-        place = camera.rays(0, count, mi.UInt32(5))[2]
-        return *(u.numpy() for u in camera.quadrature(count)), place.x.numpy() % 1, place.y.numpy() % 1
+        *_, place, numbers = camera.rays(0, count, mi.UInt32(5))
+        return *(u.numpy() for u in numbers), place.x.numpy() % 1, place.y.numpy() % 1
 
     for spp, count in (16, 900), (4096, 4):
         for u in quadrature(spp, count)[:2]:

@@ -11,9 +11,8 @@ from mi_ntf.core import field_file, fresnel, microfacet
 from mi_ntf.infer import march, shade
 from mi_ntf.infer.visibility import raymarch
 from mi_ntf.render.maps import building
-from mi_ntf.render.scene import effects
 from mi_ntf.render.scene.media import find_media
-from mi_ntf.render.transport import camera_light, composition, walk
+from mi_ntf.render.transport import camera_light, composition, effects, walk
 
 EYE = [scenes.SIMILARITY.center[0] + 1.2, scenes.SIMILARITY.center[1] + 1.5, scenes.SIMILARITY.center[2] + 5]
 """The pinhole of `scenes.scene`."""

@@ -17,10 +17,9 @@ from ..lights import environment
 from ..lights.light_rows import Discrete
 from ..maps import building
 from ..plugins.registration import load_scene
-from ..scene import effects
 from ..scene.media import find_media, ordinary_shapes
 from ..scene.settings import Settings
-from ..transport import candidates, choosing
+from ..transport import candidates, choosing, effects
 from ..transport.composition import Composition
 from ..transport.context import RenderContext
 

@@ -1,7 +1,7 @@
 """Derivatives of a light table by the parameters of Mitsuba's emitters.
 
 These are intensity, irradiance, radiance, an environment's texels, position and direction. All others are refused by
-:mod:`mi_ntf.render.scene.gradient_checks`.
+:mod:`mi_ntf.render.transport.effects`.
 """
 
 from __future__ import annotations

@@ -18,14 +18,6 @@ CHANNELS = 8
 """Channels that one kernel sums, each in a register of its loop."""
 
 
-class CameraRays(NamedTuple):
-    """Camera rays, the samples of one pixel side by side; `position` is on the film, in pixels."""
-
-    ray: Ray
-    weight: Color3
-    position: Vector3
-
-
 class Quadrature(NamedTuple):
     """Numbers in [0, 1) for each camera ray that place its samples (:func:`mi_ntf.infer.march.camera_samples`).
 
@@ -39,6 +31,15 @@ class Quadrature(NamedTuple):
     def take(self, index: UInt32) -> Quadrature:
         """Return the numbers of the given rays."""
         return Quadrature(*(dr.gather(mi.Float, number, index) for number in self))
+
+
+class CameraRays(NamedTuple):
+    """Camera rays, the samples of one pixel side by side; `position` is on the film, in pixels."""
+
+    ray: Ray
+    weight: Color3
+    position: Vector3
+    quadrature: Quadrature
 
 
 class Camera:
@@ -81,23 +82,16 @@ class Camera:
         ray = mi.Ray3f(differential)
         if dr.width(ray) < n:  # a sensor whose rays are all the same
             ray = dr.gather(mi.Ray3f, ray, dr.zeros(mi.UInt32, n))
-        return CameraRays(ray, weight, inside + mi.Vector2f(self.film.crop_offset()))
-
-    def quadrature(self, count: int) -> Quadrature:
-        """Return the numbers that place the samples of the last :meth:`rays`, those of `count` source pixels.
-
-        The sampler gives those of a pixel's first sample; the lattice spreads the others evenly. Much of the noise
-        depends on where in the skin the samples of a ray lie.
-        """
-        spp = dr.opaque(mi.UInt32, self.spp)
-        index = dr.arange(mi.UInt32, count * self.spp)
-        first = index // spp * spp
+        # The sampler gives the numbers of a pixel's first sample, and the lattice spreads the others evenly. Much of the
+        # noise depends on where in the skin the samples of a ray lie.
+        index, spp = dr.arange(mi.UInt32, n), dr.opaque(mi.UInt32, self.spp)
+        first_sample = index // spp * spp
         numbers = []
         for step in LATTICE:
-            start = mi.UInt32(dr.gather(mi.Float, self.sampler.next_1d(), first) * 2**24) << 8
+            start = mi.UInt32(dr.gather(mi.Float, self.sampler.next_1d(), first_sample) * 2**24) << 8
             # Integers wrap around; the upper 24 bits are a float's.
-            numbers.append(mi.Float((start + (index - first) * step) >> 8) * 2**-24)
-        return Quadrature(*numbers)
+            numbers.append(mi.Float((start + (index - first_sample) * step) >> 8) * 2**-24)
+        return CameraRays(ray, weight, inside + mi.Vector2f(self.film.crop_offset()), Quadrature(*numbers))
 
 
 class Reconstruction:

@@ -81,7 +81,7 @@ def turned(to_world: np.ndarray, degrees: float, up: str = "y") -> np.ndarray:
     """
     direction = to_world[:3, 1 if up == "y" else 2]
     axis = int(np.abs(direction).argmax())
-    result = to_world.copy()
+    result: np.ndarray = to_world.copy()
     result[:3] = rotation.about(np.eye(3)[axis], degrees if direction[axis] >= 0 else -degrees) @ to_world[:3]
     return result
 

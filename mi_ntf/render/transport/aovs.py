@@ -1,6 +1,6 @@
 """Arbitrary output variables of the ``nrf`` integrator: properties of the camera's samples other than light.
 
-A pixel's value is Σ w v / Σ w over all its samples, with their weights w, the fraction of the view that each sample
+A pixel's value is Σ w v / Σ w over all its samples. The weight w of a sample is the fraction of the view that it
 stops. The pixel is 0 where nothing stops the view. Ordinary surfaces take part with the transmittance of the fields
 before them.
 
@@ -107,18 +107,8 @@ class Sums:
                   distance: Float, shadow: Visibility | None) -> None:
         """Add the camera's samples in the field `part`, strand `i`.
 
-        Parameters
-        ----------
-        points
-            Points of the samples in this field, in order.
-        samples
-            Samples in all fields.
-        in_field
-            Indices of the samples in this field; None: all.
-        distance
-            Distance of the points from the camera, scene units.
-        shadow
-            Visibility of the run's lights; None without shadows. Lights at the camera have the view's transmittance.
+        `points`: points of the samples in this field, whose indices are `in_field` (None: all); `distance`: from the
+        camera, scene units; `shadow`: visibility of the run's lights, if it is not the view's transmittance.
         """
         values: list[tuple[list[Float], list[Float]]] = []
         if self.layers is not None:
@@ -168,14 +158,8 @@ class Sums:
     def add_surface(self, ray: Ray, hit: Array, transmittance: Float, distance: Float) -> None:
         """Add the surfaces behind the fields.
 
-        Parameters
-        ----------
-        hit
-            Preliminary intersections of the rays.
-        transmittance
-            Fraction of each ray's light that starts there.
-        distance
-            Distance from the camera to the rays' origins.
+        `hit`: preliminary intersections of the rays; `transmittance`: fraction of each ray's light that starts there;
+        `distance`: from the camera to the rays' origins.
         """
         if self.later_run:
             return

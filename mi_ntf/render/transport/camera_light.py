@@ -172,16 +172,18 @@ class _CameraLight:
         return transmittance
 
     def _field(self, i: int, part: Part, options: tuple[bool, bool], light: list[Float]) -> None:
-        """Add the light reflected by the samples in the field `part`, strand `i`, to `light`: three arrays, by sample.
-        """
+        """Add the light reflected by samples in the field `part`, strand `i`, to `light`, three arrays by sample."""
         assert self.field_samples
         samples, unit = self.field_samples
         weight = samples.weights[i]
-        in_field: UInt32 | None = None  # which of the samples lie in this field; None: all
         ray, t, view = samples.ray, samples.t, samples.view
-        if len(self.scene.in_view) > 1 and dr.width(ray):
-            index: UInt32 = dr.compress(weight > 0)
-            in_field, ray = index, dr.gather(mi.UInt32, ray, index)
+        if not dr.width(ray):
+            return
+        index: UInt32 = dr.arange(mi.UInt32, dr.width(t))  # of the samples in this field
+        several = len(self.scene.in_view) > 1
+        if several:
+            index = dr.compress(weight > 0)
+            ray = dr.gather(mi.UInt32, ray, index)
             t, weight = (dr.gather(mi.Float, a, index) for a in (t, weight))
             view = dr.gather(mi.Float, view, index) if view is not None else None
         if not dr.width(ray):
@@ -189,31 +191,25 @@ class _CameraLight:
         key = *options, i
         points = self.cache.points.get(key) if self.cache else None
         if points is None:
-            points = self._points(i, part, samples, ray, t, in_field)
+            x, along = samples.place(i, ray, t)
+            ordinal = index - dr.gather(mi.UInt32, samples.first, ray)
+            points = shade.Points(x, tuple(-c for c in along), part.medium.reflectance(x),
+                                  dr.gather(mi.UInt32, self.number, ray), ordinal)
+            points.evaluate()
             if self.cache:
                 self.cache.points[key] = points
         if self.sums:
             distance = (dr.gather(mi.Float, samples.bundle.base, ray) + t) * unit
             distance += self.distance if dr.width(self.distance) == 1 else dr.gather(mi.Float, self.distance, ray)
-            self.sums.add_field(i, part, points, samples, in_field, distance, self.scene.shadow(part, sampled=False))
+            self.sums.add_field(i, part, points, samples, index if several else None, distance,
+                                self.scene.shadow(part, sampled=False))
         if self.effects.lit:
             reflected = self.scene.reflect(part, points, self.stream, view)
             if self.scene.bounced and self.first_run:
                 bounced = self.scene.bounced.reflect(part, points)
                 reflected = [a + b for a, b in zip(reflected, bounced, strict=True)]
             for channel, value in zip(light, reflected, strict=True):
-                where = dr.arange(mi.UInt32, dr.width(t)) if in_field is None else in_field
-                dr.scatter_reduce(dr.ReduceOp.Add, channel, value * weight, where, mode=dr.ReduceMode.NoConflicts)
-
-    def _points(self, i: int, part: Part, samples: Samples, ray: UInt32, t: Float,
-                in_field: UInt32 | None) -> shade.Points:
-        x, along = samples.place(i, ray, t)
-        index = dr.arange(mi.UInt32, dr.width(t)) if in_field is None else in_field
-        ordinal = index - dr.gather(mi.UInt32, samples.first, ray)
-        number = dr.gather(mi.UInt32, self.number, ray)
-        points = shade.Points(x, tuple(-c for c in along), part.medium.reflectance(x), number, ordinal)
-        points.evaluate()
-        return points
+                dr.scatter_reduce(dr.ReduceOp.Add, channel, value * weight, index, mode=dr.ReduceMode.NoConflicts)
 
     def _walk(self) -> Walk:
         return Walk(self.scene, self.scene.settings.max_depth, self.total, self.stream, self.number)

@@ -1,7 +1,7 @@
 """Candidates of a pilot: ways to render a picture in less time, in the order in which they are tried.
 
-The pilot tries other visibility methods in place of the march. With the method that it takes, it then leaves out
-effects that hardly change the picture, one after the other, each as often as the error allows.
+The pilot tries other visibility methods in place of the march. It then leaves out effects that hardly change the
+picture, one after the other, each as often as the error allows.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import numpy as np
 
 from ...infer.visibility import REGISTRY
 from ..maps import building
-from ..scene import effects
 from ..scene.settings import Settings
+from . import effects
 from .composition import Composition
 
 

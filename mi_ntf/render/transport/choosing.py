@@ -17,9 +17,8 @@ import mitsuba as mi
 
 from ...infer.visibility import REGISTRY
 from .. import log
-from ..scene import effects
 from ..scene.settings import Limits, Settings
-from . import candidates
+from . import candidates, effects
 from .bounced import Patches
 from .composition import Composition
 from .pilot import BLOCKS, RAYS, Error, Look, Pilot

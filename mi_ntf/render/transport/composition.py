@@ -22,9 +22,9 @@ from ...infer.visibility.unbiased import Unbiased
 from .. import log, timing
 from ..lights import scene_lights
 from ..maps import building
-from ..scene import effects
 from ..scene.media import NRFMedium, find_media, ordinary_shapes
 from ..scene.settings import Settings
+from . import effects
 from .bounced import Bounced, Patches
 from .shadow import FieldVisibility, KnownTransmittance, Part, Shadow, transmittance_between
 from .surfaces import Surfaces
@@ -44,7 +44,7 @@ class SceneStrands(NamedTuple):
 
 
 class Composition:
-    """The scene prepared for one render. Effects that it lacks are not built (:mod:`mi_ntf.render.scene.effects`).
+    """The scene prepared for one render. Effects that it lacks are not built (:mod:`mi_ntf.render.transport.effects`).
 
     patches  of an earlier render of the same fields, or None
     smoke    the camera sees a field without opaque skins

@@ -15,10 +15,9 @@ import numpy as np
 
 from ...infer.types import Array, Color3, Float, Mask
 from .. import timing
-from ..scene import effects
 from ..scene.camera import Quadrature
 from ..scene.media import NRFMedium
-from . import camera_light
+from . import camera_light, effects
 from .composition import Composition
 
 BLOCKS, SIDE, SAMPLES = 256, 2, 2

@@ -156,13 +156,12 @@ def _trace(context: RenderContext, composition: Composition, pixels: Reconstruct
             progress.ended = "timeout"
             return False
         composition.select(run)
-        count = min(chunks.step, camera.count - first)
         # An independent stream for each chunk and seed; opaque, so that no seed is compiled into a kernel.
         stream = mi.sample_tea_32(seed, _opaque(first))[0]
-        ray, weight, position = camera.rays(first, count, stream)
+        ray, weight, position, quadrature = camera.rays(first, min(chunks.step, camera.count - first), stream)
         sums = picture.sums(dr.width(ray), run, composition.runs[run]) if picture else None
         with composition.lights.bare():
-            radiance, opacity = camera_light.trace(composition, ray, camera.quadrature(count), stream, sums,
+            radiance, opacity = camera_light.trace(composition, ray, quadrature, stream, sums,
                                                    cache.chunk(first) if cache else None)
         # The first run adds the opacity and the filter's weights.
         once = [None, None] if run else [opacity, dr.ones(mi.Float, dr.width(ray))]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -13,11 +12,10 @@ import numpy as np
 from ...core.errors import MiNtfError
 from ...infer.types import Float
 from ...infer.visibility import REGISTRY
-from . import gradient_checks
-from .frame import Frame
-from .gradient_checks import DiscreteEmitter
-from .media import NRFMedium, lets_light_through, ordinary_shapes
-from .settings import Settings
+from ..lights.scene_lights import Lights
+from ..scene.frame import Frame
+from ..scene.media import NRFMedium, lets_light_through, ordinary_shapes
+from ..scene.settings import Settings
 
 PINHOLES = ("PerspectiveCamera",)
 """Cameras whose rays all start at one point; light from there has the transmittance of the view."""
@@ -26,46 +24,19 @@ MIN_GLOSS = 0.01
 (:class:`mi_ntf.infer.grid.GridField`, `gloss`)."""
 NEAR = 1e-3
 """Largest distance of a light at the camera, relative to the distance of the nearest field's sphere."""
-
-
-class LightRows(Protocol):
-    """Lights of a scene's table (:class:`mi_ntf.render.lights.light_rows.Rows`), in scene coordinates."""
-
-    @property
-    def where(self) -> np.ndarray:
-        """Positions and directions, (n, 3)."""
-
-    @property
-    def power(self) -> np.ndarray:
-        """Intensities and irradiances, (n, 3)."""
-
-    @property
-    def is_point(self) -> np.ndarray:
-        """True for point lights, (n,)."""
-
-
-class SceneLights(Protocol):
-    """Lights of a scene (:class:`mi_ntf.render.lights.scene_lights.Lights`)."""
-
-    @property
-    def kinds(self) -> Sequence[str]:
-        """Plugin name of each emitter."""
-
-    @property
-    def background(self) -> bool:
-        """True if an environment is visible behind everything else."""
-
-    @property
-    def sampled(self) -> Sequence[mi.Emitter]:
-        """Emitters that are sampled at random."""
-
-    @property
-    def discrete(self) -> Sequence[DiscreteEmitter]:
-        """Emitters whose lights are `rows`."""
-
-    @property
-    def rows(self) -> LightRows:
-        """Lights of the table."""
+POWERS = {
+    "PointLight": ("intensity",),
+    "SpotLight": ("intensity", "texture"),
+    "DirectionalEmitter": ("irradiance",),
+    "EnvironmentMapEmitter": ("data", "scale"),
+    "ConstantBackgroundEmitter": ("radiance",),
+    "AreaLight": ("radiance",),
+    "Projector": ("irradiance", "scale"),
+    "SmoothDiffuse": ("reflectance",),
+}
+"""Mitsuba's class name → parameters in which radiance is linear."""
+PLACES = {"PointLight": ("position",), "SpotLight": ("to_world",), "DirectionalEmitter": ("to_world",)}
+"""Mitsuba's class name → parameters that move a light of the table, and its shadows."""
 
 
 @dataclass(frozen=True)
@@ -108,12 +79,12 @@ class Effects:
 
 
 def describe(scene: mi.Scene, settings: Settings, sensor: mi.Sensor, spp: int, media: Sequence[NRFMedium],
-             lights: SceneLights) -> Effects:
+             lights: Lights) -> Effects:
     """Return the effects of rendering `scene`, with its `media` and `lights`, by `spp` camera rays a pixel."""
     depth = settings.max_depth
     lit = bool(lights.rows.power.size or lights.sampled) and not 0 <= depth < 2
     exhaustive = settings.light_samples == 0
-    gradients = gradient_checks.check(scene, lights.discrete)
+    gradients = check_gradients(scene, lights)
     surfaces = len(ordinary_shapes(scene)) > 0
     # Derivatives by a light's position need the light's own transmittance. A camera ray crosses a surface or ends there
     # at random, while a shadow ray is attenuated.
@@ -156,17 +127,17 @@ def _bounces(settings: Settings, media: Sequence[NRFMedium], surfaces: bool, gra
     return name if name != "auto" else "paths" if unsupported else "radiosity"
 
 
-def sampled_light_count(settings: Settings, lights: SceneLights) -> int:
+def sampled_light_count(settings: Settings, lights: Lights) -> int:
     """Return the number of lights that are sampled at random for each shading point."""
     return settings.light_samples or 2 * len(lights.sampled)
 
 
-def lights_per_point(settings: Settings, lights: SceneLights) -> int:
+def lights_per_point(settings: Settings, lights: Lights) -> int:
     """Return the number of lights for each shading point, those of the table and sampled ones."""
     return len(lights.rows.power) + sampled_light_count(settings, lights)
 
 
-def _method(settings: Settings, rays: int, lights: SceneLights) -> tuple[str, str]:
+def _method(settings: Settings, rays: int, lights: Lights) -> tuple[str, str]:
     """Return the visibility method and the reason for it; `rays`: number of camera rays."""
     method = settings.visibility
     if method != "auto":
@@ -192,7 +163,7 @@ def _rounded(number: float) -> str:
     return f"{number:g}"
 
 
-def _at_camera(lights: SceneLights, sensor: mi.Sensor, media: Sequence[NRFMedium]) -> bool:
+def _at_camera(lights: Lights, sensor: mi.Sensor, media: Sequence[NRFMedium]) -> bool:
     """Return True if all lights are points at the pinhole of the camera."""
     if lights.sampled or sensor.class_name() not in PINHOLES or not lights.rows.is_point.all():
         return False
@@ -241,3 +212,34 @@ def on_film(sensor: mi.Sensor, frame: Frame) -> tuple[np.ndarray, np.ndarray] | 
 def _eye(sensor: mi.Sensor) -> np.ndarray:
     """Return the position of a camera's pinhole."""
     return np.array(sensor.world_transform().translation(), np.float64).ravel()
+
+
+def check_gradients(scene: mi.Scene, lights: Lights) -> bool:
+    """Return True if a parameter of `scene` carries gradients. Raises MiNtfError if its derivatives are not supported.
+    """
+    parameters = mi.traverse(scene)
+    attached = [key for key, value in parameters if dr.grad_enabled(value)]
+    for key in attached:
+        if not _supported(parameters, key, lights):
+            raise MiNtfError(
+                f"gradients by {key}: not supported; detach it. Supported are what lights emit (intensity, irradiance, "
+                "radiance, texture of a spot, data and scale of an envmap), the reflectance of diffuse BSDFs and, of "
+                "lights that are not drawn at random, the position of a point and the to_world of a spot or directional"
+            )
+        place = key.rpartition(".")[2] in ("position", "to_world")
+        if place and lets_light_through(scene):
+            raise MiNtfError(f"gradients by {key}: not supported beside surfaces that let light through (null, mask, "
+                             "thindielectric), whose own slopes would be missing; detach it or take these surfaces out")
+    return bool(attached)
+
+
+def _supported(parameters: mi.SceneParameters, key: str, lights: Lights) -> bool:
+    node, words = parameters.properties[key][2], 1
+    while node is not None:
+        of_owner, kind = ".".join(key.split(".")[-words:]), node.class_name()
+        if of_owner.startswith(POWERS.get(kind, ())):
+            return True
+        if of_owner in PLACES.get(kind, ()):
+            return any(node is d.emitter for d in lights.discrete)
+        node, words = parameters.hierarchy[node][0], words + 1
+    return False
