@@ -52,23 +52,18 @@ print(".".join(map(str, dr.detail.cuda_version())))
 
 @dataclass(frozen=True)
 class Check:
-    """Result of one check.
-
-    needed  True if rendering is impossible without it
-    found   state of the machine
-    remedy  what to do, "" if nothing
-    """
+    """Result of one check."""
 
     name: str
     ok: bool
-    needed: bool
-    found: str
-    remedy: str = ""
+    needed: bool  # rendering is impossible without it
+    found: str  # state of the machine
+    remedy: str = ""  # empty if there is nothing to do
 
 
 @dataclass(frozen=True)
 class Report:
-    """All checks of this machine. `ok` is True if every needed check passed."""
+    """Results of the checks of this machine. `ok` is True if every needed check passed."""
 
     ok: bool
     version: str

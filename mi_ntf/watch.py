@@ -98,7 +98,7 @@ class Tev:
         if not host or not port.isdecimal() or not 0 < int(port) < 65536:
             raise MiNtfError(f"--tev is {address!r}, expected HOST:PORT, as {TEV}")
         self._address, self._say = (host, int(port)), say
-        self._shown, self._said = set[str](), set[str]()
+        self._shown, self._messages = set[str](), set[str]()
 
     def show(self, name: str, bitmap: "mi.Bitmap") -> bool:
         """Send all channels of a bitmap under `name`. Return False if tev does not listen or take the picture."""
@@ -132,8 +132,8 @@ class Tev:
         return True
 
     def _say_once(self, text: str) -> bool:
-        if text not in self._said:
-            self._said.add(text)
+        if text not in self._messages:
+            self._messages.add(text)
             self._say(text)
         return False
 

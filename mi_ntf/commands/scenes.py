@@ -168,5 +168,5 @@ class RenderSequence:
             return 1 if result.faults else 0
         film = Film(self.film, frames.fps, self.exposure) if self.film else None
         summary = command.run(tasks, quiet=self.json, film=film, workers=self.workers)
-        options.print_report(summary, self.json, command.print_summary)
+        options.print_report(summary.as_data(), self.json, lambda _: command.print_summary(summary))
         return 0

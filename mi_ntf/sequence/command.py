@@ -5,7 +5,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -32,32 +32,29 @@ class Check:
 
     @property
     def faults(self) -> list[str]:
-        """All sentences."""
+        """Sentences of all kinds."""
         return self.missing + self.broken + self.other
 
 
 @dataclass(frozen=True)
 class Summary:
-    """Result of :func:`run`.
-
-    kept      number of images that existed before
-    seconds   time of everything
-    first     seconds of the first rendered image
-    each      median of the seconds of the others
-    each_of   seconds of all rendered images
-    film      file of the film, and `toned`, its tones
-    """
+    """Result of :func:`run`, with times in seconds."""
 
     folder: str
     images: int
-    kept: int
+    existing: int
     rendered: int
     seconds: float
     first: float | None
-    each: float | None
+    each: float | None  # median of all but the first
     each_of: list[float]
     film: str | None = None
-    toned: str | None = None
+    toned: str | None = None  # description of the film's tones
+
+    def as_data(self) -> dict[str, object]:
+        """Return the report of `mi-ntf sequence --json`."""
+        data = asdict(self)
+        return data | {"kept": data.pop("existing")}
 
 
 def shard(text: str) -> tuple[int, int]:
@@ -154,7 +151,7 @@ def print_check(result: Check) -> None:
 def print_summary(summary: Summary) -> None:
     """Print the result of :func:`run`."""
     print(f"{summary.folder}: {summary.rendered} of {summary.images} images in {summary.seconds:.1f} s, "
-          f"{summary.kept} were there")
+          f"{summary.existing} were there")
     if summary.each is not None:
         print(f"the first in {summary.first:.2f} s, each of the others in {summary.each:.2f} s (median)")
     if summary.film is not None:

@@ -46,18 +46,12 @@ Values: TypeAlias = dict[str, Any]
 
 @dataclass(frozen=True)
 class Frame:
-    """Values that frame `number` puts into the scene.
-
-    parameters   values of $names as text
-    camera       ``origin``, ``target``, ``up``, ``fov``
-    lights       ``position`` and ``target`` by the light's name
-    environment  ``degrees`` and ``axis``
-    """
+    """Values that frame `number` puts into the scene."""
 
     number: int
-    parameters: dict[str, str] = field(default_factory=dict)
+    parameters: dict[str, str] = field(default_factory=dict)  # of $names, as text
     camera: Values = field(default_factory=dict)
-    lights: dict[str, Values] = field(default_factory=dict)
+    lights: dict[str, Values] = field(default_factory=dict)  # by the light's name
     environment: Values = field(default_factory=dict)
 
     def values(self) -> Values:
@@ -67,7 +61,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Timeline:
-    """All `frames` in order, and the number of frames per second of their film."""
+    """Frames in order, and the number of frames per second of their film."""
 
     frames: list[Frame]
     fps: float = 24.0

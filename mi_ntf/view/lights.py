@@ -22,25 +22,17 @@ NAMES = {"PointLight": "point", "SpotLight": "spot", "DirectionalEmitter": "dire
 
 @dataclass
 class Light:
-    """Emitter `number` of the scene and its changes since the scene was opened.
-
-    kind        name of the plugin
-    up          axis about which an environment turns, unit vector
-    moved       True after a change of place or direction
-    version     number of changes
-    brightness  factor of the emission
-    degrees     angle by which an environment is turned about `up`
-    """
+    """Emitter `number` of the scene and its changes since the scene was opened."""
 
     number: int
-    kind: str
+    kind: str  # name of the plugin
     emitter: mi.Emitter
     parameters: Parameters
-    up: np.ndarray
-    moved: bool = False
-    version: int = 0
-    brightness: float = 1.0
-    degrees: float = 0.0
+    up: np.ndarray  # axis about which an environment turns, unit vector
+    moved: bool = False  # place or direction were changed
+    version: int = 0  # number of changes
+    brightness: float = 1.0  # factor of the emission
+    degrees: float = 0.0  # angle by which an environment is turned about `up`
 
     def __post_init__(self) -> None:
         self._power = numbers(self._get(POWER[self.emitter.class_name()])) if self.can_dim else None

@@ -1,4 +1,4 @@
-"""One picture of a view: the image of the scene by one method, in layers by lights and in passes that add up."""
+"""Image of the scene by one method, in layers by lights and in passes that add up."""
 
 from __future__ import annotations
 

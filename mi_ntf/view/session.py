@@ -38,18 +38,12 @@ REST_CHUNK = 1 << 15
 
 @dataclass(frozen=True)
 class Frame:
-    """Image of a view.
+    """Image of a view."""
 
-    image    linear RGB and opacity, (h, w, 4), or an AOV, (h, w, c)
-    seconds  rendering time
-    samples  samples per pixel
-    right    image by the second method of a split view
-    """
-
-    image: np.ndarray
+    image: np.ndarray  # linear RGB and opacity, (h, w, 4), or an AOV, (h, w, c)
     seconds: float
-    samples: int
-    right: np.ndarray | None = None
+    samples: int  # per pixel
+    right: np.ndarray | None = None  # by the second method of a split view
 
 
 class Session:

@@ -17,12 +17,12 @@ def test_frames_of_two_workers_are_those_of_one(scene, tmp_path, monkeypatch):
     command.run(command.tasks_of(path, tmp_path / "one", frames), quiet=True)
     two = command.tasks_of(path, "two", frames)
     summary = command.run(two, quiet=True, workers=Workers("local", 2))
-    assert (summary.rendered, summary.kept, len(summary.each_of)) == (4, 0, 4)
+    assert (summary.rendered, summary.existing, len(summary.each_of)) == (4, 0, 4)
     assert [p.name for p in sorted((tmp_path / "two").iterdir())] == [f"frame_000{i}.exr" for i in range(4)]
     for image in (tmp_path / "one").iterdir():
         assert (tmp_path / "two" / image.name).read_bytes() == image.read_bytes()
     assert command.check(two).done == 4
-    assert command.run(two, quiet=True, workers=Workers("local", 2)).kept == 4
+    assert command.run(two, quiet=True, workers=Workers("local", 2)).existing == 4
 
 
 def test_a_failing_frame_is_reported_after_the_others(scene, tmp_path, monkeypatch):
