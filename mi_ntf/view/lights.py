@@ -35,45 +35,23 @@ class Light:
     degrees: float = 0.0  # angle by which an environment is turned about `up`
 
     def __post_init__(self) -> None:
+        power = POWER.get(self.emitter.class_name())
+        self.can_dim = power is not None and self.parameters.has(self.emitter, power)
+        self.can_move, self.can_turn = self.kind in ("point", "spot"), self.kind == "envmap"
+        self.can_point = self.kind in ("spot", "directional")
         self._power = numbers(self._get(POWER[self.emitter.class_name()])) if self.can_dim else None
-        has_transform = self.kind in ("spot", "directional", "envmap")
-        self._placement = numbers(self._get("to_world")) if has_transform else np.eye(4)
-
-    @property
-    def can_move(self) -> bool:
-        """True for lights with a position."""
-        return self.kind in ("point", "spot")
-
-    @property
-    def can_point(self) -> bool:
-        """True for lights with a direction."""
-        return self.kind in ("spot", "directional")
-
-    @property
-    def can_turn(self) -> bool:
-        """True for environment maps."""
-        return self.kind == "envmap"
-
-    @property
-    def can_dim(self) -> bool:
-        """True if the emission is a number or colour."""
-        name = POWER.get(self.emitter.class_name())
-        return name is not None and self.parameters.has(self.emitter, name)
+        has_transform = self.can_point or self.can_turn
+        self.placement = numbers(self._get("to_world")) if has_transform else np.eye(4)  # light to scene
 
     @property
     def position(self) -> NDArray[np.float64]:
         """Position of a point or spot light, (3,)."""
-        return numbers(self._get("position")) if self.kind == "point" else self._placement[:3, 3]
+        return numbers(self._get("position")) if self.kind == "point" else self.placement[:3, 3]
 
     @property
     def direction(self) -> NDArray[np.float64]:
         """Direction of the light of a spot or directional light, unit vector (3,)."""
-        return np.asarray(self._placement[:3, 2] / np.linalg.norm(self._placement[:3, 2]))
-
-    @property
-    def placement(self) -> NDArray[np.float64]:
-        """Light to scene, (4, 4)."""
-        return self._placement
+        return np.asarray(self.placement[:3, 2] / np.linalg.norm(self.placement[:3, 2]))
 
     @property
     def power(self) -> NDArray[np.float64] | None:
@@ -86,9 +64,9 @@ class Light:
         if self.kind == "point":
             self._set("position", np.asarray(position, np.float64))
         else:
-            self._placement = self._placement.copy()
-            self._placement[:3, 3] = position
-            self._set("to_world", self._placement)
+            self.placement = self.placement.copy()
+            self.placement[:3, 3] = position
+            self._set("to_world", self.placement)
 
     def point(self, direction: ArrayLike) -> None:
         """Let a spot or directional light shine along `direction`."""
@@ -96,14 +74,14 @@ class Light:
         forward = np.asarray(direction, np.float64) / np.linalg.norm(direction)
         up = self.up if abs(forward @ self.up) < 0.99 else np.roll(self.up, 1)
         placement = look_at((0, 0, 0), forward, up)
-        placement[:3, 3] = self._placement[:3, 3]
-        self._placement = placement
+        placement[:3, 3] = self.placement[:3, 3]
+        self.placement = placement
         self._set("to_world", placement)
 
     def turn(self, degrees: float) -> None:
         """Turn an environment to `degrees` about the camera's up axis, relative to its place in the scene file."""
         self.degrees = float(degrees)
-        turned = self._placement.copy()
+        turned = self.placement.copy()
         turned[:3] = rotation.about(self.up, self.degrees) @ turned[:3]
         self._set("to_world", turned)
 
