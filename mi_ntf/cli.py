@@ -6,44 +6,29 @@ adds Python's traceback.
 
 import sys
 import traceback
-from collections.abc import Sequence
-from typing import Annotated, Protocol, cast
+from collections.abc import Callable, Sequence
+from typing import Protocol, cast
 
-import tyro
-from tyro.conf import subcommand
+from tyro.conf import FlagCreatePairsOff
+from tyro.extras import subcommand_cli_from_dict
 
-from mi_ntf.commands.analysis import Compare, Explain, Tradeoff
-from mi_ntf.commands.fields import Capture, Export, Info, Inspect, Train
-from mi_ntf.commands.machine import Bridge, Doctor
+from mi_ntf.commands import analysis, fields, machine, scenes
 from mi_ntf.commands.options import UsageError
-from mi_ntf.commands.scenes import Bake, Cache, Render, RenderSequence, Swap, View
 from mi_ntf.core import errors
-
-Commands = (
-    Annotated[Capture, subcommand("capture")]
-    | Annotated[Inspect, subcommand("inspect")]
-    | Annotated[Train, subcommand("train")]
-    | Annotated[Swap, subcommand("swap")]
-    | Annotated[Render, subcommand("render")]
-    | Annotated[Compare, subcommand("compare")]
-    | Annotated[Explain, subcommand("explain")]
-    | Annotated[Tradeoff, subcommand("tradeoff")]
-    | Annotated[View, subcommand("view")]
-    | Annotated[Bake, subcommand("bake")]
-    | Annotated[Cache, subcommand("cache")]
-    | Annotated[Export, subcommand("export")]
-    | Annotated[RenderSequence, subcommand("sequence")]
-    | Annotated[Info, subcommand("info")]
-    | Annotated[Bridge, subcommand("bridge")]
-    | Annotated[Doctor, subcommand("doctor")]
-)
-
 
 class Command(Protocol):
     """A parsed command line."""
 
     def run(self) -> int | None:
         """Do the work and return the exit code. None stands for 0."""
+
+
+COMMANDS: dict[str, Callable[..., Command]] = {
+    "capture": fields.Capture, "inspect": fields.Inspect, "train": fields.Train, "swap": scenes.Swap,
+    "render": scenes.Render, "compare": analysis.Compare, "explain": analysis.Explain, "tradeoff": analysis.Tradeoff,
+    "view": scenes.View, "bake": scenes.Bake, "cache": scenes.Cache, "export": fields.Export,
+    "sequence": scenes.RenderSequence, "info": fields.Info, "bridge": machine.Bridge, "doctor": machine.Doctor,
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -69,9 +54,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def parse(words: list[str]) -> Command:
     """Return the command of a command line. Raises SystemExit as argparse does."""
     if words[:1] == ["render"]:  # its flags belong to another parser
-        return Render(tuple(words[1:]))
-    config = (tyro.conf.FlagCreatePairsOff,)
-    return cast(Command, tyro.cli(Commands, prog="mi-ntf", description=__doc__, args=words, config=config))
+        return scenes.Render(tuple(words[1:]))
+    return cast(Command, subcommand_cli_from_dict(COMMANDS, prog="mi-ntf", description=__doc__, args=words,
+                                                  config=(FlagCreatePairsOff,)))
 
 
 if __name__ == "__main__":
