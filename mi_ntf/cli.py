@@ -16,6 +16,7 @@ from mi_ntf.commands import analysis, fields, machine, scenes
 from mi_ntf.commands.options import UsageError
 from mi_ntf.core import errors
 
+
 class Command(Protocol):
     """A parsed command line."""
 

@@ -12,7 +12,6 @@ from helpers.viewed import DIRECTIONAL, ENVIRONMENT, POINT, SECOND, SPOT
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.evaluate.metrics import relative_rmse
 from mi_ntf.render.maps import map_cache
-from mi_ntf.render.transport import rendering
 from mi_ntf.view.picture import Interrupted
 from mi_ntf.view.session import Session
 
@@ -199,5 +198,5 @@ def test_a_pass_ends_when_something_moves_and_leaves_nothing_behind(scene, monke
     view.stop = lambda: calls.append(1) or len(calls) > 1
     with pytest.raises(Interrupted):
         view.refine()
-    view.stop, view._finals[0].chunk = (lambda: False), rendering.CHUNK
+    view.stop, view._finals[0].context.rays_in_flight = (lambda: False), 0
     assert relative_rmse(view.refine().image, truth) < SAME
