@@ -1,4 +1,4 @@
-"""Depth, normals, reflectance and visibility of an analytic ball, and of a ball before a wall."""
+"""Further outputs of an analytic ball, and of a ball before a wall."""
 
 import mitsuba as mi
 import numpy as np
@@ -16,7 +16,7 @@ EVERY = "depth,normal,albedo,roughness,opacity,visibility,visibility_lights"
 
 @pytest.fixture(scope="module")
 def ball(tmp_path_factory):
-    """An opaque ball of radius 0.8 around the origin, skin 0.01 thick, normals outwards."""
+    """Return an opaque ball of radius 0.8 around the origin, with a skin of 0.01 and normals outwards."""
     path = tmp_path_factory.mktemp("field") / "ball.safetensors"
     header, tensors = fields.blobs([(0, 0, 0)], [RADIUS], log_density=6.4, edge=60, albedo=ALBEDO, specular=1e-6)
     field_file.save(path, header, tensors, np.float32)
@@ -30,7 +30,7 @@ LIGHTS = {
 
 
 def layers(field, names: str, lights=LIGHTS, spp=16, film="rgba", shapes=None, **options):
-    """Name → (h, w) of the extra channels and of R, G, B, seen along −z over [−1, 1]² from z = 3 on."""
+    """Return name → (h, w) of the extra channels and of R, G, B, seen along −z over [−1, 1]² from z = 3."""
     scene = mi.load_dict({
         "type": "scene",
         "integrator": {"type": "nrf", "visibility": "raymarch", "samples": 768, "aovs": names, "hide_emitters": True,
@@ -54,7 +54,7 @@ def layers(field, names: str, lights=LIGHTS, spp=16, film="rgba", shapes=None, *
 
 
 def pixels():
-    """Middles of the pixels, and the distance from the axis in radii."""
+    """Return the middles of the pixels, and the distance from the axis in radii."""
     c = (np.arange(SIZE) + 0.5) * 2 / SIZE - 1
     x, y = np.meshgrid(c, -c)
     return x, y, np.hypot(x, y) / RADIUS
@@ -81,8 +81,10 @@ def test_ball(ball):
 
 
 def test_visibility_of_the_ball(ball):
-    """From the camera's side, light arrives as the view does: E[τ] = E[T] under the weights = 1/2 of a skin that stops
-    all. The light from +x is as strong there, and gone on the far side."""
+    """From the camera's side, light arrives as the view does.
+
+    E[τ] = E[T] under the weights = 1/2 for an opaque skin. Light from +x is as strong there, and 0 on the far side.
+    """
     found, integrator = layers(ball, EVERY, spp=64)
     x, _, rho = pixels()
     ahead, aside = found["visibility_lights.0.Y"], found["visibility_lights.1.Y"]
@@ -93,7 +95,7 @@ def test_visibility_of_the_ball(ball):
 
 
 def test_lights_in_runs(ball):
-    """Maps that fit into memory one by one add up to what they are together."""
+    """Maps in several runs add up to the result of all maps together."""
     options = {"visibility": "transmittance_map", "map_resolution": 64, "spp": 4}
     whole, _ = layers(ball, EVERY, **options)
     parts, _ = layers(ball, EVERY, map_memory=64**2 * 8 / 2**20, **options)

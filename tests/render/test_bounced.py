@@ -1,4 +1,4 @@
-"""Further bounces without noise: against stock ``path`` on meshes of the same shape, and against traced paths."""
+"""Multiple scattering without noise, against stock ``path`` on meshes of the same shape and traced paths."""
 
 import drjit as dr
 import mitsuba as mi
@@ -18,7 +18,7 @@ SUN = pictures.sun((0.36, 0.48, 0.8))
 
 @pytest.fixture(scope="module")
 def skin(tmp_path_factory):
-    """A diffuse sphere of radius ½, its skin two voxels wide."""
+    """Return a diffuse sphere of radius ½ with a skin two voxels wide."""
     made = fields.skin("sphere", log_density=5.0, scale=0.01, albedo=ALBEDO, specular=1e-5, roughness=0.9)
     return pictures.save(tmp_path_factory.mktemp("skin"), (made.header, made.tensors))
 
@@ -28,13 +28,13 @@ def look(spread: float = 0.0) -> dict:
 
 
 def pair(path) -> dict:
-    """Two of the spheres side by side, each a field of its own."""
+    """Return two of the spheres side by side, each a field."""
     return {f"ball{i}": {**pictures.ball(path, to_world=mi.ScalarTransform4f().translate([x, 0, 0])),
                          "center": [x, 0, 0]} for i, x in enumerate(PLACES)}  # fmt: skip
 
 
 def added(method, things, depth=-1, spp=16, **options):
-    """What further bounces add to the picture's mean, over single scattering."""
+    """Return what further bounces add to the picture's mean, relative to single scattering."""
     means = [pictures.render(method, things, spp, max_depth=d, **options)[..., :3].mean((0, 1)) for d in (2, depth)]
     return means[1] / means[0] - 1
 
@@ -70,7 +70,7 @@ def test_a_convex_body_gets_nothing_and_pictures_have_no_more_noise(skin):
 
 @pytest.mark.slow
 def test_light_at_the_camera_takes_its_short_way(skin):
-    """One walk for view and light; the same picture as with a light beside the camera."""
+    """One march for view and light gives the same picture as a light beside the camera."""
     flash = {"type": "point", "intensity": 40.0}
     pictures_ = [
         pictures.render("raymarch", {"sensor": look(), "flash": {**flash, "position": [x, 0.8, 4.0]}, **pair(skin)},
@@ -80,7 +80,7 @@ def test_light_at_the_camera_takes_its_short_way(skin):
 
 
 def test_runs_of_lights_add_up(skin):
-    """Maps in several runs: bounced light counts once."""
+    """Bounced light counts once if maps are built in several runs."""
     things = {"sensor": look(), **{f"sun{k}": pictures.sun(d) for k, d in enumerate(np.eye(3))}, **pair(skin)}
     whole, parts = (pictures.render("transmittance_map", things, max_depth=-1, map_resolution=64, map_memory=m)
                     for m in (1024.0, 0.08))
@@ -102,7 +102,7 @@ def test_what_radiosity_does_not_know_is_traced_or_refused(skin, tmp_path):
 
 @pytest.mark.slow
 def test_few_drawn_lights_bounce_like_many(skin):
-    """What patches get is drawn once for all samples of a pixel, so their number has to do."""
+    """Few sampled lights of the patches suffice, which are the same for all samples of a pixel."""
     places = [(3, 0, 0), (-3, 0, 0), (0, 3, 0), (0, -1.5, 0), (0, 0, 3), (0, 0, -3), (0, 0.8, 0), (0, 0, 1)]
     lights = {f"light{i}": {"type": "point", "position": list(p), "intensity": 5.0} for i, p in enumerate(places)}
     things = {"sensor": look(), **lights, **pair(skin)}
@@ -115,7 +115,7 @@ def test_few_drawn_lights_bounce_like_many(skin):
 
 
 def test_what_is_read_back_is_computed_once(variant):
-    """One kernel for three channels."""
+    """One kernel computes three channels."""
     values = dr.arange(mi.Float, 1000) + 1
     dr.eval(values)
     light = mi.Color3f(dr.sqrt(values), dr.log(values), values * values)
@@ -129,7 +129,7 @@ def test_what_is_read_back_is_computed_once(variant):
 
 
 def test_a_field_that_no_line_meets(tmp_path):
-    """A speck of a thousandth of the sphere: nothing to find, and nothing breaks."""
+    """A field of a thousandth of the sphere has no patches and renders without error."""
     made = fields.blobs([(0.2, 0, 0)], [0.004], log_density=6.5, edge=2)
     things = {"sensor": pictures.camera((0, 0, 3), fov=1.0), "sun": SUN,
               "ball": pictures.ball(pictures.save(tmp_path, made), resolution=64)}  # fmt: skip

@@ -1,4 +1,4 @@
-"""Films, filters and sensors that users choose without a thought: each shows what the neutral one shows."""
+"""Films, filters and sensors that users may choose, against neutral ones."""
 
 import itertools
 
@@ -18,7 +18,7 @@ RGB_TO_XYZ = np.array([[0.412453, 0.357580, 0.180423], [0.212671, 0.715160, 0.07
 
 
 def with_film(field, integrator, spp=4, size=16, seed=0, **film):
-    """Image of the object by a film with these options."""
+    """Return the image of the object by a film with these options."""
     loaded = scenes.scene(field, integrator, LIGHT, size=size, spp=spp, film_options=film)
     return scenes.render(loaded, seed)
 
@@ -38,7 +38,7 @@ def test_pixel_formats_of_a_box_filter(blobs, pixel_format, visibility):
 @pytest.mark.parametrize("rfilter", ["tent", "gaussian", "mitchell", "catmullrom", "lanczos"])
 @pytest.mark.parametrize("border", [False, True])
 def test_reconstruction_equals_the_films_own(blobs, rfilter, border, monkeypatch):
-    """The same samples, put by Mitsuba's ImageBlock; in several chunks."""
+    """Mitsuba's ImageBlock reconstructs the same samples to the same picture, in several chunks."""
     monkeypatch.setattr("mi_ntf.render.transport.rendering.CHUNK", 500)
     options = {"rfilter": {"type": rfilter}, "sample_border": border, "pixel_format": "rgba"}
     loaded = scenes.scene(blobs, nrf("none", samples=64), LIGHT, size=16, spp=4, film_options=options)
@@ -64,7 +64,7 @@ def test_reconstruction_equals_the_films_own(blobs, rfilter, border, monkeypatch
     ids=str,
 )
 def test_one_seed_one_image(blobs, rfilter, options):
-    """Eight renders of one process are the same bits: no sum depends on the order in which threads come along."""
+    """Eight renders in one process have the same bits, since no sum depends on the order of threads."""
     film = {"rfilter": {"type": rfilter}}
     loaded = scenes.scene(blobs, nrf(**{"visibility": "raymarch", **options}), LIGHT, size=24, spp=4, film_options=film)
     first = scenes.render(loaded, 7)
@@ -77,7 +77,7 @@ SENSORS = (*POINTS, "irradiancemeter", "thinlens", "orthographic", "batch", "off
 
 
 def sensors(spp: int) -> dict:
-    """Sensors of every kind on the object: name → part of a scene. Those of one pixel see bright matter."""
+    """Return sensors of every kind: name → part of a scene. Sensors of one pixel see bright matter."""
     to_world, centre = mi.ScalarTransform4f(), np.array(scenes.SIMILARITY.center)
     left = centre - [0.4, 0, 0]
     look = to_world.look_at(origin=list(left + np.array([1.2, 1.5, 5])), target=list(left), up=[0, 1, 0])
@@ -104,7 +104,7 @@ def sensors(spp: int) -> dict:
 
 @pytest.mark.parametrize("name", SENSORS)
 def test_sensors_agree_with_volpath(blobs, name):
-    """Radiance of each sensor's whole film, six seeds: equal to volpath's by Welch's test, and within 6 %."""
+    """The radiance of each sensor's film, six seeds, equals volpath's by Welch's test and within 6 %."""
 
     def means(integrator, spp):
         loaded = mi.load_dict({"type": "scene", "integrator": integrator, **sensors(spp)[name], **LIGHT,
@@ -119,7 +119,7 @@ def test_sensors_agree_with_volpath(blobs, name):
 
 
 def test_frozen_functions_are_refused(blobs):
-    """A render's sizes are not known beforehand, so dr.freeze cannot record it: an exception, and life goes on."""
+    """A render in dr.freeze raises an exception, since its sizes are not known beforehand; later renders work."""
     loaded = scenes.scene(blobs, nrf(), LIGHT, size=8, spp=2)
     before = scenes.render(loaded)
 
@@ -138,8 +138,10 @@ def test_frozen_functions_are_refused(blobs):
 
 
 def test_samples_of_a_pixel_spread_evenly(blobs):
-    """Of 16 points, and of 4096, every stretch of a few sixteenths (4096ths) of [0, 1) holds one; single ones are
-    uniform, and independent of each other and of where in its pixel a ray goes through."""
+    """Every stretch of a few sixteenths of [0, 1) holds one of 16 points; the same for 4096.
+
+    Single points are uniform, and independent of each other and of where in its pixel a ray starts.
+    """
     loaded = scenes.scene(blobs, nrf(), LIGHT, size=256, spp=1)
 
     def quadrature(spp, count):
@@ -159,7 +161,7 @@ def test_samples_of_a_pixel_spread_evenly(blobs):
 
 
 def test_samples_of_a_pixel_know_of_each_other(blobs):
-    """Along one ray, whose places in its pixel are none, the variance of 16 samples is not half of a sixteenth."""
+    """Along identical rays the variance of 16 samples is less than half of a sixteenth."""
     view = sensors(1)["radiancemeter"]
     loaded = mi.load_dict({"type": "scene", "integrator": nrf(), **view, **LIGHT, "ball": scenes.ball(blobs)})
 
@@ -170,7 +172,7 @@ def test_samples_of_a_pixel_know_of_each_other(blobs):
 
 
 def test_a_pixel_sums_a_million_samples():
-    """To float32's grain: a plain float32 sum of 10⁶ times 0.1 is 1 % too large."""
+    """The sum is exact to float32; a plain float32 sum of 10⁶ times 0.1 is 1 % too large."""
     spp = 10**6
     camera = Camera(mi.load_dict({"type": "perspective", "film": scenes.film(1)}), spp)
     camera.film.prepare([])

@@ -1,4 +1,4 @@
-"""What is chosen under limits of error and time, and by ``auto`` without any."""
+"""Choice of a method under limits of error and time, and by ``auto`` without limits."""
 
 import mitsuba as mi
 import numpy as np
@@ -20,7 +20,7 @@ def nrf(**options) -> dict:
 
 
 def clock(monkeypatch, each):
-    """One sample takes `each` seconds of its settings: small pictures are timed too roughly to be told apart."""
+    """Make one sample take `each` seconds of its settings, since small pictures are timed too roughly."""
     plain = pilot.Pilot.look
 
     def look(self, compose):
@@ -35,7 +35,7 @@ def relative(image, truth) -> float:
 
 
 def pictures(loaded, **march):
-    """By the scene's integrator and by the march, of one seed, and what the first achieved."""
+    """Return pictures by the scene's integrator and by the march, of one seed, and the result of the first."""
     image = scenes.render(loaded, 1)[..., :3]
     truth = np.array(mi.render(loaded, integrator=mi.load_dict(nrf(visibility="raymarch", **march)), seed=1))[..., :3]
     return image, truth, loaded.integrator().achieved
@@ -67,7 +67,7 @@ def test_without_max_error_nothing_is_tried(blobs):
 
 
 def test_small_pictures_are_marched_without_a_pilot(blobs):
-    """The pilot would be a large part of them."""
+    """The pilot would be a large part of small pictures."""
     loaded = scenes.scene(blobs, nrf(max_error=0.5, frames=1), {"light": scenes.light("env")}, size=16, spp=1)
     mi.render(loaded)
     achieved = loaded.integrator().achieved
@@ -75,7 +75,7 @@ def test_small_pictures_are_marched_without_a_pilot(blobs):
 
 
 def test_a_named_method_stays(blobs):
-    """Whatever its error, and what is left out may not add to it."""
+    """A named method stays whatever its error; omissions may not add to it."""
     loaded = scenes.scene(blobs, nrf(visibility="transmittance_map", map_resolution=8, max_error=1e-3),
                           {"light": scenes.light("env")}, size=16, spp=1)
     mi.render(loaded)
@@ -91,7 +91,7 @@ def test_a_named_method_stays(blobs):
     ("brightest lights", {"log_density": 3.0}, "lamps", {}),
 ])
 def test_what_hardly_shows_is_left_out(tmp_path, monkeypatch, what, field, lights, options):
-    """Where it saves time. The error is that of the picture; a hundredth of it is not allowed."""
+    """An effect is left out if it saves time and the picture's error stays below the limit."""
     cost = {"without specular lobes": lambda s: 1.0 + s.specular, "without further bounces": lambda s: float(
         abs(s.max_depth)), "brightest lights": lambda s: float(s.brightest_lights or 100)}[what]
     clock(monkeypatch, cost)
@@ -112,7 +112,7 @@ def test_what_hardly_shows_is_left_out(tmp_path, monkeypatch, what, field, light
 
 @pytest.mark.parametrize("shown", [True, False])
 def test_a_field_of_a_few_pixels_is_left_out_or_seen(blobs, monkeypatch, shown):
-    """The pilot looks at it, however small: where it is as bright as a lamp, it stays."""
+    """The pilot looks at fields of any size; one as bright as a lamp stays."""
     clock(monkeypatch, lambda s: 1.0 - 0.5 * len(s.without_media))
     center, radius = np.array([-1.6, 0.2, -3.0]), 0.12
     size = radius / scenes.SIMILARITY.radius
@@ -131,7 +131,7 @@ def test_a_field_of_a_few_pixels_is_left_out_or_seen(blobs, monkeypatch, shown):
 
 @pytest.mark.parametrize("light_samples", [0, 3])
 def test_a_sharp_lobe_keeps_lights_that_would_glint(tmp_path, monkeypatch, light_samples):
-    """Fewer lights of a sky are looked at with many rays without shadows where a lobe is sharp."""
+    """Fewer lights of a sky are judged by many rays without shadows if a lobe is sharp."""
     clock(monkeypatch, lambda s: float(s.environment_lights))
     calls = []
     plain = choosing.Chooser._glints
@@ -156,7 +156,7 @@ def test_frames_keep_the_choice(blobs, monkeypatch):
 
 
 def test_other_lights_are_another_choice(blobs):
-    """The choice is kept for as many lights and the same settings alone."""
+    """The choice is reused for the same settings and number of lights alone."""
     choices = []
     for lights in ({"light": scenes.light("env")}, {"light": scenes.light("point")}):
         loaded = scenes.scene(blobs, nrf(max_error=0.3), lights, size=16, spp=1)
@@ -179,7 +179,7 @@ def chosen_in(blobs, monkeypatch, budget: float, each):
 @pytest.mark.parametrize(("march", "other", "visibility"), [
     (1e-4, 1e-5, "raymarch"), (50.0, 1e-3, "transmittance_map")])
 def test_a_budget_takes_what_errs_least_in_its_time(blobs, monkeypatch, march, other, visibility):
-    """Noise and bias together: a march of many samples has none of either, one of a fifth of a sample has much."""
+    """The error has noise and bias: a slow march has much noise, a fast one has little."""
     composition, choice = chosen_in(blobs, monkeypatch, 10.0, lambda s: march if s.visibility == "raymarch" else other)
     assert composition.effects.visibility == visibility
     assert choice.predicted["seconds"] == 10.0 and choice.predicted["error"] <= choice.predicted["bound"]

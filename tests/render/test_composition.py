@@ -1,4 +1,4 @@
-"""Several fields, surfaces and depths in one scene: against stock ``volpath`` and against closed forms."""
+"""Several fields, surfaces and depths in one scene, against stock ``volpath`` and closed forms."""
 
 import mitsuba as mi
 import numpy as np
@@ -22,8 +22,10 @@ def nrf(visibility="raymarch", **options):
 
 
 def room(field, floor=None, lamp=False) -> dict:
-    """Beside the object of `scenes.scene`: itself once more, half as large, turned, and maybe a floor, a ball, a
-    lamp."""
+    """Return shapes beside the object of `scenes.scene`.
+
+    They are the object once more, half as large and rotated, and optionally a floor with a ball, and a lamp.
+    """
     to_world, centre = mi.ScalarTransform4f, list(scenes.SIMILARITY.center)
     place = to_world().translate(TURN).rotate([0, 1, 0], 120)
     shapes = {
@@ -65,8 +67,11 @@ METAL = {"type": "roughconductor", "alpha": 0.2}
     ],
 )
 def test_agrees_with_volpath(blobs, light, floor, lamp, depth):
-    """Two fields of one file, floor and ball, every kind of shadow and bounce among them: z-test per 4×4 block; 8×8
-    block means of direct light within 3 %, four times volpath's noise in them; the mean of all bounces within 2 %."""
+    """Test shadows and bounces of two fields of one file, a floor and a ball.
+
+    The z-test is per 4×4 block. Means of 8×8 blocks of direct light agree within 3 %, four times volpath's noise. The
+    mean of all bounces agrees within 2 %.
+    """
     options = {"light_samples": 2} if light in (None, "env") else {}
     lights = {"light": scenes.light(light)} if light else {}
 
@@ -92,7 +97,7 @@ TOWARDS = np.array([0.6, 0.64, 0.48])
 
 
 def chord(p, d, centre, radius, length=np.inf):
-    """Length of the part of the rays p + t d, 0 < t < `length`, inside a ball."""
+    """Return the length of the part of the rays p + t d, 0 < t < `length`, inside a ball."""
     rel = p - centre
     b = rel @ d
     h = np.sqrt(np.maximum(b * b - (rel * rel).sum(-1) + radius**2, 0))
@@ -100,7 +105,10 @@ def chord(p, d, centre, radius, length=np.inf):
 
 
 def overlap_by_quadrature(balls, x, y, steps=1500):
-    """Single scattering by a midpoint rule along parallel view rays at (x, y), light of irradiance 1 from `TOWARDS`."""
+    """Return single scattering by a midpoint rule along parallel view rays at (x, y).
+
+    The light has irradiance 1 and comes from `TOWARDS`.
+    """
     balls = [(np.array(centre), radius, sigma / radius) for centre, radius, sigma in balls]
     view, total = np.array([0.0, 0.0, -1.0]), np.zeros((*x.shape, 3))
     passed = np.zeros(x.shape)
@@ -155,7 +163,7 @@ def test_overlapping_fields_against_quadrature(tmp_path, balls, visibility):
 
 
 def test_shapes_that_shine_and_what_hides_them(blobs):
-    """The lamp is seen with its radiance and covers; `hide_emitters` leaves it out, its light stays."""
+    """The picture shows the lamp with its radiance; `hide_emitters` removes the lamp but not its light."""
     shapes = {"lamp": {"type": "sphere", "center": [0.4, -0.2, 3.0], "radius": 0.3,
                        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [7, 6, 5]}}}}  # fmt: skip
     options = {"size": 16, "spp": 64, "shapes": shapes}
@@ -174,7 +182,7 @@ def test_shapes_that_shine_and_what_hides_them(blobs):
 
 
 def test_a_shape_hides_the_field_behind_it(blobs):
-    """A black wall through the middle of the object: nothing of what lies behind it is seen, whatever the step."""
+    """Matter behind a black wall through the middle of the object is invisible for any step size."""
     centre = scenes.SIMILARITY.center
     wall = {"wall": {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate(list(centre)).scale(9),
                      "bsdf": {"type": "diffuse", "reflectance": 0.0}}}  # fmt: skip
@@ -197,7 +205,7 @@ def test_a_foreign_medium_is_refused(blobs):
 
 @pytest.mark.parametrize("floor", [None, DIFFUSE])
 def test_chunks_that_meet_nothing(blobs, monkeypatch, floor):
-    """A row of pixels at a time: the first see no matter at all."""
+    """Chunks are rows of pixels, the first of which see no matter."""
     lights = {"light": scenes.light("directional")}
     scene = scenes.scene(blobs, nrf(max_depth=3), lights, size=16, spp=16, shapes=room(blobs, floor))
     whole = scenes.render(scene, 0)
@@ -209,8 +217,7 @@ def test_chunks_that_meet_nothing(blobs, monkeypatch, floor):
 
 @pytest.mark.parametrize("bsdf", [{"type": "dielectric"}, {"type": "diffuse"}, {"type": "thindielectric"}, None])
 def test_a_bound_that_is_a_surface_is_refused(blobs, bsdf):
-    """A statue in a glass ball whose shape is the glass: volpath would refract there, so nothing must be drawn
-    silently without."""
+    """A bound of glass is refused, since volpath would refract there."""
     loaded = scenes.scene(None, nrf(), {"light": scenes.light("point")}, size=8, spp=1, shapes={
         "ball": {k: v for k, v in (scenes.ball(blobs) | {"bsdf": bsdf}).items() if v}})  # fmt: skip
     with pytest.raises(Exception) as caught:
@@ -219,8 +226,11 @@ def test_a_bound_that_is_a_surface_is_refused(blobs, bsdf):
 
 
 def test_a_sun_among_many_lights_is_marched_to(monkeypatch):
-    """Under a sky whose sun is most of its light, a picture by the atlas is the march's: 0.2 % off, without that 3 %,
-    all of it around the sun's shadow. A sun that dim lights are left out beside is one still."""
+    """Under a sky whose sun is most of its light, the atlas gives the march's picture.
+
+    The error is 0.2 %; without marched suns it is 3 %, around the sun's shadow. Leaving out dim lights does not change
+    the suns.
+    """
     loaded = shipped.scene("statue", "sky", 48, 4)
 
     def picture(visibility):
@@ -250,7 +260,7 @@ def test_suns_of_the_table_and_of_sampled_lights():
 
 @pytest.mark.parametrize(("count", "bright", "expected"), [(64, 1, 1), (64, 6, 4), (15, 1, 0), (64, 0, 0)])
 def test_suns_are_few_of_many(count, bright, expected):
-    """Those that bring a tenth of all light each, the brightest where more than one in sixteen does."""
+    """Suns have a tenth of all light each, and there is at most one for sixteen lights."""
     lights = {f"light_{i}": {"type": "directional", "direction": [0.0, np.sin(i), np.cos(i)],
                              "irradiance": 50.0 + i if i < bright else 0.2} for i in range(count)}
     found = scene_lights.Lights(mi.load_dict({"type": "scene", **lights})).suns()

@@ -1,4 +1,4 @@
-"""What a scene does not call for is not there: its code raises if it is reached, and kernels are shorter without it."""
+"""Effects that a scene lacks are not computed: their code is not reached, and kernels are shorter."""
 
 import drjit as dr
 import mitsuba as mi
@@ -28,7 +28,7 @@ def floor():
 
 
 def forbid(monkeypatch, owner, name):
-    """`owner.name` raises when it is called."""
+    """Make `owner.name` raise when it is called."""
 
     def called(*_, **__):
         raise AssertionError(f"{name} was called")
@@ -41,7 +41,7 @@ def described(scene) -> effects.Effects:
 
 
 def operations(scene) -> int:
-    """Arithmetic operations in all kernels of one render."""
+    """Return the number of arithmetic operations in all kernels of one render."""
     scenes.render(scene, 0)  # field, maps
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
@@ -51,7 +51,7 @@ def operations(scene) -> int:
 
 
 def test_light_at_the_camera_needs_no_visibility(blobs, monkeypatch):
-    """It agrees with the march towards the light, and builds nothing."""
+    """The picture agrees with the march towards the light, and nothing is built."""
     scene = scenes.scene(blobs, nrf(samples=768), lamp(), size=24, spp=64)
     with monkeypatch.context() as general:
         general.setattr(effects, "_at_camera", lambda *_: False)
@@ -66,7 +66,7 @@ def test_light_at_the_camera_needs_no_visibility(blobs, monkeypatch):
 
 
 def test_light_beside_the_camera_is_not_at_it(blobs):
-    """A millionth of the way counts as there, a hundredth does not; nor does a light without a camera at all."""
+    """A millionth of the distance counts as at the camera, a hundredth does not."""
     near, beside = (lamp([EYE[0] + shift, *EYE[1:]]) for shift in (5e-6, 5e-2))
     assert described(scenes.scene(blobs, nrf(), near, size=8)).collocated
     assert not described(scenes.scene(blobs, nrf(), beside, size=8)).collocated
@@ -88,7 +88,7 @@ def test_no_shapes_no_rays(blobs, monkeypatch):
 
 
 def test_diffuse_field_has_no_specular_lobe(tmp_path, monkeypatch):
-    """A lobe of 1/1000 is left out: the image stays, the kernel shrinks."""
+    """A lobe of 1/1000 is left out: the image stays, and the kernel is shorter."""
     path = scenes.write_blobs(tmp_path, log_density=3.0, specular=1e-3, roughness=0.9)
     scene = scenes.scene(path, nrf(), {"light": scenes.light("point")}, size=24, spp=16)
     with monkeypatch.context() as general:
@@ -104,7 +104,7 @@ def test_diffuse_field_has_no_specular_lobe(tmp_path, monkeypatch):
 
 
 def test_fresnel_effect_is_that_of_fields_trained_with_it(tmp_path, monkeypatch):
-    """However rough; other fields never ask for it."""
+    """Other fields do not evaluate it, however rough they are."""
     paths = (scenes.write_blobs(tmp_path / str(rim), log_density=3.0, specular=0.041 if rim else 1e-3, roughness=0.99,
                                 fresnel=rim) for rim in (False, True))
     faint, scene = (scenes.scene(p, nrf(), {"light": scenes.light("point")}, size=24, spp=16) for p in paths)
@@ -127,7 +127,7 @@ def test_gloss_is_the_highest_lobe_in_matter(tmp_path):
 
 @pytest.mark.parametrize("visibility_name", ["raymarch", "transmittance_map"])
 def test_dark_lights_light_nothing(blobs, monkeypatch, visibility_name):
-    """A light of no power: opacity only, no map, no shading."""
+    """A light of zero power gives opacity only, without map and shading."""
     forbid(monkeypatch, building, "build")
     forbid(monkeypatch, shade, "reflect")
     image = scenes.render(scenes.scene(blobs, nrf(visibility_name), lamp(intensity=0.0), size=16))
@@ -146,7 +146,7 @@ def test_empty_field_is_not_marched(tmp_path, monkeypatch):
 
 
 def test_field_outside_the_view_is_not_marched(blobs, monkeypatch):
-    """Beside and behind the camera; at the border of the picture it counts as seen."""
+    """Fields beside and behind the camera are outside; a field at the border is in view."""
     scene = scenes.scene(blobs, nrf(), {"light": scenes.light("point")}, size=8, spp=4)
     parameters = mi.traverse(scene)
     centre = list(scenes.SIMILARITY.center)

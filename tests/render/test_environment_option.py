@@ -1,4 +1,4 @@
-"""``--env FILE --env-rotate DEG --env-scale S``: by what arrives from each direction, wherever the emitter stands."""
+"""``--env FILE --env-rotate DEG --env-scale S``, by the radiance from each direction, for emitters anywhere."""
 
 from pathlib import Path
 
@@ -60,13 +60,13 @@ def write(folder: Path, light: str, integrator="path", inside="", name="scene.xm
 
 
 def seen(path: Path, directions: np.ndarray, environment: Environment | None = None) -> np.ndarray:
-    """(n, 3) radiance from `directions` (n, 3)."""
+    """Return the radiance (n, 3) from `directions` (n, 3)."""
     [emitter] = scene_file.load(path, {}, environment).emitters()
     return radiance(emitter, directions)
 
 
 def about(axis: str, degrees: float, d: np.ndarray) -> np.ndarray:
-    """`d` (n, 3) turned counter-clockwise, seen from the tip of the axis."""
+    """Return `d` (n, 3) rotated counter-clockwise, seen from the tip of the axis."""
     i = "xyz".index(axis)
     j, k = (i + 1) % 3, (i + 2) % 3
     angle, result = np.radians(degrees), d.copy()

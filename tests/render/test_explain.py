@@ -1,4 +1,4 @@
-"""`mi-ntf explain`: what is said is what is done."""
+"""`mi-ntf explain` says what a render does."""
 
 import json
 import re
@@ -17,7 +17,7 @@ SCENE = Path(__file__).parents[2] / "scenes" / "statue" / "scene.xml"
 
 
 def with_integrator(folder: Path, properties: str) -> Path:
-    """The shipped scene under its point light, with more `properties` of the integrator."""
+    """Return the shipped scene under its point light, with further `properties` of the integrator."""
     text = SCENE.read_text().replace("field.safetensors", str(SCENE.parent / "field.safetensors"))
     text = text.replace('"light_$light.xml"', f'"{SCENE.parent}/light_point.xml"')
     text = text.replace("sensor.xml", str(SCENE.parent / "sensor.xml"))
@@ -37,7 +37,7 @@ def test_point_light_by_name():
 
 
 def test_what_is_held_for_a_field():
-    """Whatever the lights: 36² maps of 51² texels of two logistics, four halves each."""
+    """Tables of a field do not depend on lights: 36² maps of 51² texels of two logistics, four halves each."""
     one, many = (explain(SCENE, {"visibility": "transmittance_atlas", "light": light, "res": "16", "depth": "2"})
                  for light in ("point", "env"))
     assert one["memory_bytes"]["maps or volumes"] == many["memory_bytes"]["maps or volumes"] == 2 * 36**2 * 51**2 * 8
@@ -46,7 +46,7 @@ def test_what_is_held_for_a_field():
 
 
 def test_a_sun_that_is_marched_to(tmp_path):
-    """A sky's, beside which an atlas is looked up; named methods of other kinds have none."""
+    """The sun of a sky is marched beside an atlas; other methods have no marched sun."""
     sky = '<emitter type="sunsky"><vector name="sun_direction" x="0.4" y="0.5" z="0.7"/></emitter>'
     text = re.sub(r'<include filename="light_\$light.xml"/>', sky, SCENE.read_text())
     assert sky in text
@@ -60,7 +60,7 @@ def test_a_sun_that_is_marched_to(tmp_path):
 
 
 def test_auto_counts_camera_rays_times_lights():
-    """Against the 3.4 million rays of an atlas, of which the sentence speaks."""
+    """The reason compares the rays with the 3.4 million rays of an atlas."""
     few, many = (explain(SCENE, {"light": "env", "res": res, "spp": "1", "depth": "2"}) for res in ("16", "96"))
     assert few["visibility"] == "raymarch" and many["visibility"] == "transmittance_atlas"
     assert many["lights"]["count"] == 512
@@ -85,7 +85,7 @@ def test_maps_of_mixtures_take_four_times_the_memory(tmp_path):
 
 
 def test_memory_of_maps_is_bounded(tmp_path):
-    """512 lights of 288 KiB each, 14 of which fit into 4 MiB."""
+    """Of 512 lights with 288 KiB each, 14 fit into 4 MiB."""
     scene = with_integrator(tmp_path, '<float name="map_memory" value="4"/>')
     light = f'<include filename="{SCENE.parent}/light_point.xml"/>'
     scene.write_text(scene.read_text().replace(light, '<emitter type="constant"/>'))
@@ -94,7 +94,7 @@ def test_memory_of_maps_is_bounded(tmp_path):
 
 
 def test_environments_state_their_error(tmp_path, capsys):
-    """Fewer lights, more error: an even sky's 512 cells are 3.8° wide, its bound 0.48 %."""
+    """Fewer lights err more; 512 cells of an even sky are 3.8° wide, with a bound of 0.48 %."""
     light, found = f'<include filename="{SCENE.parent}/light_point.xml"/>', []
     for count in (32, 512):
         scene = with_integrator(tmp_path, f'<integer name="environment_lights" value="{count}"/>')
@@ -119,7 +119,7 @@ def test_table_names_every_effect(capsys):
 
 @pytest.mark.slow
 def test_measured_beside_predicted(tmp_path, capsys):
-    """In a process of its own: Dr.Jit counts the memory of all that lives in one."""
+    """It runs in its own process, since Dr.Jit counts the memory of the whole process."""
     words = ("-Dvisibility=transmittance_map", "-Dlight=point", "-Dres=128", "-Dspp=16", "-Ddepth=2", "--measure",
              "--json")
     done = run_program("mi-ntf", "explain", SCENE, *words, cwd=tmp_path)
@@ -135,7 +135,7 @@ def test_measured_beside_predicted(tmp_path, capsys):
 
 
 def test_what_is_built_is_part_of_a_render():
-    """Patches that light bounces between count as built, as maps do; a march of single scattering builds nothing."""
+    """Patches count as built, as maps do; a march of single scattering builds nothing."""
     built = {}
     for depth, visibility in (("2", "raymarch"), ("2", "transmittance_map"), ("6", "raymarch")):
         scene = load_scene(SCENE, {"light": "point", "visibility": visibility, "res": "16", "spp": "1", "depth": depth})

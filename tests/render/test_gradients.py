@@ -25,7 +25,7 @@ def setting(blobs, lights, visibility, **options):
 @pytest.mark.parametrize("mode", [forward, backward])
 @pytest.mark.parametrize("visibility", ["raymarch", "transmittance_map"])
 def test_intensity(blobs, visibility, mode):
-    """The image is linear in it: the difference's rounding is all that may differ."""
+    """The image is linear in the intensity, so only rounding differs."""
     scene, parameters = setting(blobs, {"light": scenes.light("point")}, visibility)
     case = scene, parameters, "light.intensity.value", [1.0, 0.5, 0.2], mi.Color3f
     assert mode(*case) == pytest.approx(differences(*case, 10.0), rel=1e-3)
@@ -34,9 +34,11 @@ def test_intensity(blobs, visibility, mode):
 @pytest.mark.parametrize("mode", [pytest.param(forward, marks=pytest.mark.slow), backward])
 @pytest.mark.parametrize(("light_samples", "rel"), [(0, 0.01), (4, 0.05)])
 def test_environment_texels(blobs, light_samples, rel, mode):
-    """A patch of texels brightens. Exhaustively, cells and their centres of radiance move with them, which the
-    derivative leaves out (0.1 % here); drawn lights come from the old map in the one and from the new maps in the other
-    (4 % noise)."""
+    """A patch of texels becomes brighter.
+
+    In the exhaustive sum, cells and their centres move with it, which the derivative leaves out (0.1 % here). Sampled
+    lights come from the old map in one picture and from new maps in the other (4 % noise).
+    """
     lights = {"light": scenes.light("env")}
     scene, parameters = setting(blobs, lights, "raymarch", environment_lights=128, light_samples=light_samples)
     patch = np.zeros(parameters["light.data"].shape, np.float32)
@@ -49,8 +51,11 @@ def test_environment_texels(blobs, light_samples, rel, mode):
     (forward, "raymarch"), *((backward, v) for v in ("raymarch", "neural_transmittance", "transmittance_map", "none")),
     *(pytest.param(forward, v, marks=pytest.mark.slow) for v in ("neural_transmittance", "transmittance_map", "none"))])
 def test_position(blobs, visibility, mode):
-    """The light's distance, its angle, its shadows and the horizon, where the phase function jumps, move. Maps and
-    networks stay: derivatives are the march's. Differences see its steps: from 0.05 to 0.1 they vary by 1 %."""
+    """The light's distance, angle, shadows and the horizon, where the phase function jumps, move.
+
+    Derivatives are the march's even with maps and networks. Differences depend on its steps: from 0.05 to 0.1 they vary
+    by 1 %.
+    """
     scene, parameters = setting(blobs, {"light": scenes.light("point")}, "raymarch")
     case = scene, parameters, "light.position", [-0.3, -0.6, 1.0], mi.Point3f
     truth = differences(*case, 0.1)
@@ -64,7 +69,7 @@ def test_position(blobs, visibility, mode):
 
 @pytest.mark.parametrize("other", ["field", "floor"])
 def test_position_moves_shadows_on_other_things(blobs, other):
-    """Of one field on another, and of a field on a surface: all that the camera sees."""
+    """Shadows of one field on another, and of a field on a surface, move."""
     up = mi.ScalarTransform4f()
     if other == "floor":
         lying = up.translate([0.4, -1.8, 0.3]).rotate([1, 0, 0], -90).scale(6)

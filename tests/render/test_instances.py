@@ -17,7 +17,7 @@ def ball(**more) -> dict:
 
 
 def instances() -> dict:
-    """A group of a ball, which is not seen itself, at each of the places."""
+    """Return a group of a ball, which is invisible itself, and an instance at each of the places."""
     move = mi.ScalarTransform4f().translate
     at = {f"at_{i}": {"type": "instance", "to_world": move(p), "group": {"type": "ref", "id": "group"}}
           for i, p in enumerate(PLACES)}
@@ -37,7 +37,7 @@ def scene(blobs, integrator: dict, shapes: dict, **options):
 
 @pytest.mark.parametrize("options", [{}, {"max_depth": 4}, {"max_error": 0.05, "visibility": "auto"}])
 def test_instances_are_what_is_written_out(blobs, options):
-    """They hide the field, shade it and the floor, and reflect."""
+    """Instances hide the field, cast shadows on it and the floor, and reflect."""
     pictures = [
         scenes.render(scene(blobs, scenes.nrf(**options), shapes, size=16, spp=16))
         for shapes in (instances(), written_out(), {})
@@ -57,7 +57,7 @@ def test_instances_beside_stock_volpath(blobs, depth):
 
 
 def test_a_field_in_a_group_is_refused(blobs):
-    """Also beside one that stands in no group."""
+    """It is refused even beside a field that is in no group."""
     group = {"group": {"type": "shapegroup", "inner": scenes.ball(blobs)},
              "at": {"type": "instance", "group": {"type": "ref", "id": "group"}}}
     for field in (None, blobs):

@@ -1,4 +1,4 @@
-"""The ``nrf`` integrator against stock ``volpath`` on the same field, analytic fields, the mesh, its own promises."""
+"""The ``nrf`` integrator against stock ``volpath``, analytic fields and meshes."""
 
 import dataclasses
 import time
@@ -24,7 +24,7 @@ def renders(path, integrator, kind, spp, **options):
 @pytest.mark.slow  # test_lights.py compares every emitter, in larger blocks
 @pytest.mark.parametrize("kind", ["directional", "point", "env"])
 def test_agrees_with_volpath(blobs, kind):
-    """The same single scattering by delta tracking: z-test per 4×4 block, and 8×8 block means within 2 %."""
+    """Single scattering agrees with delta tracking: z-test per 4×4 block, 8×8 block means within 2 %."""
     # The environment in both as Mitsuba samples it: `light_samples` draws from the very map.
     extra = {"light_samples": 2} if kind == "env" else {}
     ours = renders(blobs, nrf(samples=1024, **extra), kind, 64, size=48, sampler="multijitter")
@@ -40,7 +40,7 @@ def test_agrees_with_volpath(blobs, kind):
 
 
 def test_environment_as_directional_lights(blobs):
-    """The exhaustive sum over texels equals Mitsuba's sampling of the map, up to where in its texel a light sits."""
+    """The exhaustive sum equals Mitsuba's sampling, apart from the position of a light in its texel."""
     sampled = np.mean(renders(blobs, nrf(light_samples=8), "env", 16, size=32), 0)
     summed = scenes.render(
         scenes.scene(blobs, nrf(environment_lights=128), {"light": scenes.light("env")}, spp=16, size=32)
@@ -51,7 +51,7 @@ def test_environment_as_directional_lights(blobs):
 
 
 def test_map_and_network_field_agree_with_grid(blobs):
-    """`transmittance_map` against `raymarch`; the network as the field against its baked grid."""
+    """`transmittance_map` agrees with `raymarch`, and the networks with their baked grid."""
     lights = {"light": scenes.light("directional")}
     march = scenes.render(scenes.scene(blobs, nrf(), lights, spp=64))
     tmap = scenes.render(scenes.scene(blobs, nrf("transmittance_map"), lights, spp=64), seed=1)
@@ -75,7 +75,7 @@ def test_empty_field_is_black_and_clear(tmp_path):
 
 
 def ball_scene(path, integrator, lights, size=32, spp=64, resolution=256):
-    """A field of identity similarity seen along −z by an orthographic camera over [−1, 1]²."""
+    """Return a field of identity similarity seen along −z by an orthographic camera over [−1, 1]²."""
     return mi.load_dict({
         "type": "scene",
         "integrator": integrator,
@@ -95,7 +95,7 @@ HEAD_ON = {"light": {"type": "directional", "direction": [0, 0, -1], "irradiance
 
 
 def test_opaque_sphere_is_a_lambert_sphere(tmp_path):
-    """L = k E cos θ/π on a sphere lit from the camera; no light is lost to a self-shadow beyond the skin's own."""
+    """L = k E cos θ/π on a sphere lit from the camera; self-shadows are the skin's own alone."""
     path = tmp_path / "opaque.safetensors"
     header, tensors = fields.blobs([(0, 0, 0)], [0.8], log_density=6.4, edge=60, albedo=(0.5, 0.5, 0.5), specular=1e-6)
     field_file.save(path, header, tensors, np.float32)
@@ -131,7 +131,7 @@ def test_uniform_ball_has_the_closed_form_opacity(tmp_path):
 
 
 def side(image) -> np.ndarray:
-    """Unit vector in the picture from the middle of the silhouette to the middle of the light on it."""
+    """Return the unit vector in the picture from the middle of the silhouette to the middle of the light on it."""
     y, x = np.mgrid[: image.shape[0], : image.shape[1]]
     middle = [np.array([(w * x).sum(), (w * y).sum()]) / w.sum() for w in (image[..., :3].sum(-1), image[..., 3])]
     shift = middle[0] - middle[1]
@@ -140,7 +140,7 @@ def side(image) -> np.ndarray:
 
 
 def test_orientation(blobs):
-    """Lit from the same side by nrf, volpath, and path on spheres in the field's place, by both kinds of light."""
+    """nrf, volpath, and path on spheres in the field's place show light from the same side."""
     similarity = scenes.SIMILARITY
     spheres = {
         f"s{i}": {
@@ -170,7 +170,7 @@ def test_orientation(blobs):
 
 
 def test_background_and_alpha(blobs):
-    """With visible emitters the environment shows through, and pixels are opaque; hidden, alpha is the opacity."""
+    """A visible environment makes pixels opaque; with a hidden one alpha is the opacity."""
     lights = {"light": scenes.light("env")}
     shown = scenes.render(scenes.scene(blobs, nrf("none", hide_emitters=False), lights))
     hidden = scenes.render(scenes.scene(blobs, nrf("none"), lights))
@@ -183,7 +183,7 @@ def test_background_and_alpha(blobs):
 
 
 def test_seeds_spp_and_chunks(blobs, monkeypatch):
-    """One seed, one image; another seed, another; chunks of pixels change the noise, not the mean."""
+    """One seed gives one image; chunks of pixels change the noise but not the mean."""
     loaded = scenes.scene(blobs, nrf(), {"light": scenes.light("point")}, size=32)
     first = scenes.render(loaded, 3)
     # Samples are added to their pixels atomically, in any order: float32 sums differ in the last bits.
@@ -218,14 +218,14 @@ def test_timeout_ends_early(blobs, monkeypatch):
 
 
 def test_develop_false_leaves_the_image_in_the_film(blobs):
-    """What the stock program does: render(develop=False), then the film writes."""
+    """The stock program calls render(develop=False) and then writes the film."""
     loaded = scenes.scene(blobs, nrf("none"), {"light": scenes.light("point")}, size=16)
     loaded.integrator().render(loaded, 0, seed=5, spp=4, develop=False)
     np.testing.assert_allclose(np.array(loaded.sensors()[0].film().develop()), scenes.render(loaded, 5, 4), atol=1e-6)
 
 
 def test_placement_by_to_world_and_scale(tmp_path):
-    """Twice the size, rotated, moved, with the light moved along and brightened by the square: the same image."""
+    """An object of twice the size, moved with its light, which is brightened by the square, looks the same."""
     path = scenes.write_blobs(tmp_path)
     plain = scenes.render(scenes.scene(path, nrf(), {"light": scenes.light("point")}, spp=64))
     place = mi.ScalarTransform4f().translate([1, 2, -1]).rotate([0, 1, 0], 70)
@@ -259,7 +259,7 @@ def test_placement_by_to_world_and_scale(tmp_path):
 
 @pytest.mark.parametrize(("planes", "voxels"), [((), 192), ((64, 90), 192), ((192, 64), 384), ((1024,), 512)])
 def test_voxels_follow_the_finest_planes(planes, voxels):
-    """Two a texel, 192 at least, 512 at most."""
+    """There are two voxels per texel, 192 to 512."""
     kind = "planes" if planes else "frequency"
     network = dataclasses.replace(FAST.density, encoding=Encoding(kind, planes, 1 if planes else 0))
     assert loaded.voxels(Header(dataclasses.replace(FAST, density=network))) == voxels

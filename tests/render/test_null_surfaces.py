@@ -1,4 +1,4 @@
-"""Surfaces that let light through: in front of lights, of fields and of the camera, against stock ``volpath``."""
+"""Surfaces that let light through before lights, fields and the camera, against stock ``volpath``."""
 
 from pathlib import Path
 
@@ -22,7 +22,7 @@ PANE = {"type": "thindielectric", "specular_transmittance": {"type": "rgb", "val
 
 
 def sheet(place, size: float, bsdf: dict) -> dict:
-    """A square of half side `size` that faces the object, at `place` relative to its centre."""
+    """Return a square of half side `size` that faces the object, at `place` relative to its centre."""
     look = mi.ScalarTransform4f().look_at((CENTER + place).tolist(), CENTER.tolist(), [0, 1, 0.1])
     return {"type": "rectangle", "to_world": look @ mi.ScalarTransform4f().scale(size), "bsdf": bsdf}
 
@@ -62,7 +62,7 @@ SLOW = "leaf and floor, area", "null case around the camera, depth 3", "leaf at 
 
 @pytest.mark.parametrize("case", [pytest.param(c, marks=[pytest.mark.slow] * (c in SLOW)) for c in CASES])
 def test_agrees_with_volpath(blobs, case):
-    """z-test per 4×4 block, and means of 8×8 blocks within 2 % and four times their noise."""
+    """The z-test is per 4×4 block; means of 8×8 blocks agree within 2 % and four times their noise."""
     shapes, lights, options = CASES[case]
     draws = {"light_samples": 2} if "env" in lights else {}
     lights = {name: scenes.light(name) for name in lights}
@@ -83,7 +83,7 @@ def test_agrees_with_volpath(blobs, case):
 
 
 def test_further_outputs_behind_a_pane(blobs):
-    """Depth, normals and visibility of what lies behind a sheet, by the share of the rays that cross it."""
+    """Depth, normals and visibility behind a sheet have the fraction of the rays that cross it."""
     wanted = "depth, normal, albedo, opacity, visibility_lights"
     clear = {**LEAF, "opacity": 0.25, "nested": {"type": "diffuse"}}
 
@@ -104,7 +104,7 @@ def test_further_outputs_behind_a_pane(blobs):
 
 
 def test_runs_of_lights_behind_a_pane(blobs):
-    """Lights whose maps do not fit into memory together, each run with its own choice of rays that cross the pane."""
+    """Each run of lights has its own choice of rays that cross the pane."""
     lights = {str(i): {**scenes.light("directional"), "direction": [-1, -1.2, 0.4 * i - 0.6]} for i in range(3)}
     shapes = {"pane": sheet(TO_CAMERA, 0.6, LEAF)}
 
@@ -117,7 +117,7 @@ def test_runs_of_lights_behind_a_pane(blobs):
 
 
 def test_places_of_lights_have_no_derivatives_through_surfaces(blobs):
-    """The slope of a mask's own opacity would be missing."""
+    """Derivatives are refused, since the slope of a mask's own opacity would be missing."""
     scene = scenes.scene(blobs, scenes.nrf(), {"light": scenes.light("point")}, size=4, spp=1,
                          shapes={"leaf": sheet(TO_LIGHT, 1.2, LEAF)})
     parameters = mi.traverse(scene)
@@ -130,8 +130,10 @@ def test_places_of_lights_have_no_derivatives_through_surfaces(blobs):
 
 
 def test_no_kernel_depends_on_how_many_rays_cross(blobs, tmp_path):
-    """Another seed, and so other numbers of rays behind each of four masks: every kernel comes from the cache. In a
-    process of its own: what other tests left scheduled would be part of kernels."""
+    """With another seed, and other numbers of rays behind each of four masks, every kernel is in the cache.
+
+    It runs in its own process, since scheduled work of other tests would be part of kernels.
+    """
     script = (f"import sys; sys.path[:0] = {[str(Path(__file__).parents[1]), str(Path(__file__).parent)]!r}\n"
               f"import mitsuba as mi; mi.set_variant({VARIANT!r})\nimport mi_ntf.render; mi_ntf.render.register()\n"
               "import test_null_surfaces; print(test_null_surfaces.compiled_by_another_seed(sys.argv[1]))")
@@ -140,7 +142,7 @@ def test_no_kernel_depends_on_how_many_rays_cross(blobs, tmp_path):
 
 
 def compiled_by_another_seed(path) -> list:
-    """Sizes of the kernels that a second picture of four masks compiles anew."""
+    """Print the sizes of the kernels that a second picture of four masks compiles."""
     sheets = {str(i): sheet((1 - 0.1 * i) * np.array(TO_CAMERA), 0.9, {**LEAF, "opacity": 0.3}) for i in range(4)}
     scene = scenes.scene(path, scenes.nrf(samples=64), {"light": scenes.light("point")}, size=16, spp=16, shapes=sheets)
     scenes.render(scene, 0)

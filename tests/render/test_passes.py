@@ -1,4 +1,4 @@
-"""Samples by limits of noise and time."""
+"""Numbers of samples under limits of noise and time."""
 
 import functools
 import math
@@ -20,7 +20,7 @@ def nrf(**options) -> dict:
 
 @pytest.mark.parametrize("weights", [(8, 8), (2, 14), (12, 4)])
 def test_noise_is_that_of_the_mean(weights):
-    """However samples are divided, within what 64² pixels tell: E|I − truth| over √truth."""
+    """The noise does not depend on how samples are divided, within the accuracy of 64² pixels."""
     rng = np.random.default_rng(0)
     truth = rng.uniform(0.2, 1, (64, 64, 3))
     one, other = (truth + 0.3 / math.sqrt(n) * rng.normal(size=truth.shape) for n in weights)
@@ -34,7 +34,10 @@ def test_black_pictures_have_no_noise():
 
 
 class Machine:
-    """A clock; a sample takes `each` seconds, the first pass `compiling` more, and noise falls by √n from `noise`."""
+    """Clock of a machine on which a sample takes `each` seconds.
+
+    The first pass takes `compiling` seconds more, and noise falls by √n from `noise`.
+    """
 
     def __init__(self, limits, each=0.1, compiling=2.0, noise=0.5):
         self.now, self.each, self.compiling, self.noise = 0.0, each, compiling, noise
@@ -64,7 +67,7 @@ def test_time_is_kept_and_used(each):
 
 
 def test_the_choice_is_no_pass():
-    """It takes of the budget, but a further pass need not fit into as much again."""
+    """The choice takes time of the budget, but a further pass need not last as long."""
     machine = Machine(Limits(seconds=20), each=0.5, compiling=0.0)
     machine.now = 12.0  # spent on the choice
     found = machine.run()
@@ -77,13 +80,13 @@ def test_the_first_limit_wins():
 
 
 def test_one_pass_when_there_is_no_time():
-    """A picture is a picture: what cannot be in time has one sample a pixel."""
+    """A picture has at least one sample per pixel, even if that exceeds the time."""
     found = Machine(Limits(seconds=1), each=5).run()
     assert (found.count, found.ended) == (1, "time")
 
 
 def test_noise_threshold_is_reached(blobs):
-    """Measured against a picture of many more samples."""
+    """The noise is measured against a picture of many more samples."""
     loaded = scenes.scene(blobs, nrf(noise_threshold=0.03), {"light": scenes.light("point")}, size=24)
     integrator = loaded.integrator()
     image = mi.render(loaded, seed=1).numpy()[..., :3]
@@ -97,14 +100,14 @@ def test_noise_threshold_is_reached(blobs):
 
 @functools.cache
 def smoke():
-    """A scene and its picture of 128 samples, noise 0.006."""
+    """Return a scene and its picture of 128 samples, with a noise of 0.006."""
     loaded = shipped.scene("cloud", "point", 48, 4)
     return loaded, shipped.picture(loaded, shipped.integrator(visibility="raymarch"), 100, 128)[0]
 
 
 @pytest.mark.parametrize(("threshold", "samples"), [(0.1, (2, 2)), (0.03, (4, 16))])
 def test_noise_of_smoke_is_reached(threshold, samples):
-    """Within 1.3 of what is asked for, or with the two samples that tell noise at all."""
+    """The noise is within a factor of 1.3 of the limit, or there are two samples, the least that can tell noise."""
     loaded, truth = smoke()
     nrf = shipped.integrator(visibility="raymarch", noise_threshold=threshold)
     image = shipped.picture(loaded, nrf, 1)[0]
@@ -115,7 +118,7 @@ def test_noise_of_smoke_is_reached(threshold, samples):
 
 
 def test_more_passes_are_the_same_picture(blobs):
-    """Depth, alpha and light of passes agree with one of as many samples; the film holds the last."""
+    """Depth, alpha and light of passes agree with one pass of as many samples, and the film holds them."""
     loaded = scenes.scene(blobs, nrf(noise_threshold=0.01, aovs="depth,opacity"), {"light": scenes.light("point")},
                           size=16,
                           film_options={"rfilter": {"type": "gaussian"}})
@@ -132,7 +135,7 @@ def test_more_passes_are_the_same_picture(blobs):
 
 
 def test_the_clock_waits_for_a_pass(blobs, monkeypatch):
-    """Kernels run beside the program: seconds that are read before they end would count for the next pass."""
+    """A pass ends with its kernels, whose time would count for the next pass otherwise."""
     events, sync, done = [], dr.sync_thread, passes.Passes.done
     monkeypatch.setattr(dr, "sync_thread", lambda: (events.append("wait"), sync()))
     monkeypatch.setattr(passes.Passes, "done", lambda self, *about: (events.append("read"), done(self, *about)))

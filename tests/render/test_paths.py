@@ -29,7 +29,7 @@ def smoke(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def furnace(nothing):
-    """``furnace(depth)``: pictures (SEEDS, 32, 32) by one sample a pixel from within the ball."""
+    """Return a function of the depth: pictures (SEEDS, 32, 32) by one sample per pixel from within the ball."""
     @cache
     def render(depth):
         scene = mi.load_dict({
@@ -46,8 +46,10 @@ def furnace(nothing):
 
 @pytest.mark.parametrize("depth", [2, 9])
 def test_radiance_of_a_furnace(furnace, depth):
-    """Sum of albedoᵏ over the bounces: emitter and BSDF samples share each bounce, and the paths that go on stand for
-    those that end at random. Z-test with 8192 paths."""
+    """The radiance is the sum of albedoᵏ over the bounces, by a z-test with 8192 paths.
+
+    Emitter and BSDF samples share each bounce, and surviving paths represent those that Russian roulette ends.
+    """
     values, truth = furnace(depth), (1 - ALBEDO**depth) / (1 - ALBEDO)
     error = values.std() / np.sqrt(values.size)
     assert error < 0.005 * truth  # measured 0.2 % at depth 9; at depth 2 samples of a ball from within do not vary
@@ -55,15 +57,17 @@ def test_radiance_of_a_furnace(furnace, depth):
 
 
 def test_renders_of_two_seeds_are_independent(furnace):
-    """Within 4 standard errors."""
+    """The correlation is 0 within 4 standard errors."""
     values = furnace(9)
     values = (values - values.mean()) / values.std()
     assert abs((values[1:] * values[:-1]).mean()) < 4 / np.sqrt(values[1:].size)
 
 
 def test_paths_of_neighbouring_pixels_are_independent(nothing):
-    """Of 16 suns of one direction each pixel draws one: pairs of neighbours draw all 256 pairs equally often, by χ² of
-    65536 pixels. Random streams that begin at one place and differ in their increments alone do not."""
+    """Neighbours sample all 256 pairs of 16 suns equally often, by χ² of 65536 pixels.
+
+    The suns have one direction. Streams with equal starts and different increments would fail.
+    """
     suns = {f"sun_{i}": pictures.sun((0, 0, 1), np.pi * (i + 1)) for i in range(16)}
     scene = mi.load_dict({
         "type": "scene", "integrator": {"type": "nrf", "visibility": "raymarch"},
@@ -79,9 +83,11 @@ def test_paths_of_neighbouring_pixels_are_independent(nothing):
 
 
 def test_light_from_field_to_field(tmp_path):
-    """Two balls of smoke, a lamp on one of them; of the other the camera sees what the first one scatters, a fifth of
-    the picture's light. Against volpath by a z-test of 4×4 block means, and in the mean of that half within 6 %, four
-    standard errors."""
+    """Light of one ball of smoke on another agrees with volpath.
+
+    A lamp lights one ball; the camera sees what the other scatters, a fifth of the picture's light. The z-test is of
+    4×4 block means; the mean of that half agrees within 6 %, four standard errors.
+    """
     balls = {}
     for name, x in (("left", -1.2), ("right", 1.2)):
         smoke = fields.uniform(4.0, similarity=Similarity((x, 0.0, 0.0), 1.0), albedo=(0.9,) * 3, specular=0.05)
@@ -103,7 +109,7 @@ def test_light_from_field_to_field(tmp_path):
 
 @pytest.mark.parametrize(("across", "chord"), [(0.0, 2.0), (0.8, 1.2), (1.5, 0.0)])
 def test_a_mirrored_lamp_is_dimmed_by_the_field_before_it(smoke, across, chord):
-    """A ball of smoke, outside of the picture, between a mirror and the lamp that it shows: e^(−σ chord)."""
+    """A ball of smoke between a mirror and a lamp attenuates its reflection by e^(−σ chord)."""
     to_world = mi.ScalarTransform4f().translate([0, 0, -2])
     image = pictures.render("raymarch", {
         "sensor": pictures.camera((-6, across, 1), (-2.4, across, -2), fov=0.01, size=2),

@@ -1,4 +1,4 @@
-"""The pilot: places, errors with their bounds, and random numbers that all ways to render share."""
+"""Places of the pilot's rays, errors with their bounds, and random numbers that all candidates share."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ LEAF = {"type": "rectangle", "to_world": mi.scalar_rgb.ScalarTransform4f().trans
 
 
 def look_of(loaded, **changed):
-    """A function of settings' changes that returns the pilot's look, and the pilot."""
+    """Return a function of changes of the settings that gives the pilot's look, and the pilot."""
     sensor = loaded.sensors()[0]
     one = pilot.Pilot(sensor, find_media(loaded))
     settings = loaded.integrator().context.settings
@@ -34,7 +34,7 @@ def look_of(loaded, **changed):
 
 
 def test_weights_make_means_of_the_picture(rng):
-    """Means of any function over the square, whatever boxes hold more places: here of an indicator, by a z-test."""
+    """Weighted means estimate means over the picture for any boxes, here of an indicator, by a z-test."""
     boxes = [(np.array([0.1, 0.2]), np.array([0.3, 0.25])), (np.array([0.2, 0.1]), np.array([0.9, 0.8]))]
     places, weight = pilot._places(4096, boxes)
     assert weight.sum() == pytest.approx(1, abs=0.02)
@@ -45,7 +45,7 @@ def test_weights_make_means_of_the_picture(rng):
 
 
 def some_looks(rng, one, bias: float, noise: float):
-    """A truth and a look that is off by a `bias` common to both samples and a `noise` of each."""
+    """Return a look and a truth that differ by a `bias` common to both samples and a `noise` of each."""
     truth = rng.uniform(0.5, 1.5, (len(one.weight), 1, 3)) * np.ones((1, pilot.SAMPLES, 1))
     shape = (len(one.weight), 1, 1)
     off = bias * rng.normal(size=shape) + noise * rng.normal(size=(len(one.weight), pilot.SAMPLES, 1))
@@ -61,7 +61,7 @@ def one(blobs):
 
 @pytest.mark.parametrize(("bias", "noise", "samples"), [(0.02, 0.0, 4), (0.02, 0.1, 16), (0.0, 0.05, 4)])
 def test_errors_are_those_of_pictures(rng, one, bias, noise, samples):
-    """Bias and the noise that a picture's samples leave; the bound lies above in nearly all of 200 pilots."""
+    """The estimate has the bias and the picture's noise; the bound is above in nearly all of 200 pilots."""
     expected = np.hypot(bias, noise / np.sqrt(samples))
     found = [one.error(*some_looks(rng, one, bias, noise), samples) for _ in range(200)]
     squares = np.array([e.estimate**2 for e in found])
@@ -77,7 +77,7 @@ def test_a_black_truth_has_no_error(one):
 
 
 def test_noise_is_that_of_a_picture(blobs):
-    """One sample a pixel, box filter: against the spread of eight pictures, within what they and 1024 pixels tell."""
+    """The noise of one sample per pixel agrees with the spread of eight pictures, within their accuracy."""
     loaded = scenes.scene(blobs, scenes.nrf(light_samples=1), {"light": scenes.light("env")}, size=48, spp=1)
     look, one = look_of(loaded)
     pictures = np.stack([scenes.render(loaded, seed)[..., :3] for seed in range(8)])
@@ -88,7 +88,7 @@ def test_noise_is_that_of_a_picture(blobs):
 @pytest.mark.parametrize("options", [
     {"max_depth": 2}, {"max_depth": 4, "bounces": "paths"}, {"max_depth": 4, "bounces": "paths", "light_samples": 3}])
 def test_equal_settings_differ_by_nothing(blobs, options):
-    """With a floor, a lamp that is drawn, a leaf that lets light through, and further bounces."""
+    """The scene has a floor, a sampled lamp, a leaf that lets light through, and further bounces."""
     loaded = scenes.scene(blobs, scenes.nrf(**options), {"lamp": LAMP, "sky": scenes.light("env")},
                           shapes={"floor": FLOOR, "leaf": LEAF}, size=32, spp=4)
     look, one = look_of(loaded)
@@ -99,8 +99,11 @@ def test_equal_settings_differ_by_nothing(blobs, options):
 
 
 def test_what_is_left_out_changes_no_other_numbers(blobs):
-    """Rays that do not meet a field that is left out keep all of their random numbers, those of surfaces, bounces and
-    drawn lights: it is empty, but makes rays march through it, and other points come first in the arrays."""
+    """Rays that do not meet a removed field keep their random numbers.
+
+    These are the numbers of surfaces, bounces and sampled lights. The field is small, but rays march through it, and
+    its points come first in the arrays.
+    """
     small = scenes.Similarity((-0.7, 1.2, 0.3), 0.3)
     size = small.radius / scenes.SIMILARITY.radius
     place = mi.ScalarTransform4f().translate(
@@ -127,7 +130,7 @@ def test_what_is_built_is_told_from_what_grows(blobs):
 
 
 def test_evaluated_loops_have_prices(blobs):
-    """A launcher's flag: seconds are the clock's, whatever kernels look like."""
+    """Times are measured with evaluated loops, too, which a launcher's flag sets."""
     loaded = scenes.scene(blobs, scenes.nrf("transmittance_map"), {"light": scenes.light("point")}, size=16, spp=1)
     look, _ = look_of(loaded)
     with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False):
@@ -136,7 +139,7 @@ def test_evaluated_loops_have_prices(blobs):
 
 
 def test_seconds_of_work():
-    """Building is apart, kernels are summed, and the flag of the kernel history is the caller's again."""
+    """Building is counted separately, kernels are summed, and the caller's flag of the kernel history is restored."""
     def work():
         with timing.building():
             dr.eval(dr.arange(mi.Float, 1 << 20) + 1)

@@ -1,4 +1,4 @@
-"""The scene of ordinary shapes that rays are traced in: kept while no shape changes."""
+"""Scene of ordinary shapes for rays, which is reused until a shape changes."""
 
 import drjit as dr
 import mitsuba as mi
@@ -10,7 +10,7 @@ from mi_ntf.render.transport import surfaces
 
 
 def room() -> dict:
-    """A floor as a mesh and two instances of a ball."""
+    """Return a floor as a mesh and two instances of a ball."""
     floor = mi.Mesh("floor", 4, 2)
     parameters = mi.traverse(floor)
     parameters["vertex_positions"] = np.float32([[-4, -1.5, -4], [4, -1.5, -4], [4, -1.5, 4], [-4, -1.5, 4]]).ravel()
@@ -44,7 +44,7 @@ def test_shapes_are_built_again_when_one_moves(blobs, monkeypatch, name):
 
 
 def test_no_render_of_the_same_scene_compiles_again(blobs):
-    """Nor with another integrator object, which shares nothing that was built for the scene."""
+    """Another integrator object compiles nothing either, though it shares nothing that was built."""
     pane = {"type": "rectangle", "bsdf": {"type": "mask", "opacity": 0.5, "nested": {"type": "diffuse"}},
             "to_world": mi.ScalarTransform4f().translate([0, 0, 1.5])}
     lights = {"light": scenes.light("point"), "lamp": {"type": "point", "position": [2, 3, -1]}}

@@ -1,4 +1,4 @@
-"""Media of very unequal size, lamps behind walls, many runs of lights, paths of many bounces: exact answers."""
+"""Media of very unequal size, lamps behind walls, many runs of lights and bounces, against exact answers."""
 
 import time
 
@@ -23,7 +23,7 @@ def save(folder, name, header, tensors):
 
 
 def view(shapes: dict, lights: dict, options: dict, size=16, spp=64, width=1.0, centre=(0, 0, 0)):
-    """Orthographic view along −z of a square around `centre`, `width` to each side."""
+    """Return an orthographic view along −z of a square around `centre`, `width` to each side."""
     look = mi.ScalarTransform4f().look_at([*centre[:2], 400], list(centre), [0, 1, 0]).scale(width)
     sensor = {"type": "orthographic", "to_world": look, "far_clip": 1e5, "film": scenes.film(size),
               "sampler": {"type": "multijitter", "sample_count": spp}}  # fmt: skip
@@ -36,7 +36,7 @@ HEAD_ON = {"light": {"type": "directional", "direction": [0, 0, -1], "irradiance
 
 @pytest.mark.parametrize("order", ["fog first", "ball first"])
 def test_fog_beside_a_small_field_in_both_orders(tmp_path, order):
-    """A fog of radius 100 and optical depth 1 looks as it does alone, whichever shape comes first in the file."""
+    """A fog of radius 100 and optical depth 1 looks as it does alone, in either order of the shapes."""
     fog_place, ball_place = Similarity((0.0, 0.0, 0.0), 100.0), Similarity((0.0, 120.0, 0.0), 1.0)
     fog = save(tmp_path, "fog", *fields.uniform(0.5, similarity=fog_place))
     ball = save(tmp_path, "ball", *fields.blobs([(0, 0, 0)], [0.5], similarity=ball_place))
@@ -49,7 +49,7 @@ def test_fog_beside_a_small_field_in_both_orders(tmp_path, order):
 
 
 def test_a_small_field_inside_a_large_fog(tmp_path):
-    """Along the axis, lit and seen from the same side: fog before the ball and beside it in closed form."""
+    """Lit and seen along the axis, fog before and beside the ball has a closed form."""
     fog_place, ball_place = Similarity((0.0, 0.0, 0.0), 100.0), Similarity((0.0, 0.0, 20.0), 1.0)
     fog = save(tmp_path, "fog", *fields.uniform(0.2, similarity=fog_place, specular=1e-6))
     ball = save(tmp_path, "ball", *fields.blobs([(0, 0, 0)], [0.5], log_density=6, edge=30, similarity=ball_place))
@@ -76,7 +76,7 @@ def test_a_small_field_inside_a_large_fog(tmp_path):
     ids=str,
 )
 def test_a_lamp_in_opaque_matter_stays_dark(tmp_path, options):
-    """Optical depth 60 lies between the lamp and every point that is seen: nothing arrives, however strong it is."""
+    """No light passes the optical depth of 60 between a strong lamp and all visible points."""
     path = save(tmp_path, "ball", *fields.blobs([(0, 0, 0)], [0.8], log_density=5.0))
     lamp = {"lamp": {"type": "point", "position": [0.0, 0.0, 0.0], "intensity": 1e6}}
     image = view({"ball": scenes.ball(path, Similarity())}, lamp, options, spp=4)
@@ -86,7 +86,7 @@ def test_a_lamp_in_opaque_matter_stays_dark(tmp_path, options):
 
 
 def test_matter_in_the_shadow_of_a_far_surface(tmp_path):
-    """A wall 2·10⁴ radii behind the object: shadow rays from it end, and its lit part has the light that it should."""
+    """A wall 2·10⁴ radii behind the object stops shadow rays, and its lit part has the right radiance."""
     path = save(tmp_path, "ball", *fields.blobs([(0, 0, 0)], [0.8], log_density=5.0))
     far = {"far": {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -2e4]).scale(1e3)},
            "ball": scenes.ball(path, Similarity())}  # fmt: skip
@@ -102,7 +102,7 @@ def furnace(path, depth, **options):
 
 
 def test_further_bounces_add_nothing_to_a_convex_object(tmp_path):
-    """Light that leaves a convex skin is gone: the same picture at every depth, in a white furnace too."""
+    """A convex skin looks the same at every depth, in a white furnace as well."""
     path = save(tmp_path, "white", *fields.blobs([(0, 0, 0)], [0.8], log_density=6.4, edge=60, **WHITE))
     images = {depth: furnace(path, depth)[..., :3].mean() for depth in (2, 3, -1)}
     assert images[3] == pytest.approx(images[2], rel=0.01)
@@ -114,7 +114,7 @@ def test_further_bounces_add_nothing_to_a_convex_object(tmp_path):
 
 
 def test_a_stopped_render_shows_whole_light_or_none(blobs, monkeypatch):
-    """Three runs of lights, stopped in the last: pixels are as in the whole picture, or empty."""
+    """Stopped in the last of three runs, pixels are those of the whole picture or empty."""
     monkeypatch.setattr("mi_ntf.render.transport.rendering.CHUNK", 256)
     lights = {f"light_{i}": {"type": "point", "position": [3.4 - 2 * i, 3.0, 2.5], "intensity": 50.0} for i in range(3)}
     options = {"visibility": "transmittance_map", "map_resolution": 32, "map_memory": 32**2 * 8 / 2**20}
