@@ -49,8 +49,8 @@ def layers(field, names: str, lights=LIGHTS, spp=16, film="rgba", shapes=None, *
     })  # fmt: skip
     mi.render(scene)
     image = scene.sensors()[0].film().bitmap()
-    found = [f.name for f in image.struct_()]
-    return dict(zip(found, np.moveaxis(np.array(image), -1, 0), strict=True)), scene.integrator()
+    outputs = [f.name for f in image.struct_()]
+    return dict(zip(outputs, np.moveaxis(np.array(image), -1, 0), strict=True)), scene.integrator()
 
 
 def pixels():
@@ -61,23 +61,23 @@ def pixels():
 
 
 def test_ball(ball):
-    found, integrator = layers(ball, EVERY)
+    outputs, integrator = layers(ball, EVERY)
     x, y, rho = pixels()
     inner, outer = rho < 0.85, rho > 1.15
     z = np.sqrt(np.maximum(RADIUS**2 - x**2 - y**2, 0))
     # A pixel is 0.125 wide. At ρ = 0.85 depth falls by 0.2 within it, and curves by 0.02; the mean of 16 rays strays by
     # 0.015. The skin is 0.01 thick.
-    np.testing.assert_allclose(found["depth.T"][inner], (3 - z)[inner], atol=0.06)
-    normal = np.stack([found[f"normal.{c}"] for c in "XYZ"], -1)
+    np.testing.assert_allclose(outputs["depth.T"][inner], (3 - z)[inner], atol=0.06)
+    normal = np.stack([outputs[f"normal.{c}"] for c in "XYZ"], -1)
     np.testing.assert_allclose(np.linalg.norm(normal, axis=-1)[inner], 1, rtol=1e-4)
     np.testing.assert_allclose(normal[inner], np.stack([x, y, z], -1)[inner] / RADIUS, atol=0.06)
     for channel, value in zip("RGB", ALBEDO, strict=True):
-        np.testing.assert_allclose(found[f"albedo.{channel}"][inner], value, rtol=0.01)
-    np.testing.assert_allclose(found["roughness.Y"][inner], 0.5, rtol=0.01)
-    np.testing.assert_allclose(found["opacity.Y"][inner], 1, atol=1e-3)
-    np.testing.assert_allclose(found["opacity.Y"], found["A"], atol=1e-6)
+        np.testing.assert_allclose(outputs[f"albedo.{channel}"][inner], value, rtol=0.01)
+    np.testing.assert_allclose(outputs["roughness.Y"][inner], 0.5, rtol=0.01)
+    np.testing.assert_allclose(outputs["opacity.Y"][inner], 1, atol=1e-3)
+    np.testing.assert_allclose(outputs["opacity.Y"], outputs["A"], atol=1e-6)
     for name in integrator.aov_names():
-        assert (found[name][outer] == 0).all(), name
+        assert (outputs[name][outer] == 0).all(), name
 
 
 def test_visibility_of_the_ball(ball):
@@ -85,10 +85,10 @@ def test_visibility_of_the_ball(ball):
 
     E[τ] = E[T] under the weights = 1/2 for an opaque skin. Light from +x is as strong there, and 0 on the far side.
     """
-    found, integrator = layers(ball, EVERY, spp=64)
+    outputs, integrator = layers(ball, EVERY, spp=64)
     x, _, rho = pixels()
-    ahead, aside = found["visibility_lights.0.Y"], found["visibility_lights.1.Y"]
-    np.testing.assert_allclose(found["visibility.Y"], (ahead + aside) / 2, atol=1e-5)
+    ahead, aside = outputs["visibility_lights.0.Y"], outputs["visibility_lights.1.Y"]
+    np.testing.assert_allclose(outputs["visibility.Y"], (ahead + aside) / 2, atol=1e-5)
     np.testing.assert_allclose(ahead[rho < 0.7], 0.5, atol=0.03)  # 64 samples a pixel of spread 0.3, a march to 1 %
     assert (aside[(rho < 0.7) & (x < -0.2)] < 0.01).all()
     assert integrator.aov_names()[-2:] == ["visibility_lights.0.Y", "visibility_lights.1.Y"]
@@ -113,28 +113,28 @@ def test_soft_matter(tmp_path):
     """σ = 0.7 in the unit sphere: depth and opacity of exponential free flight."""
     path = tmp_path / "soft.safetensors"
     field_file.save(path, *fields.uniform(0.7), np.float32)
-    found, _ = layers(path, "depth,opacity", lights={}, spp=64)
+    outputs, _ = layers(path, "depth,opacity", lights={}, spp=64)
     x, y, _ = pixels()
     r = np.hypot(x, y)
     inner = r < 0.8
     h = np.sqrt(1 - r[inner] ** 2)
     opacity = 1 - np.exp(-1.4 * h)
     mean = 3 - h + 1 / 0.7 - 2 * h * np.exp(-1.4 * h) / opacity
-    np.testing.assert_allclose(found["opacity.Y"][inner], opacity, atol=0.01)  # h varies within a pixel
-    np.testing.assert_allclose(found["depth.T"][inner], mean, atol=0.01)
+    np.testing.assert_allclose(outputs["opacity.Y"][inner], opacity, atol=0.01)  # h varies within a pixel
+    np.testing.assert_allclose(outputs["depth.T"][inner], mean, atol=0.01)
 
 
 def test_wall_behind_the_ball(ball):
     wall = {"wall": {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -2]).scale(3),
                      "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.1, 0.2, 0.3]}}}}
-    found, _ = layers(ball, "depth,normal,albedo,opacity,roughness", shapes=wall)
+    outputs, _ = layers(ball, "depth,normal,albedo,opacity,roughness", shapes=wall)
     _, _, rho = pixels()
     outer = rho > 1.15
-    np.testing.assert_allclose(found["depth.T"][outer], 5, rtol=1e-5)
-    np.testing.assert_allclose(found["normal.Z"][outer], 1, rtol=1e-5)
-    np.testing.assert_allclose(found["albedo.B"][outer], 0.3, rtol=1e-5)
-    assert (found["opacity.Y"] > 0.999).all() and (found["roughness.Y"][outer] == 0).all()
-    np.testing.assert_allclose(found["albedo.B"][rho < 0.85], ALBEDO[2], rtol=0.01)
+    np.testing.assert_allclose(outputs["depth.T"][outer], 5, rtol=1e-5)
+    np.testing.assert_allclose(outputs["normal.Z"][outer], 1, rtol=1e-5)
+    np.testing.assert_allclose(outputs["albedo.B"][outer], 0.3, rtol=1e-5)
+    assert (outputs["opacity.Y"] > 0.999).all() and (outputs["roughness.Y"][outer] == 0).all()
+    np.testing.assert_allclose(outputs["albedo.B"][rho < 0.85], ALBEDO[2], rtol=0.01)
 
 
 def test_light_is_the_same_with_and_without(ball):
@@ -146,10 +146,10 @@ def test_light_is_the_same_with_and_without(ball):
 
 
 def test_unlit_scenes_have_outputs_too(ball):
-    found, _ = layers(ball, "depth,albedo", lights={}, film="rgb")
+    outputs, _ = layers(ball, "depth,albedo", lights={}, film="rgb")
     inner = pixels()[2] < 0.85
-    assert (found["R"] == 0).all()
-    np.testing.assert_allclose(found["albedo.R"][inner], ALBEDO[0], rtol=0.01)
+    assert (outputs["R"] == 0).all()
+    np.testing.assert_allclose(outputs["albedo.R"][inner], ALBEDO[0], rtol=0.01)
 
 
 def test_what_is_not_asked_for_is_not_traced(ball, monkeypatch):
@@ -158,15 +158,15 @@ def test_what_is_not_asked_for_is_not_traced(ball, monkeypatch):
 
     monkeypatch.setattr(aovs.Sums, "_visibility", refuse)
     monkeypatch.setattr(aovs.Sums, "add_surface", refuse)
-    found, _ = layers(ball, "depth,albedo")
-    assert found["depth.T"].max() > 0
+    outputs, _ = layers(ball, "depth,albedo")
+    assert outputs["depth.T"].max() > 0
     with pytest.raises(Exception, match="custom") as asked:
         layers(ball, "visibility")
     assert "traced" in str(asked.value.__cause__)
     monkeypatch.setattr(aovs.Sums, "add_field", refuse)
     monkeypatch.setattr(aovs, "Picture", refuse)
-    found, _ = layers(ball, "")
-    assert list(found) == ["R", "G", "B", "A"] and found["R"].max() > 0
+    outputs, _ = layers(ball, "")
+    assert list(outputs) == ["R", "G", "B", "A"] and outputs["R"].max() > 0
 
 
 @pytest.mark.parametrize(("text", "error"), [

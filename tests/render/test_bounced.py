@@ -19,8 +19,8 @@ SUN = pictures.sun((0.36, 0.48, 0.8))
 @pytest.fixture(scope="module")
 def skin(tmp_path_factory):
     """Return a diffuse sphere of radius ½ with a skin two voxels wide."""
-    made = fields.skin("sphere", log_density=5.0, scale=0.01, albedo=ALBEDO, specular=1e-5, roughness=0.9)
-    return pictures.save(tmp_path_factory.mktemp("skin"), (made.header, made.tensors))
+    field = fields.skin("sphere", log_density=5.0, scale=0.01, albedo=ALBEDO, specular=1e-5, roughness=0.9)
+    return pictures.save(tmp_path_factory.mktemp("skin"), (field.header, field.tensors))
 
 
 def look(spread: float = 0.0) -> dict:
@@ -56,10 +56,10 @@ def added_to_mesh(light: dict, depth: int) -> np.ndarray:
 def test_two_spheres_light_each_other_as_surfaces_do(skin, kind, depth):
     light = {"sun": SUN, "sky": {"type": "constant"}}[kind]
     things = {"sensor": look(), "light": light, **pair(skin)}
-    found = added("raymarch", things, depth, environment_lights=64, bounces="radiosity")
+    result = added("raymarch", things, depth, environment_lights=64, bounces="radiosity")
     mesh = added_to_mesh(light, depth)
     # Of what bounces add. Measured 6 to 9 %: the second voxel of a skin this wide is nearer to the other sphere still.
-    np.testing.assert_allclose(found, mesh, rtol=0.1, atol=5e-4)
+    np.testing.assert_allclose(result, mesh, rtol=0.1, atol=5e-4)
 
 
 def test_a_convex_body_gets_nothing_and_pictures_have_no_more_noise(skin):
@@ -130,8 +130,8 @@ def test_what_is_read_back_is_computed_once(variant):
 
 def test_a_field_that_no_line_meets(tmp_path):
     """A field of a thousandth of the sphere has no patches and renders without error."""
-    made = fields.blobs([(0.2, 0, 0)], [0.004], log_density=6.5, edge=2)
+    field = fields.blobs([(0.2, 0, 0)], [0.004], log_density=6.5, edge=2)
     things = {"sensor": pictures.camera((0, 0, 3), fov=1.0), "sun": SUN,
-              "ball": pictures.ball(pictures.save(tmp_path, made), resolution=64)}  # fmt: skip
+              "ball": pictures.ball(pictures.save(tmp_path, field), resolution=64)}  # fmt: skip
     image = pictures.render("raymarch", things, max_depth=-1)
     assert np.isfinite(image).all()

@@ -179,5 +179,5 @@ def test_a_pixel_sums_a_million_samples():
     block = camera.film.create_block()
     Reconstruction(block, camera).add(0, mi.Point2f(dr.full(mi.Float, 0.5, spp), 0.5),
                                       [dr.full(mi.Float, value, spp) for value in (0.1, 1 / 3)])
-    found = np.array(block.tensor()).ravel()[:2] / spp
-    np.testing.assert_allclose(found, np.float32([0.1, 1 / 3]), rtol=1e-6)
+    result = np.array(block.tensor()).ravel()[:2] / spp
+    np.testing.assert_allclose(result, np.float32([0.1, 1 / 3]), rtol=1e-6)

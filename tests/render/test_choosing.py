@@ -24,8 +24,8 @@ def clock(monkeypatch, each):
     plain = pilot.Pilot.look
 
     def look(self, compose):
-        seen = plain(self, compose)
-        return pilot.Look(seen.composition, seen.radiance, 0.0, each(seen.composition.settings), 1e-6, 0.0)
+        measured = plain(self, compose)
+        return pilot.Look(measured.composition, measured.radiance, 0.0, each(measured.composition.settings), 1e-6, 0.0)
 
     monkeypatch.setattr(pilot.Pilot, "look", look)
 
@@ -85,15 +85,15 @@ def test_a_named_method_stays(blobs):
     assert not any(t["taken"] for t in achieved["trials"][1:])
 
 
-@pytest.mark.parametrize(("what", "field", "lights", "options"), [
+@pytest.mark.parametrize(("omission", "field", "lights", "options"), [
     ("without specular lobes", {"log_density": 3.0, "specular": 0.06, "roughness": 0.9}, "point", {}),
     ("without further bounces", {"log_density": 3.0}, "point", {"max_depth": 4, "bounces": "paths"}),
     ("brightest lights", {"log_density": 3.0}, "lamps", {}),
 ])
-def test_what_hardly_shows_is_left_out(tmp_path, monkeypatch, what, field, lights, options):
+def test_what_hardly_shows_is_left_out(tmp_path, monkeypatch, omission, field, lights, options):
     """An effect is left out if it saves time and the picture's error stays below the limit."""
     cost = {"without specular lobes": lambda s: 1.0 + s.specular, "without further bounces": lambda s: float(
-        abs(s.max_depth)), "brightest lights": lambda s: float(s.brightest_lights or 100)}[what]
+        abs(s.max_depth)), "brightest lights": lambda s: float(s.brightest_lights or 100)}[omission]
     clock(monkeypatch, cost)
     shining = {"sun": scenes.light("point")}
     if lights == "lamps":
@@ -105,7 +105,7 @@ def test_what_hardly_shows_is_left_out(tmp_path, monkeypatch, what, field, light
         loaded = scenes.scene(path, nrf(visibility="raymarch", max_error=limit, **options), shining, size=24, spp=2,
                               shapes=FLOOR if options else None)
         image, truth, achieved = pictures(loaded, **options)
-        left_out = any(t["taken"] and what in t["name"] for t in achieved["trials"])
+        left_out = any(t["taken"] and omission in t["name"] for t in achieved["trials"])
         assert left_out == (limit == 0.3)
         assert relative(image, truth) <= limit and (relative(image, truth) > 0) == left_out
 

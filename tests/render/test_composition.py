@@ -263,8 +263,8 @@ def test_suns_are_few_of_many(count, bright, expected):
     """Suns have a tenth of all light each, and there is at most one for sixteen lights."""
     lights = {f"light_{i}": {"type": "directional", "direction": [0.0, np.sin(i), np.cos(i)],
                              "irradiance": 50.0 + i if i < bright else 0.2} for i in range(count)}
-    found = scene_lights.Lights(mi.load_dict({"type": "scene", **lights})).suns()
-    assert found.sum() == expected and len(found) == count
+    suns = scene_lights.Lights(mi.load_dict({"type": "scene", **lights})).suns()
+    assert suns.sum() == expected and len(suns) == count
     if expected:
         power = scene_lights.Lights(mi.load_dict({"type": "scene", **lights})).rows.power[:, 0]
-        assert power[found].min() >= np.sort(power)[-expected]
+        assert power[suns].min() >= np.sort(power)[-expected]

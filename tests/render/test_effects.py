@@ -150,12 +150,12 @@ def test_field_outside_the_view_is_not_marched(blobs, monkeypatch):
     scene = scenes.scene(blobs, nrf(), {"light": scenes.light("point")}, size=8, spp=4)
     parameters = mi.traverse(scene)
     centre = list(scenes.SIMILARITY.center)
-    seen = {}
+    in_view = {}
     for name, target in {"ahead": centre, "border": [3.1, 0, 0], "beside": [7, 0, 0], "behind": [2, 3, 11]}.items():
         parameters["sensor.to_world"] = mi.Transform4f().look_at(EYE, target, [0, 1, 0])
         parameters.update()
-        seen[name] = described(scene).in_view[0]
-    assert seen == {"ahead": True, "border": True, "beside": False, "behind": False}
+        in_view[name] = described(scene).in_view[0]
+    assert in_view == {"ahead": True, "border": True, "beside": False, "behind": False}
     forbid(monkeypatch, march, "camera_samples")
     assert (scenes.render(scene) == 0).all()
 

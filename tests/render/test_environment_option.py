@@ -96,19 +96,19 @@ def test_what_shone_from_a_direction_shines_from_the_turned_one_and_scaled(folde
 @pytest.mark.parametrize("kind", sorted(set(LIGHTS) - {"sunsky"}))
 def test_a_file_takes_the_place_and_keeps_placement_and_scale(folder, directions, kind):
     light, _ = LIGHTS[kind]
-    kept = "".join(part for part in (UP_Z, TILTED, '<float name="scale" value="3"/>') if part in light)
-    by_hand = f'<emitter type="envmap"><string name="filename" value="other.exr"/>{kept}</emitter>'
+    properties = "".join(part for part in (UP_Z, TILTED, '<float name="scale" value="3"/>') if part in light)
+    by_hand = f'<emitter type="envmap"><string name="filename" value="other.exr"/>{properties}</emitter>'
     expected = seen(write(folder, by_hand, name="hand.xml"), directions)
-    found = seen(write(folder, light), directions, Environment(folder / "other.exr"))
-    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4)
+    result = seen(write(folder, light), directions, Environment(folder / "other.exr"))
+    np.testing.assert_allclose(result, expected, rtol=1e-3, atol=1e-4)
 
 
 def test_in_place_of_a_sky_a_map_stands_upright(folder, directions):
     rows = np.linspace(1, 0, 8, dtype=np.float32)  # bright above, alike all around
     mi.Bitmap(np.tile(rows[:, None, None], (1, 16, 3))).write(str(folder / "rows.exr"))
-    found = seen(write(folder, LIGHTS["sunsky"][0]), directions, Environment(folder / "rows.exr"))
+    result = seen(write(folder, LIGHTS["sunsky"][0]), directions, Environment(folder / "rows.exr"))
     expected = 1 - np.arccos(np.clip(directions[:, 2], -1, 1)) / np.pi
-    np.testing.assert_allclose(found, np.tile(expected[:, None], 3), atol=1e-3)
+    np.testing.assert_allclose(result, np.tile(expected[:, None], 3), atol=1e-3)
 
 
 def test_a_scene_without_gets_one_beside_its_lights(folder, directions):

@@ -95,16 +95,17 @@ def test_memory_of_maps_is_bounded(tmp_path):
 
 def test_environments_state_their_error(tmp_path, capsys):
     """Fewer lights err more; 512 cells of an even sky are 3.8° wide, with a bound of 0.48 %."""
-    light, found = f'<include filename="{SCENE.parent}/light_point.xml"/>', []
+    light, environments = f'<include filename="{SCENE.parent}/light_point.xml"/>', []
     for count in (32, 512):
         scene = with_integrator(tmp_path, f'<integer name="environment_lights" value="{count}"/>')
         scene.write_text(scene.read_text().replace(light, '<emitter type="constant" id="sky"/>'))
         report = explain(scene, {"visibility": "none"})
         print_table(report)
-        found += report["environments"]
-    assert [e["lights"] for e in found] == [32, 512] and {e["emitter"] for e in found} == {"constant emitter (sky)"}
-    assert [e["irradiance_error_percent"] for e in found] == pytest.approx([5.5, 0.48], rel=0.05)
-    assert found[1]["radius_degrees"] == pytest.approx(3.83, rel=0.02)
+        environments += report["environments"]
+    assert [e["lights"] for e in environments] == [32, 512]
+    assert {e["emitter"] for e in environments} == {"constant emitter (sky)"}
+    assert [e["irradiance_error_percent"] for e in environments] == pytest.approx([5.5, 0.48], rel=0.05)
+    assert environments[1]["radius_degrees"] == pytest.approx(3.83, rel=0.02)
     assert "0.48 % of all light" in " ".join(capsys.readouterr().out.split())
     assert explain(SCENE, {"visibility": "none", "light": "point"})["environments"] == []
 
@@ -139,9 +140,9 @@ def test_what_is_built_is_part_of_a_render():
     built = {}
     for depth, visibility in (("2", "raymarch"), ("2", "transmittance_map"), ("6", "raymarch")):
         scene = load_scene(SCENE, {"light": "point", "visibility": visibility, "res": "16", "spp": "1", "depth": depth})
-        _, found = timing.once(scene, scene.integrator(), 1, 0)
-        built[depth, visibility] = found["build_seconds"]
-        assert found["build_seconds"] + found["compile_seconds"] < found["wall_seconds"]
+        _, seconds = timing.once(scene, scene.integrator(), 1, 0)
+        built[depth, visibility] = seconds["build_seconds"]
+        assert seconds["build_seconds"] + seconds["compile_seconds"] < seconds["wall_seconds"]
     assert built.pop(("2", "raymarch")) == 0 < min(built.values())
 
 

@@ -80,15 +80,15 @@ def test_position_moves_shadows_on_other_things(blobs, other):
         shift = {"to_world": up.translate(away)}
         shapes = {"second": {**scenes.ball(blobs, **shift), "center": [0.4 + away[0], -0.2 + away[1], 0.3 + away[2]]}}
         aim = {"origin": [-3.5, -1.4, 2.5], "target": [-3.5, -2.4, -2.1]}
-    found = []
+    values = []
     for visibility in ("raymarch", "none"):
         integrator = {"type": "nrf", "visibility": visibility, "hide_emitters": True, "samples": 256}
         scene = scenes.scene(blobs, integrator, {"light": scenes.light("point")}, size=12, spp=16, shapes=shapes)
         parameters = mi.traverse(scene)
         parameters["sensor.to_world"] = mi.Transform4f().look_at(**aim, up=[0, 1, 0])
         case = scene, parameters, "light.position", [-0.3, -0.6, 1.0], mi.Point3f
-        found += [differences(*case, 0.1), backward(*case)]
-    truth, slope, unshadowed, _ = found
+        values += [differences(*case, 0.1), backward(*case)]
+    truth, slope, unshadowed, _ = values
     assert abs(truth - unshadowed) > 0.5 * abs(truth)
     assert slope == pytest.approx(truth, rel=0.05)
 

@@ -266,5 +266,5 @@ def test_voxels_follow_the_finest_planes(planes, voxels):
 
 
 def test_a_scene_may_name_the_voxels(blobs):
-    for given, found in ((None, 256), (16, 16)):
-        assert loaded.load(str(blobs), given).grid.resolution == found
+    for resolution, voxels in ((None, 256), (16, 16)):
+        assert loaded.load(str(blobs), resolution).grid.resolution == voxels

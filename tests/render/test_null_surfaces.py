@@ -84,11 +84,11 @@ def test_agrees_with_volpath(blobs, case):
 
 def test_further_outputs_behind_a_pane(blobs):
     """Depth, normals and visibility behind a sheet have the fraction of the rays that cross it."""
-    wanted = "depth, normal, albedo, opacity, visibility_lights"
+    names = "depth, normal, albedo, opacity, visibility_lights"
     clear = {**LEAF, "opacity": 0.25, "nested": {"type": "diffuse"}}
 
     def outputs(shapes):
-        loaded = scenes.scene(blobs, scenes.nrf(aovs=wanted), {"l": scenes.light("directional")}, spp=64, size=16,
+        loaded = scenes.scene(blobs, scenes.nrf(aovs=names), {"l": scenes.light("directional")}, spp=64, size=16,
                               shapes=shapes)
         return np.array(mi.render(loaded))[..., 4:]
 

@@ -54,24 +54,24 @@ class Machine:
 
 
 def test_noise_ends_it():
-    found = Machine(Limits(noise=0.02)).run()
-    assert found.ended == "noise" and found.noise <= 0.02
-    assert 625 <= found.count <= 625 * 9 / 8  # (0.5/0.02)², and the least that a pass adds
+    end = Machine(Limits(noise=0.02)).run()
+    assert end.ended == "noise" and end.noise <= 0.02
+    assert 625 <= end.count <= 625 * 9 / 8  # (0.5/0.02)², and the least that a pass adds
 
 
 @pytest.mark.parametrize("each", [1e-4, 0.02, 0.7])
 def test_time_is_kept_and_used(each):
-    found = Machine(Limits(seconds=20), each=each).run()
-    assert found.ended in ("time", "samples") and found.seconds <= 20
-    assert found.seconds >= 18 or found.count == passes.MOST
+    end = Machine(Limits(seconds=20), each=each).run()
+    assert end.ended in ("time", "samples") and end.seconds <= 20
+    assert end.seconds >= 18 or end.count == passes.MOST
 
 
 def test_the_choice_is_no_pass():
     """The choice takes time of the budget, but a further pass need not last as long."""
     machine = Machine(Limits(seconds=20), each=0.5, compiling=0.0)
     machine.now = 12.0  # spent on the choice
-    found = machine.run()
-    assert 18 <= found.seconds <= 20 and found.count >= 12
+    end = machine.run()
+    assert 18 <= end.seconds <= 20 and end.count >= 12
 
 
 def test_the_first_limit_wins():
@@ -81,8 +81,8 @@ def test_the_first_limit_wins():
 
 def test_one_pass_when_there_is_no_time():
     """A picture has at least one sample per pixel, even if that exceeds the time."""
-    found = Machine(Limits(seconds=1), each=5).run()
-    assert (found.count, found.ended) == (1, "time")
+    end = Machine(Limits(seconds=1), each=5).run()
+    assert (end.count, end.ended) == (1, "time")
 
 
 def test_noise_threshold_is_reached(blobs):
@@ -90,8 +90,8 @@ def test_noise_threshold_is_reached(blobs):
     loaded = scenes.scene(blobs, nrf(noise_threshold=0.03), {"light": scenes.light("point")}, size=24)
     integrator = loaded.integrator()
     image = mi.render(loaded, seed=1).numpy()[..., :3]
-    found = integrator.achieved
-    assert found["ended"] == "noise" and found["noise"] <= 0.03 and found["passes"] > 2
+    end = integrator.achieved
+    assert end["ended"] == "noise" and end["noise"] <= 0.03 and end["passes"] > 2
     plain = mi.load_dict(nrf())
     truth = np.mean([mi.render(loaded, integrator=plain, seed=s, spp=1024).numpy()[..., :3] for s in (2, 3)], axis=0)
     off = np.abs(image - truth).sum() / np.sqrt(np.maximum(truth.sum(-1), 0)).sum()

@@ -74,11 +74,11 @@ def test_paths_of_neighbouring_pixels_are_independent(nothing):
         "sensor": pictures.camera((0, 0, 2), fov=20.0, size=256), **suns,
         "floor": {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": 1.0}},
         "field": pictures.ball(nothing, resolution=16)})  # fmt: skip
-    drawn = scenes.render(scene, 1, 1)[..., 0] / 16 - 1  # each for all 16
-    np.testing.assert_allclose(drawn, np.round(drawn), atol=1e-4)
-    drawn = np.round(drawn).astype(int)
+    sampled = scenes.render(scene, 1, 1)[..., 0] / 16 - 1  # each for all 16
+    np.testing.assert_allclose(sampled, np.round(sampled), atol=1e-4)
+    sampled = np.round(sampled).astype(int)
     for shift in ((0, 1), (0, 2), (0, 3), (1, 0)):
-        pairs = 16 * drawn + np.roll(drawn, shift, (0, 1))
+        pairs = 16 * sampled + np.roll(sampled, shift, (0, 1))
         assert scipy.stats.chisquare(np.bincount(pairs.ravel(), minlength=256)).pvalue > 1e-4
 
 

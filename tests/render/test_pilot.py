@@ -63,12 +63,12 @@ def one(blobs):
 def test_errors_are_those_of_pictures(rng, one, bias, noise, samples):
     """The estimate has the bias and the picture's noise; the bound is above in nearly all of 200 pilots."""
     expected = np.hypot(bias, noise / np.sqrt(samples))
-    found = [one.error(*some_looks(rng, one, bias, noise), samples) for _ in range(200)]
-    squares = np.array([e.estimate**2 for e in found])
+    errors = [one.error(*some_looks(rng, one, bias, noise), samples) for _ in range(200)]
+    squares = np.array([e.estimate**2 for e in errors])
     # The mean of squares has a spread of its own; estimates below 0 are cut, at most half of them without a bias.
     assert squares.mean() == pytest.approx(expected**2, abs=4 * squares.std() / np.sqrt(200) + 0.02 * expected**2)
-    assert np.mean([e.bound >= expected for e in found]) > 0.95
-    assert np.median([e.bound for e in found]) < 1.5 * expected
+    assert np.mean([e.bound >= expected for e in errors]) > 0.95
+    assert np.median([e.bound for e in errors]) < 1.5 * expected
 
 
 def test_a_black_truth_has_no_error(one):
@@ -134,8 +134,8 @@ def test_evaluated_loops_have_prices(blobs):
     loaded = scenes.scene(blobs, scenes.nrf("transmittance_map"), {"light": scenes.light("point")}, size=16, spp=1)
     look, _ = look_of(loaded)
     with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False):
-        found = look()
-    assert found.built > 0 and found.each > 0
+        measured = look()
+    assert measured.built > 0 and measured.each > 0
 
 
 def test_seconds_of_work():

@@ -61,8 +61,8 @@ def test_a_small_field_inside_a_large_fog(tmp_path):
     beside, before = (full * (1 - np.exp(-2 * 0.2 * length)) / 2 for length in (1.0, 0.795))
     np.testing.assert_allclose(both[0, 0, :3], beside, rtol=0.03)  # voxels of 1/64 at the rim
     assert both[0, 0, 3] == pytest.approx(1 - np.exp(-0.4), abs=0.01)
-    seen = both[7:9, 7:9, :3].mean((0, 1)) - np.exp(-0.4 * 0.795) * alone[7:9, 7:9, :3].mean((0, 1))
-    np.testing.assert_allclose(seen, before, rtol=0.04)
+    brightness = both[7:9, 7:9, :3].mean((0, 1)) - np.exp(-0.4 * 0.795) * alone[7:9, 7:9, :3].mean((0, 1))
+    np.testing.assert_allclose(brightness, before, rtol=0.04)
 
 
 @pytest.mark.parametrize(

@@ -82,8 +82,8 @@ class Camera:
         ray = mi.Ray3f(differential)
         if dr.width(ray) < n:  # a sensor whose rays are all the same
             ray = dr.gather(mi.Ray3f, ray, dr.zeros(mi.UInt32, n))
-        # The sampler gives the numbers of a pixel's first sample, and the lattice spreads the others evenly. Much of the
-        # noise depends on where in the skin the samples of a ray lie.
+        # The sampler gives the numbers of a pixel's first sample, and the lattice spreads the others evenly. The noise
+        # depends on where in the skin the samples of a ray lie.
         index, spp = dr.arange(mi.UInt32, n), dr.opaque(mi.UInt32, self.spp)
         first_sample = index // spp * spp
         numbers = []
