@@ -1,0 +1,1 @@
+"""The commands ``explain``, ``bake`` and ``cache``."""

@@ -1,0 +1,1 @@
+"""Emitters of a scene as lights of its fields."""

@@ -71,21 +71,13 @@ class EmitterSamples:
     each would scatter to the viewer without shadows (Talbot et al. 2005). The light is weighted so that its expected
     value is the sum over all emitters.
 
-    Parameters
-    ----------
-    weights
-        Probabilities of the emitters, in any scale.
-    points
-        Shading points in the field coordinates of `frame`.
-    seed
-        Opaque unsigned integer.
-    count
-        Lights per point, each of an emitter selected by weight; 0: ``SAMPLES`` lights of each emitter, or 1 if it has
-        no extent.
-    least
-        Least number of lights, of all emitters together or of each with an extent.
-    gradients
-        Emitters or points are attached. The selected candidate is then sampled once more.
+    weights    probabilities of the emitters, in any scale
+    points     shading points in the field coordinates of `frame`
+    seed       opaque unsigned integer
+    count      lights per point, each of an emitter selected by weight; 0: ``SAMPLES`` lights of each emitter, or 1 if
+               it has no extent
+    least      least number of lights, of all emitters together or of each with an extent
+    gradients  emitters or points are attached; the selected candidate is then sampled once more
     """
 
     moving = False

@@ -114,22 +114,14 @@ def integrate(image: np.ndarray, latitude: Axis, longitude: Axis) -> np.ndarray:
 class Cells:
     """Parts of the sphere, each of which becomes a directional light.
 
-    Attributes
-    ----------
-    axes
-        Latitudes and longitudes of the map that is cut.
-    bounds
-        ``Bounds`` of each cell, (n, 4).
-    power
-        (n, 3) irradiance, ∫ L dω.
-    direction
-        (n, 3) unit vector to the centre of radiance, in the map's own axes.
-    weight
-        (n,) ∫ w dω, see :func:`integrate`.
-    focus
-        (n,) |∫ w ω dω| / weight, 1 if all light comes from one point.
-    solid_angle
-        (n,) in sr.
+    axes         latitudes and longitudes of the map that is cut
+    bounds       (n, 4) ``Bounds`` of each cell
+    power        (n, 3) irradiance, ∫ L dω
+    direction    (n, 3) unit vector to the centre of radiance, in the map's own axes
+    weight       (n,) integral of the absolute radiance, ∫ w dω with w = Σ |L| over the colours
+    focus        (n,) |∫ w ω dω| / weight, which is 1 if all light comes from one point, and 0 if it comes from all
+                 sides alike
+    solid_angle  (n,) in sr
     """
 
     axes: tuple[Axis, Axis]

@@ -39,15 +39,8 @@ class Version:
     other variable gets its index meanwhile. Neither the objects nor anything that carries gradients is stored, since
     these would outlive their scene.
 
-    Parameters
-    ----------
-    owners
-        Type of the objects, `objects` themselves or nested ones, whose parameters count.
-
-    Attributes
-    ----------
-    attached : bool
-        True if a parameter carries gradients.
+    `owners`: type of the objects, `objects` themselves or nested ones, whose parameters count; `attached`: True if a
+    parameter carries gradients.
     """
 
     def __init__(self, *objects: mi.Object, owners: type = object) -> None:

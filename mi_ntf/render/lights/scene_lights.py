@@ -35,38 +35,22 @@ class LightGroup(NamedTuple):
 class Lights:
     """The emitters of a scene, sorted once per render.
 
-    Parameters
-    ----------
-    media
-        The scene's ``nrf`` media. An ``ntf`` emitter with one of them is replaced by the light that it wraps, since the
-        integrator casts the shadows of these media itself.
-    light_samples
-        0: every discrete light at every point, environments by cells, and a few samples of each other emitter;
-        n: n samples per point of all emitters together.
-    environment_lights
-        Largest number of directional lights that represent an environment.
-    brightest
-        Number of rows that shine, those that bring most light to the fields; 0: all.
-    only
-        Numbers of the emitters that shine; None: all.
+    media               the scene's ``nrf`` media. An ``ntf`` emitter with one of them is replaced by the light that it
+                        wraps, since the integrator casts the shadows of these media itself.
+    light_samples       0: every discrete light at every point, environments by cells, and a few samples of each other
+                        emitter; n: n samples per point of all emitters together
+    environment_lights  largest number of directional lights that represent an environment
+    brightest           number of rows that shine, those that bring most light to the fields; 0: all
+    only                numbers of the emitters that shine; None: all
 
-    Attributes
-    ----------
-    kinds : list of str
-        Plugin name of each emitter.
-    sampled : list of mi.Emitter
-        Emitters that are sampled at random.
-    discrete : list of Discrete
-        The others, each with its rows.
-    rows : Rows
-        All rows in scene coordinates.
-    background : bool
-        True if one of the emitters is an environment, which is visible behind everything else.
+    kinds       plugin name of each emitter
+    sampled     emitters that are sampled at random
+    discrete    the others, each with its rows
+    rows        all rows in scene coordinates
+    background  True if one of the emitters is an environment, which is visible behind everything else in the
+                scene
 
-    Raises
-    ------
-    MiNtfError
-        If an emitter has non-finite values, or cannot be sampled.
+    Raises MiNtfError if an emitter has non-finite values, or cannot be sampled.
     """
 
     def __init__(self, scene: mi.Scene, media: Sequence[NRFMedium] = (), light_samples: int = 0,
@@ -135,12 +119,7 @@ class Lights:
                 gradients: bool = False) -> list[LightGroup]:
         """Return the light sources to sum over at `points`, in the coordinates of `frame`.
 
-        Parameters
-        ----------
-        table
-            Lights of the table that shine.
-        least_samples, gradients
-            As for :class:`EmitterSamples`.
+        `table`: lights of the table that shine; `least_samples`, `gradients`: as for :class:`EmitterSamples`.
         """
         groups = [LightGroup(table, True)] if table.count else []
         if self.sampled:

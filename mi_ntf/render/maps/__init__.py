@@ -1,0 +1,1 @@
+"""Visibility methods and their maps, in memory and on disk."""

@@ -76,14 +76,10 @@ def size_per_field(name: str, medium: NRFMedium, table: LightTable, options: Opt
 
 
 def build(name: str, medium: NRFMedium, table: LightTable | None, options: Options) -> Visibility | None:
-    """Build a visibility method for `medium`, in its field coordinates.
+    """Build the visibility method `name`, which is not ``auto``, for `medium`, in its field coordinates.
 
-    Parameters
-    ----------
-    name
-        Name of the method, never ``auto``; ``none`` gives None.
-    table
-        Lights in the same coordinates, for which the method stores tables; None for sampled lights.
+    `table`: lights in the same coordinates, for which the method stores tables; None for sampled lights. The result is
+    None for ``none``.
     """
 
     def keep(make: Callable[..., TransmittanceMap], *, channels: int, step: float,

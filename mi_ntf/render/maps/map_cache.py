@@ -64,19 +64,12 @@ def cached(name: str, make: Callable[..., TransmittanceMap], count: int, limit: 
            dtype: np.dtype = FLOAT32, placed: bool = True) -> TransmittanceMap:
     """Return the map called `name` from memory or disk; make and store it if it is in neither.
 
-    Parameters
-    ----------
-    make
-        Makes the map: ``make()`` computes the texels, ``make(values)`` takes stored ones.
-    count, dtype
-        Number and type of the map's numbers.
-    limit
-        Bytes that maps in memory may take, this one included. A larger map is not stored there.
-    light_keys, make_part
-        Keys of the lights (:func:`light_keys`), if parts of a map in memory may be reused. ``make_part(rows)`` then
-        makes the map of the remaining lights.
-    placed
-        The map depends on the places of lights.
+    make          makes the map: ``make()`` computes the texels, ``make(values)`` takes stored ones
+    count, dtype  number and type of the map's numbers
+    limit         bytes that maps in memory may take, this one included; a larger map is not stored there
+    light_keys    :func:`light_keys`, if parts of a map in memory may be reused
+    make_part     ``make_part(rows)`` makes the map of some lights
+    placed        the map depends on the places of lights
     """
     mode, size = user_cache.mode(), dtype.itemsize * count
     if mode == "off":

@@ -40,16 +40,9 @@ def is_medium(props: mi.Properties) -> bool:
 
 
 class Reader:
-    """Values of the properties of a plugin.
+    """Values of the properties of a plugin, which messages call `plugin`.
 
-    Parameters
-    ----------
-    plugin
-        Name of the plugin in messages.
-    legal
-        Names of its properties. Other names raise MiNtfError.
-    nested
-        Nested objects are allowed; their names are arbitrary.
+    Raises MiNtfError for names that are not in `legal`. If `nested`, there may be nested objects of any name.
     """
 
     def __init__(self, props: mi.Properties, plugin: str, legal: tuple[str, ...], nested: bool = False) -> None:
