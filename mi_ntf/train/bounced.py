@@ -21,17 +21,10 @@ SIDE = 8
 
 
 class Bounced:
-    """Irradiance of the skin by bounced light of all photographs' flashes.
+    """Irradiance of the skin by bounced light of all photographs' flashes, of radiant intensity `power` (views, 3).
 
-    Parameters
-    ----------
-    flash
-        The lights of all photographs.
-    power
-        Radiant intensities (views, 3), as ``Rays.light``.
-    room
-        Logarithm (3,) of the light that the room reflects from all sides, relative to the light that arrives from the
-        flash at the centre of the sphere. None: a dark room.
+    `room` is the logarithm (3,) of the light that the room reflects from all sides; None means a dark room. It is
+    relative to the light that arrives from the flash at the centre of the sphere.
     """
 
     def __init__(self, flash: Flash, power: torch.Tensor, room: torch.Tensor | None = None):

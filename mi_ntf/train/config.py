@@ -71,7 +71,7 @@ class FastConfig:
     augmentation: bool = True
     """Learn transmittance on rays of all directions, not only on those of the cameras."""
     colour_loss: bool = True
-    """Also compare pixels lit by the learned transmittance with the photographs."""
+    """Compare pixels lit by the learned transmittance with the photographs, too."""
     bounces: bool = True
     """The photographs contain light of the flash that the object throws on itself."""
     gains: bool = True

@@ -53,14 +53,9 @@ class Course:
 
 
 class Fast:
-    """The recipe ``fast``.
+    """The recipe ``fast``; with `estimate` it searches the position of the flash beside the lens.
 
-    Parameters
-    ----------
-    estimate
-        Estimate the position of the flash beside the lens.
-    field
-        Tensors of a finished field of the same data, whose transmittance networks alone are trained.
+    `field` are tensors of a finished field of the same data, whose transmittance networks alone are trained.
     """
 
     def __init__(self, config: FastConfig, run: Run, estimate: bool = False,
@@ -71,7 +66,7 @@ class Fast:
         self.generator = run.generator
         self.config = config = config.sharpened(self.data.pixel_width)
         self.field_until = config.ntf_alone
-        self.networks = parallel.share(networks.initial(config.architecture, config.log_density, self.generator))
+        self.networks = parallel.distributed(networks.initial(config.architecture, config.log_density, self.generator))
         pool = self.data.train
         self.gains = Gains(pool) if config.gains and not self.data.splits["train"].calibrated else None
         self.room = None if self.gains is None else torch.nn.Parameter(torch.full((3,), math.log(ROOM)))
@@ -125,8 +120,6 @@ class Fast:
         """See :class:`mi_ntf.train.recipe.Recipe`."""
         return self.occupancy
 
-    # --- state ----------------------------------------------------------------------------------------------------
-
     def parameters(self) -> Tensors:
         """See :class:`mi_ntf.train.recipe.Recipe`."""
         if self.gains is None or self.room is None:
@@ -158,8 +151,6 @@ class Fast:
         self.marched.log_sigma, self.marched.reach = state["log_sigma"], state["reach"]
         if self.bounced is not None:
             self.bounced.restore(state["bounced"])
-
-    # --- schedule -------------------------------------------------------------------------------------------------
 
     def carve(self, steps: int = 300, points: int = 4096) -> None:
         """Give the density the shape of the visual hull, by regression of ln σ: seconds that save minutes."""
@@ -241,8 +232,6 @@ class Fast:
         if self.clock.progress >= (self.config.ntf_from if self.at_lens else self.config.shadows_from):
             self.marched.update(self.networks, self.occupancy)
         self.course.last_bake = self.clock.step
-
-    # --- steps ----------------------------------------------------------------------------------------------------
 
     def sample_rays(self, count: int, generator: torch.Generator) -> rays.Rays:
         """Return about `count` random camera rays that meet the visual hull, with the pieces that do."""

@@ -1,8 +1,8 @@
 """Light of a flash that is not at the lens: its position, its shadows, and the light that points scatter.
 
-A cell of the camera's ray at the optical depth D from the camera has the depth D c_o/c_i for light that falls in at the
-cosine c_i to the normal, where the viewer's is c_o: skins are flat and thin compared with objects that throw shadows.
-So the whole skin, with the phase function ρ (c_i + c_o) of the field, scatters
+Let c_o and c_i be the cosines of viewer and light to the normal. Skins are flat and thin compared with objects that
+throw shadows, so a cell at the optical depth D from the camera has the depth D c_o/c_i from the light. The whole skin,
+with the phase function ρ (c_i + c_o) of the field, scatters
 
     L = Σ_j (e^{−(1 + c_o/c_i) D_j} − e^{−(1 + c_o/c_i) D_{j+1}}) V ρ c_i I/d²
 
@@ -36,16 +36,9 @@ CLEAR = 1.0
 
 
 class Flash:
-    """Lights of all photographs, split after split, in field coordinates.
+    """Lights of the `photographs`, split after split, in field coordinates.
 
-    Parameters
-    ----------
-    photographs
-        The photographs of all splits.
-    solid
-        True if the object has a skin.
-    marched
-        Density that throws shadows; it throws none before it is known.
+    `solid` is true if the object has a skin; `marched` is the density that throws shadows, once it is known.
     """
 
     def __init__(self, photographs: Sequence[Photographs], solid: bool, marched: TransmittanceTargets):

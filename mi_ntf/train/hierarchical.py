@@ -95,10 +95,10 @@ class Hierarchical:
             raise MiNtfError("the preset 'paper' needs a flash at the lens, and these photographs' is elsewhere; take "
                              "the preset 'fast'")
         self.config, self.data, self.learner, self.generator = config, run.data, run.learner, run.generator
-        self.networks = parallel.share(networks.initial(config.architecture, config.log_density, self.generator))
+        self.networks = parallel.distributed(networks.initial(config.architecture, config.log_density, self.generator))
         initial = networks.initial(config.architecture, config.log_density, self.generator)
         tensors = {k: v for k, v in initial.tensors.items() if k.split(".")[0] in FIELD}
-        self.coarse = parallel.share(Networks(config.architecture, tensors))
+        self.coarse = parallel.distributed(Networks(config.architecture, tensors))
         fine = self.networks.tensors.items()
         field = [v for k, v in fine if k.split(".")[0] in FIELD] + list(tensors.values())
         rest = [v for k, v in fine if k.split(".")[0] not in FIELD]

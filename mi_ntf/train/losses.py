@@ -54,8 +54,8 @@ def normals(image: Image, d: torch.Tensor, baked: NormalTargets) -> tuple[torch.
 def gloss(image: Image, least: float, fading: float, count: int) -> torch.Tensor:
     """Return the cost of specular weight s above its `least` value, (`fading` + ROUGH α⁴) s per ray, α = roughness².
 
-    A lobe of α = 1 adds the same light under a flash as a diffuse lobe of a quarter of its weight, and only the diffuse
-    one is right under other lights. Only sharp lobes explain sharp highlights, so their cost may fade during training.
+    Under a flash, a lobe of α = 1 adds the same light as a diffuse lobe of a quarter of its weight. Under other lights
+    only the diffuse one is right. Only sharp lobes explain sharp highlights, so their cost may fade during training.
     Vanishing weights cost (FAINT − ln s)²/10. `count` is the number of rays.
     """
     roughness, specular = image.reflectance.roughness, image.reflectance.specular
@@ -67,8 +67,8 @@ def gloss(image: Image, least: float, fading: float, count: int) -> torch.Tensor
 def evenness(networks: Networks, image: Image, length: float, count: int, generator: torch.Generator) -> torch.Tensor:
     """Return the squared change of ln σ along the surface, in random directions perpendicular to detached normals.
 
-    Photographs with the light at the lens hardly show small bumps of the density, since nothing is in shadow there; lit
-    from elsewhere, bumps shade each other and show as blotches. Differences are taken over a quarter of `length` to all
+    Photographs with the light at the lens hardly show small bumps of the density, since nothing is in shadow. Under
+    other lights bumps shade each other and show as blotches. Differences are taken over a quarter of `length` to all
     of it, at `count` samples.
     """
     visible = (image.weight.detach() > 0.02).nonzero()[:, 0]

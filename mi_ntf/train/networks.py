@@ -81,18 +81,10 @@ class Networks:
                     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the transmittance of rays as mixtures of logistics, ``(hit (n,), mixture (n, K, 3))``.
 
-        Parameters
-        ----------
-        o, d
-            A point and the unit direction towards the light of each ray, (n, 3).
-        profile
-            Optical depths (n, k) from equidistant points of the chords, far ends first, to the light-side ends
-            (``TransmittanceTargets.march``). Only the encoding ``depth`` reads them.
-
-        Notes
-        -----
-        `hit` is false where the ray misses the sphere. The last axis of the mixture is (w, a, b), see
-        :mod:`mi_ntf.core.mixture`.
+        `o`, `d` (n, 3) are a point of each ray and its unit direction towards the light. `profile` (n, k) are optical
+        depths from equidistant points of the chords, far ends first, to the light-side ends
+        (``TransmittanceTargets.march``), which only the encoding ``depth`` reads. `hit` is false where the ray misses
+        the sphere; the last axis of the mixture is (w, a, b), see :mod:`mi_ntf.core.mixture`.
         """
         net = self.architecture.transmittance
         hit, m, h = spheres.chord(ops, o.unbind(1), d.unbind(1))

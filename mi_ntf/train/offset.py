@@ -4,7 +4,7 @@ A point i of the surface, seen in photograph v, has
 
     ln I = a_i + g_v + ln ⟨n_i, ω_i⟩⁺ − 2 ln d_i,        I the geometric mean of its three channels,
 
-with a_i its albedo and g_v the photograph's exposure. Only the position of the light in the camera's axes is common to
+with the albedo a_i and the photograph's exposure g_v. Only the position of the light in the camera's axes is common to
 all photographs. For each trial position a and g are means of the residual, and the position with the least residual is
 the flash's. Points in shadow and highlights are outliers, which a robust cost ignores.
 """

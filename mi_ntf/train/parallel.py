@@ -2,8 +2,8 @@
 
 Each process draws the same global batch, since all generators have the same seed. It evaluates the networks, forward
 and backward, at its part of the points, and the values are gathered. Compositing, losses and decisions see all values
-in every process. Gradients are averaged, so all processes keep the same parameters, and the result is that of one
-process with the same batch up to the order of sums. A loss term that does not go through :class:`Shared` is computed by
+in every process. Gradients are averaged, so all processes keep the same parameters. The result is that of one process
+with the same batch, up to the order of sums. A loss term that does not go through :class:`Shared` is computed by
 all processes alike, which is right too.
 """
 
@@ -63,7 +63,7 @@ def average_gradients(tensors: list[torch.Tensor]) -> None:
         gradient.copy_(mean.view_as(gradient))
 
 
-def share(networks: Networks) -> Networks:
+def distributed(networks: Networks) -> Networks:
     """Return `networks` for evaluation by all processes together; with one process, return `networks` itself."""
     return networks if count() == 1 else Shared(**vars(networks))
 
@@ -72,17 +72,21 @@ class Shared(Networks):
     """Networks whose points are divided among the processes. All processes must call them with the same points."""
 
     def log_density(self, x: torch.Tensor) -> torch.Tensor:
+        """See :class:`Networks`."""
         return divided(lambda *a: (self._alone().log_density(*a),), x)[0]
 
     def reflectance(self, x: torch.Tensor) -> Reflectance:
+        """See :class:`Networks`."""
         return Reflectance(*divided(self._alone().reflectance, x))
 
     def ray_mixture(self, o: torch.Tensor, d: torch.Tensor, profile: torch.Tensor
                     ) -> tuple[torch.Tensor, torch.Tensor]:
+        """See :class:`Networks`."""
         hit, mix = divided(self._alone().ray_mixture, o, d, profile)
         return hit, mix
 
     def visibility(self, x: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
+        """See :class:`Networks`."""
         return divided(lambda *a: (self._alone().visibility(*a),), x, d)[0]
 
     def _alone(self) -> Networks:

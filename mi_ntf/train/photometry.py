@@ -14,7 +14,7 @@ BLACK_WEIGHT = 0.25
 
 
 class Gains:
-    """One factor a channel for each photograph of the training split, of geometric mean 1 over all photographs.
+    """Factors by channel of the photographs of the training split, of geometric mean 1 over all photographs.
 
     Photographs determine only the product of intensity and albedo, so the mean has to be fixed. Gains start at the mean
     brightness of the object in each photograph.

@@ -99,8 +99,9 @@ class Photographs:
         frame = torch.searchsorted(ends, pick, right=True)
         place = ends[frame] - 1 - pick
         wide = (right - left)[frame]
-        row: torch.Tensor = frame * self.height + top[frame] + place // wide
-        return row * self.width + left[frame] + place % wide
+        row = frame * self.height + top[frame] + place // wide
+        pixel: torch.Tensor = row * self.width + left[frame] + place % wide
+        return pixel
 
     def look_at(self, points: torch.Tensor, margin: float) -> None:
         """Set the windows around all `points` (n, 3), each with a `margin` around it, in field coordinates."""

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -11,6 +10,7 @@ from ..data.page import Page
 from ..data.schema import Split
 from . import device
 from .agreement import MOVED, Agreement, survey
+from .checkpoint import State
 from .flash import Flash
 from .monitor import Notes, Validation
 from .photometry import fitted
@@ -19,7 +19,7 @@ from .scoring import FieldView, Light, Pixels, srgb
 from .training_data import TrainingData
 from .transmittance_targets import TransmittanceTargets
 
-Report = dict[str, Any]
+Report = State
 """Report of a run, in JSON types."""
 SHOWN = 3
 """Test photographs on the page …"""

@@ -103,18 +103,10 @@ def occupied(networks: Networks) -> Occupancy:
 @torch.no_grad()
 def score(field: FieldView, photographs: Photographs, most: float = math.inf, views: int | None = None,
           passes: int = 2, tell: Callable[[float], None] = lambda done: None) -> Scores:
-    """Compare the field with the photographs of a split.
+    """Compare the field with the photographs of a split, or the first `views` of them.
 
-    Parameters
-    ----------
-    most
-        Limit of the number of pixels. They are random, and the same in every call.
-    views
-        Number of photographs, the first ones; None: all.
-    passes
-        Jittered evaluations to average.
-    tell
-        Called with the fraction that is done.
+    At most `most` pixels are compared, random ones, the same in every call. Each is the mean of `passes` jittered
+    evaluations. `tell` is called with the fraction that is done.
     """
     count = photographs.views if views is None else min(views, photographs.views)
     each, generator = [], device.generator(1)

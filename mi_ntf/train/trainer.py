@@ -50,19 +50,12 @@ def train(dataset: Path, out: Path, *, preset: str = "fast", minutes: float | No
           estimate: bool = False, view: bool = False, ntf: str | None = None, augmentation: bool = True,
           colour_loss: bool = True, visibility_mlp: bool = False, bounces: bool = True, fresnel: bool = True,
           gains: bool = True) -> Report:
-    """Train a field on photographs and write it.
+    """Train a field on the photographs in `dataset`, write it to `out`, and return the report, which its header holds.
 
     Parameters
     ----------
-    dataset, out
-        Folder of the data set; field file to write.
-    preset
-        Recipe and settings, a key of ``PRESETS``.
     minutes, steps
-        Limit of the run, one of them; 10 minutes by default. Runs given in steps are reproducible, bit for bit on one
-        CPU.
-    seed
-        Seed of the initial networks and of all samples.
+        Limit of the run, one of them; 10 minutes by default. Runs given in steps are reproducible to the last bit.
     tensorboard
         Folder for TensorBoard events.
     field
@@ -76,20 +69,13 @@ def train(dataset: Path, out: Path, *, preset: str = "fast", minutes: float | No
     ntf, augmentation, colour_loss, visibility_mlp, bounces, fresnel, gains
         Changes of the preset, see :func:`mi_ntf.train.config.configured`.
 
-    Returns
-    -------
-    Report
-        The report, JSON types, which the header of the field file holds too.
-
     Notes
     -----
     A checkpoint ``OUT.ckpt`` is written every minute. The same command continues it, and it is deleted at the end.
     Faults (:class:`mi_ntf.train.monitor.Fault`) are rolled back and listed in the report; several of them end the run.
 
-    Under ``torchrun --nproc-per-node=N -m mi_ntf train DATASET -o FIELD …`` (or any launcher that sets RANK,
-    WORLD_SIZE, MASTER_ADDR and MASTER_PORT) N processes share the work of every step, see :mod:`mi_ntf.train.parallel`.
-    The result is that of one process with the same seed, up to rounding. The first process prints and writes; the
-    others return an empty report. All must see the same files.
+    Under ``torchrun --nproc-per-node=N -m mi_ntf train …`` N processes share the work of every step, see
+    :mod:`mi_ntf.train.parallel`. The first one prints and writes; the others return an empty report.
     """
     config = configured(preset, ntf=ntf, augmentation=augmentation, colour_loss=colour_loss,
                         visibility_mlp=visibility_mlp, bounces=bounces, fresnel=fresnel, gains=gains)
@@ -164,7 +150,7 @@ class Record:
 
 
 class Trainer:
-    """One training run: it has a recipe, and adds the loop, validation, roll-backs, checkpoints and reports.
+    """Training run: it has a recipe, and adds the loop, validation, roll-backs, checkpoints and reports.
 
     Parameters are those of :func:`train`. A checkpoint of the same run is continued by :meth:`resume`.
     """
@@ -201,8 +187,6 @@ class Trainer:
         self.last = math.nan  # PSNR of the last validation, dB
         self.saved = time.monotonic()  # Time of the last checkpoint
         self.clock.spent = time.monotonic() - start
-
-    # --- the loop -------------------------------------------------------------------------------------------------
 
     def loop(self) -> None:
         """Step until the limit; show progress, validate, save checkpoints, roll back faults."""
@@ -276,8 +260,6 @@ class Trainer:
         values |= {f"learning rate/{k}": float(o.param_groups[0]["lr"]) for k, o in learner.optimizers.items()}
         self.log.scalars(self.clock.step, values, learner.rays, learner.samples)
 
-    # --- validation -----------------------------------------------------------------------------------------------
-
     @property
     def view(self) -> FieldView:
         """The field as learned so far, ready to be rendered."""
@@ -317,8 +299,6 @@ class Trainer:
         self.recipe.adopt(best["snapshot"])
         return (f"step {step}: the field is finished; the one of step {record.chosen['step']} is kept, since it is "
                 f"better by {best['psnr'] - self.last:.2f} dB in validation")
-
-    # --- state ----------------------------------------------------------------------------------------------------
 
     def state(self) -> State:
         """Return a copy of all that decides the next step: a run that restores it is the same run."""
@@ -363,8 +343,6 @@ class Trainer:
         self.generator.set_state(random)
         self.keep()
         return f"{fault}: back to step {self.clock.step}, learning rates × {factor:g}"
-
-    # --- files ----------------------------------------------------------------------------------------------------
 
     def save(self) -> None:
         """Write the last good state as a checkpoint."""
@@ -414,9 +392,5 @@ class Trainer:
 
 
 def _threads() -> int:
-    """Return the number of idle cores, 1 or 2.
-
-    Two threads that wait for each other on a busy machine are far slower than one. Runs given in steps use one thread
-    always, so that their sums have one order.
-    """
+    """Return the number of idle cores, 1 or 2: on a busy machine two threads that wait for each other are slow."""
     return 2 if (os.cpu_count() or 1) - os.getloadavg()[0] > 1.5 else 1

@@ -98,22 +98,10 @@ def chords(o: torch.Tensor, d: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor
 
 def walk(marched: TransmittanceTargets, o: torch.Tensor, d: torch.Tensor, until: float,
          reach: torch.Tensor | float = torch.inf) -> tuple[torch.Tensor, torch.Tensor]:
-    """March rays to a given optical depth.
+    """March rays from `o` along `d` (n, 3) to the optical depth `until` or the distance `reach`, (n,) or one number.
 
-    Parameters
-    ----------
-    o, d
-        Origins and unit directions (n, 3).
-    until
-        Optical depth at which a ray ends.
-    reach
-        Distance at which a ray ends, (n,) or one number.
-
-    Returns
-    -------
-    t, depth
-        The distance (n,) at which the ray passes `until`; infinity if it does not within the unit sphere. The optical
-        depth (n,) at the end of the ray, up to BLOCK steps behind the place where it passes `until`.
+    Returns ``(t, depth)``, (n,) each. `t` is the distance at which a ray passes `until`, infinity if it does not in the
+    unit sphere. `depth` is the optical depth at its end, up to BLOCK steps behind the place where it passes `until`.
     """
     t, depth = torch.full((len(o),), torch.inf), torch.zeros(len(o))
     start, end = sphere_span(o, d)

@@ -129,14 +129,8 @@ def render(networks: Networks, rays: Rays, samples: Samples, bounced: Bounced | 
            generator: torch.Generator | None = None, lobes: bool = True, flash: Flash | None = None) -> Image:
     """Render colour and alpha of `rays` from packed samples.
 
-    Parameters
-    ----------
-    bounced
-        Further bounces of the light, sampled with `generator`; None: no bounces.
-    lobes
-        If false, roughness and specular weight get no gradient.
-    flash
-        Lights beside the lenses; None: the light is at the lens.
+    `bounced` are further bounces of the light, sampled with `generator`. Without `lobes`, roughness and specular weight
+    get no gradient. `flash` are lights beside the lenses; without it, the light is at the lens.
     """
     ray, t, width = samples
     x = torch.addcmul(rays.o[ray], rays.d[ray], t[:, None])

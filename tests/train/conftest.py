@@ -1,4 +1,4 @@
-"""What all training tests share."""
+"""Settings of all training tests."""
 
 try:
     import torch

@@ -36,18 +36,18 @@ def split(images: np.ndarray, focal=50.0, c2w: np.ndarray | None = None, offset=
     n, height, width = images.shape[:3]
     c2w = around(n) if c2w is None else c2w
     right, up, forward = offset
-    given = {"principal": np.tile([width / 2, height / 2], (n, 1)), "center": np.zeros(3), "radius": 1.0} | more
+    options = {"principal": np.tile([width / 2, height / 2], (n, 1)), "center": np.zeros(3), "radius": 1.0} | more
     return Split(images=images, c2w=c2w, focal=np.broadcast_to(np.asarray(focal, np.float64), (n, 2)).copy(),
-                 light_pos=(c2w @ (right, up, -forward, 1.0))[:, :3], light_intensity=np.full((n, 3), power), **given)
+                 light_pos=(c2w @ (right, up, -forward, 1.0))[:, :3], light_intensity=np.full((n, 3), power), **options)
 
 
-def photographs(images: np.ndarray, first: int = 0, **given) -> Photographs:
-    """As :func:`split`; `first`: number of the first one."""
-    return Photographs(split(images, **given), first)
+def photographs(images: np.ndarray, first: int = 0, **options) -> Photographs:
+    """Return the photographs of a :func:`split`; `first` is the number of the first one."""
+    return Photographs(split(images, **options), first)
 
 
 def flash(place: torch.Tensor, marched: TransmittanceTargets, solid: bool = True) -> Flash:
     """Lights at `place` (views, 3), whatever the cameras."""
-    found = Flash([photographs(np.zeros((len(place), 1, 1, 4), np.float32))], solid, marched)
-    found.place = place
-    return found
+    lights = Flash([photographs(np.zeros((len(place), 1, 1, 4), np.float32))], solid, marched)
+    lights.place = place
+    return lights

@@ -1,4 +1,4 @@
-"""Whether photographs agree: shifts and a spoiled one are found in pictures made for it, nothing where all is well."""
+"""Agreement of photographs: known shifts and one spoiled photograph are found, and nothing where all is well."""
 
 import numpy as np
 import pytest
@@ -30,8 +30,8 @@ def world(o: np.ndarray, d: np.ndarray) -> np.ndarray:
 def pictures(moved: np.ndarray, factor: int = 4) -> np.ndarray:
     """(VIEWS, SIDE, SIDE, 4) photographs that are `moved` (VIEWS, 2) pixels to the right and down."""
     n = SIDE * factor
-    found = world(*schema.pixel_rays(C2W, FOCAL * factor, n, n, (SIDE / 2 + moved) * factor))
-    return np.float32(found.reshape(VIEWS, SIDE, factor, SIDE, factor, 4).mean((2, 4)))
+    actual = world(*schema.pixel_rays(C2W, FOCAL * factor, n, n, (SIDE / 2 + moved) * factor))
+    return np.float32(actual.reshape(VIEWS, SIDE, factor, SIDE, factor, 4).mean((2, 4)))
 
 
 @pytest.fixture(autouse=True)
@@ -42,18 +42,18 @@ def field(monkeypatch):
         right = np.cross(d, (0.31, 0.5, 0.81))
         right /= np.linalg.norm(right, axis=1, keepdims=True)
         place = (np.arange(4) - 1.5) / 4 / FOCAL
-        seen = [world(o, d + a * right + b * np.cross(right, d)) for a in place for b in place]
-        return scoring.Pixels(torch.as_tensor(np.mean(seen, 0)[:, :3], dtype=torch.float32), None, None, None)
+        observed = [world(o, d + a * right + b * np.cross(right, d)) for a in place for b in place]
+        return scoring.Pixels(torch.as_tensor(np.mean(observed, 0)[:, :3], dtype=torch.float32), None, None, None)
 
     monkeypatch.setattr(scoring.FieldView, "render", render)
 
 
 def survey(images: np.ndarray, gains: torch.Tensor | None = None) -> tuple[agreement.Agreement, list[str]]:
-    """What is found, and what is said of it."""
+    """Return the agreement of the photographs, and the complaints about them."""
     split = shots.split(images, FOCAL, C2W, names=NAMES)
-    found = agreement.survey(scoring.FieldView(None, None, 0.01), shots.Photographs(split), gains)
-    assert found.psnr.shape == (VIEWS,) and found.shift.shape == (VIEWS, 2)
-    return found, report.complaints(found, {"train": split})
+    actual = agreement.survey(scoring.FieldView(None, None, 0.01), shots.Photographs(split), gains)
+    assert actual.psnr.shape == (VIEWS,) and actual.shift.shape == (VIEWS, 2)
+    return actual, report.complaints(actual, {"train": split})
 
 
 def test_photographs_that_agree_are_quiet():
@@ -65,25 +65,25 @@ def test_photographs_that_agree_are_quiet():
     noisy = pictures(np.zeros((VIEWS, 2)))
     noisy[..., :3] *= 1 + noise
     for images in (levels(pictures(np.zeros((VIEWS, 2)))), noisy.astype(np.float16)):
-        found, quiet = survey(images)
-        assert quiet == [] and found.moved < 0.05 and found.outliers() == []
+        actual, quiet = survey(images)
+        assert quiet == [] and actual.moved < 0.05 and actual.outliers() == []
 
 
 @pytest.mark.parametrize("size", [0.3, 0.8])
 def test_known_shifts_are_found(size):
     """Within 15 %, right and down, of each and of all; the warning says how much, in pixels and degrees."""
     moved = size * RANDOM
-    found, said = survey(pictures(moved))
-    np.testing.assert_allclose(found.shift, moved, atol=0.15 * size)
+    actual, said = survey(pictures(moved))
+    np.testing.assert_allclose(actual.shift, moved, atol=0.15 * size)
     rms = np.sqrt((moved**2).sum(1).mean())
-    assert found.moved == pytest.approx(rms, rel=0.15)
+    assert actual.moved == pytest.approx(rms, rel=0.15)
     said = [text for text in said if "disagree" not in text]  # those of no shift at all agree very well
     if rms < agreement.MOVED:
         assert said == []
         return
     assert len(said) == 1, said
-    assert said[0].startswith(f"warning: the photographs are moved against each other by {found.moved:.2g} pixels "
-                              f"({np.degrees(np.arctan(found.moved / FOCAL)):.2g} degrees) and probably twice that")
+    assert said[0].startswith(f"warning: the photographs are moved against each other by {actual.moved:.2g} pixels "
+                              f"({np.degrees(np.arctan(actual.moved / FOCAL)):.2g} degrees) and probably twice that")
     # A field that is moved as a whole has learned it so.
     together, _ = survey(pictures(moved + np.array([0.4, -0.3])))
     assert together.moved == pytest.approx(rms, rel=0.15)
@@ -91,31 +91,31 @@ def test_known_shifts_are_found(size):
 
 
 def test_a_spoiled_photograph_is_named():
-    """One of another place, in turn; the others' noise is allowed for."""
+    """A photograph of another place, in turn; the noise of the others is allowed for."""
     rng = np.random.default_rng(4)
     for spoiled in (0, 5):
         images = pictures(np.zeros((VIEWS, 2)))
         images[..., :3] *= 1 + 0.02 * rng.normal(size=images[..., :3].shape)
         images[spoiled, ..., :3] = images[spoiled, :, ::-1, :3]
-        found, said = survey(np.float16(images))
-        assert found.outliers() == [spoiled]
+        actual, said = survey(np.float16(images))
+        assert actual.outliers() == [spoiled]
         said = [text for text in said if "disagree" in text]
         assert len(said) == 1 and said[0].startswith(
             f"warning: 1 of {VIEWS} photographs disagree with the others beyond their gains: {NAMES[spoiled]} "
-            f"({found.psnr[spoiled]:.1f} dB), where the median is {found.psnr.median():.1f} dB; look for motion")
+            f"({actual.psnr[spoiled]:.1f} dB), where the median is {actual.psnr.median():.1f} dB; look for motion")
 
 
 def test_gains_are_no_disagreement():
     factors = torch.as_tensor(2 ** np.random.default_rng(3).uniform(-0.7, 0.7, (VIEWS, 3)), dtype=torch.float32)
     images = pictures(np.zeros((VIEWS, 2))) * np.append(factors.numpy(), np.ones((VIEWS, 1)), 1)[:, None, None]
-    found, said = survey(np.float32(images), factors)
-    assert said == [] and float(found.psnr.min()) > 45
+    actual, said = survey(np.float32(images), factors)
+    assert said == [] and float(actual.psnr.min()) > 45
     assert float(survey(np.float32(images))[0].psnr.max()) < 40
 
 
 def test_a_photograph_without_the_object_is_left_out():
     images = pictures(0.8 * RANDOM)
     images[3] = 0
-    found, said = survey(images)
-    assert found.psnr.isnan().nonzero()[:, 0].tolist() == [3] and found.outliers() == [] and not found.shift[3].any()
+    actual, said = survey(images)
+    assert actual.psnr.isnan().nonzero()[:, 0].tolist() == [3] and actual.outliers() == [] and not actual.shift[3].any()
     assert len(said) == 1 and "moved against each other" in said[0]

@@ -41,9 +41,9 @@ def learned(tmp_path_factory):
 def test_a_flash_that_is_told_explains_what_one_at_the_lens_cannot(tmp_path):
     """Terminators and the shadow of one sphere on the other move with the camera: no reflectance stands in for them.
     26.2 and 25.2 dB were measured."""
-    told, lens = (learn(tmp_path, name, left_out, 700)["test"]["object"]
+    known, lens = (learn(tmp_path, name, left_out, 700)["test"]["object"]
                   for name, left_out in (("told", ()), ("lens", ("pl_pos",))))
-    assert told > 25 and told > lens + 0.5, (told, lens)
+    assert known > 25 and known > lens + 0.5, (known, lens)
 
 
 def test_a_flash_taken_to_be_at_the_lens_is_noticed(learned):
@@ -59,10 +59,10 @@ def test_a_flash_taken_to_be_at_the_lens_is_noticed(learned):
 def test_gains_of_the_photographs_are_found(learned):
     """To 20 % on average after few steps, of photographs whose own vary by a factor of four; to 33 % if none were."""
     _, report = learned
-    found = np.log(np.array(list(report["photographs"]["gains"].values())))
+    actual = np.log(np.array(list(report["photographs"]["gains"].values())))
     true = np.log(two_spheres.gains("train", 24))
     assert np.abs(true - true.mean(0)).mean() > 0.32
-    assert np.abs(found - (true - true.mean(0))).mean() < 0.2
+    assert np.abs(actual - (true - true.mean(0))).mean() < 0.2
 
 
 def test_a_checkpoint_beside_the_lens_continues_bit_for_bit(tmp_path, monkeypatch):

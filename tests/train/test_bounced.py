@@ -71,48 +71,48 @@ class Outward:
 
 @pytest.fixture(scope="module")
 def light(spheres):
-    found = bounced.Bounced(shots.flash(FLASH, spheres[1]), POWER)
-    assert not found.known
+    actual = bounced.Bounced(shots.flash(FLASH, spheres[1]), POWER)
+    assert not actual.known
     side, bounced.SIDE = bounced.SIDE, 24  # 576 rays a patch, of which some 60 meet the other sphere
-    found.update(Outward(spheres[0]), spheres[1], camera_rays(), 0)
+    actual.update(Outward(spheres[0]), spheres[1], camera_rays(), 0)
     bounced.SIDE = side
-    return found
+    return actual
 
 
 def exact(x, n, flash, power, samples: int = 4000):
     """Irradiance at `x`, normal `n`, of one bounce off the other sphere by `flash`, by sampling that sphere."""
     rng = np.random.default_rng(1)
     other = np.array([PLACES[1] if x[0] < 0 else PLACES[0], 0, 0])
-    own = -other
+    center = -other
     m = rng.normal(size=(samples, 3))
     m /= np.linalg.norm(m, axis=1, keepdims=True)
     y = other + RADIUS * m
-    away, toward = flash - y, x - y
-    r2, d2 = (away**2).sum(1), (toward**2).sum(1)
-    lit = np.maximum((away * m).sum(1), 0) / r2**1.5
+    path, toward = flash - y, x - y
+    r2, d2 = (path**2).sum(1), (toward**2).sum(1)
+    lit = np.maximum((path * m).sum(1), 0) / r2**1.5
     # The first sphere's shadow on the other.
-    b = ((own - y) * away).sum(1) / np.sqrt(r2)
-    lit *= ~((b > 0) & (((own - y) ** 2).sum(1) - b * b < RADIUS**2))
-    seen = np.maximum((toward * m).sum(1), 0) * np.maximum(-(toward * n).sum(1), 0) / d2**2
-    return power * np.array([0.8, 0.5, 0.2]) * (lit * seen).mean() * 4 * RADIUS**2
+    b = ((center - y) * path).sum(1) / np.sqrt(r2)
+    lit *= ~((b > 0) & (((center - y) ** 2).sum(1) - b * b < RADIUS**2))
+    observed = np.maximum((toward * m).sum(1), 0) * np.maximum(-(toward * n).sum(1), 0) / d2**2
+    return power * np.array([0.8, 0.5, 0.2]) * (lit * observed).mean() * 4 * RADIUS**2
 
 
 def test_two_spheres_against_an_integral(light):
-    """What one sphere throws on the near side of the other, in blue, of which the second bounce has 2 %."""
+    """Light that one sphere throws on the near side of the other, in blue, of which the second bounce has 2 %."""
     generator = torch.Generator().manual_seed(0)
     for view in (0, 1):
-        found, known = [], []
+        actual, known = [], []
         for degrees in (-60, -30, 0, 30, 60):
             n = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees)), 0.3])
             n /= np.linalg.norm(n)
             x = np.array([PLACES[0], 0, 0]) + RADIUS * n
             many, normals = (torch.as_tensor(np.tile(v, (500, 1)), dtype=torch.float32) for v in (x, n))
-            found.append(float(light(torch.full((500,), view), many, normals, generator)[:, 2].mean()))
+            actual.append(float(light(torch.full((500,), view), many, normals, generator)[:, 2].mean()))
             known.append(exact(x, n, FLASH[view].numpy(), POWER[view].numpy())[2])
         # Patches are a seventh of the radius wide, and blend with those of other faces at 60°: measured 0.13 of the
         # most; on average 5 %.
-        np.testing.assert_allclose(found, known, atol=0.2 * max(known))
-        assert np.mean(found[1:4]) == pytest.approx(np.mean(known[1:4]), rel=0.12)
+        np.testing.assert_allclose(actual, known, atol=0.2 * max(known))
+        assert np.mean(actual[1:4]) == pytest.approx(np.mean(known[1:4]), rel=0.12)
 
 
 def test_far_points_and_other_faces_get_nothing_or_their_own(light):
@@ -130,15 +130,15 @@ def test_the_room_sends_light_back_where_it_is_open(light):
     room = torch.log(torch.tensor([0.1, 0.2, 0.05])).requires_grad_()
     within = copy.copy(light)
     within.room = room
-    for away in (False, True):
-        n = np.array([-1.0 if away else 1.0, 0, 0])
+    for far_side in (False, True):
+        n = np.array([-1.0 if far_side else 1.0, 0, 0])
         x = np.array([PLACES[0], 0, 0]) + RADIUS * n
         many, normals = (torch.as_tensor(np.tile(v, (2000, 1)), dtype=torch.float32) for v in (x, n))
         view = torch.zeros(2000).long()
         both = [b(view, many, normals, torch.Generator().manual_seed(0)) for b in (within, light)]
         added = (both[0] - both[1]).mean(0)
         # A sphere of radius r at the distance d before a patch takes (r/d)² of its sky; nothing is before the far side.
-        open_ = 1 - (0 if away else (RADIUS / (2 * PLACES[1] - RADIUS)) ** 2)
+        open_ = 1 - (0 if far_side else (RADIUS / (2 * PLACES[1] - RADIUS)) ** 2)
         expected = open_ * POWER[0] / float(FLASH[0].square().sum()) * room.exp()
         torch.testing.assert_close(added, expected, rtol=0.06, atol=0)
         added.sum().backward()
@@ -149,12 +149,12 @@ def test_the_room_sends_light_back_where_it_is_open(light):
 def test_albedo_learns_of_the_bounced_light(spheres, light):
     """Colour holds it, on top of the flash's own light, and its derivative by the albedo is its own share."""
     nets = Outward(spheres[0])
-    some = camera_rays(200)
+    subset = camera_rays(200)
     samples = (torch.arange(200).repeat_interleave(64), torch.linspace(2, 4, 64).repeat(200),
                torch.full((12800,), 2 / 64))
     generator = torch.Generator().manual_seed(0)
-    without = volume.render(nets, some, samples)
-    whole = volume.render(nets, some, samples, light, generator)
+    without = volume.render(nets, subset, samples)
+    whole = volume.render(nets, subset, samples, light, generator)
     torch.testing.assert_close(whole.color, without.color + whole.bounced)
     assert float(whole.bounced.max()) > 0.01 and without.bounced == 0.0
     albedo = torch.tensor([[0.5, 0.5, 0.5]], requires_grad=True)
@@ -165,7 +165,7 @@ def test_albedo_learns_of_the_bounced_light(spheres, light):
 
 
 def test_the_same_patches_as_ever(spheres, light):
-    """One seed, one result: a resumed run is the same run."""
+    """The same seed gives the same result, so that a resumed run is the same run."""
     once, again = (bounced.Bounced(shots.flash(FLASH, spheres[1]), POWER) for _ in range(2))
     for each in (once, again):
         each.update(Outward(spheres[0]), spheres[1], camera_rays(), 0)

@@ -90,8 +90,8 @@ def test_uniform_ball_has_the_closed_form():
 
 
 def test_rays_end_where_they_are_spent_and_steep_cells_are_split():
-    """What is kept are the cells in front of the depth SPENT, of each ray its own, in their order, those of optical
-    depth STEEP and their neighbours in PARTS, with a sample in each part."""
+    """Cells of each ray in front of the depth SPENT remain, in their order. Cells of optical depth STEEP and their
+    neighbours are split in PARTS, with a sample in each part."""
     counts, step = np.array([60, 0, 100, 1, 40]), 0.05
     ray = torch.as_tensor(np.repeat(np.arange(5), counts))
     near = torch.as_tensor(np.concatenate([np.arange(n) * step + 1 for n in counts])).float()
@@ -135,20 +135,20 @@ def test_a_ray_outside_the_occupied_cells_is_dropped_and_others_are_tightened():
     hull = torch.zeros((32,) * 3, dtype=torch.bool)
     hull[14:18, 14:18, 14:18] = True  # |x| ≤ 1/8
     grid = Occupancy(hull)
-    index, kept = grid.tighten(rays(5))
+    index, remaining = grid.tighten(rays(5))
     assert index.tolist() == [0, 1]  # x = 0 and 0.1; the next is at 0.2
     # A cell (1/16) more at most at either end than the cube itself, 3 ± 1/8
-    assert (kept.t0 <= 3 - 1 / 8).all() and (kept.t0 >= 3 - 1 / 8 - 1 / 8).all()
-    assert (kept.t1 >= 3 + 1 / 8).all() and (kept.t1 <= 3 + 1 / 8 + 1 / 8).all()
+    assert (remaining.t0 <= 3 - 1 / 8).all() and (remaining.t0 >= 3 - 1 / 8 - 1 / 8).all()
+    assert (remaining.t1 >= 3 + 1 / 8).all() and (remaining.t1 <= 3 + 1 / 8 + 1 / 8).all()
 
 
 def test_a_field_without_matter_is_black():
-    """No ray meets a cell, not even a block of cells."""
+    """Rays meet no cell, not even a block of cells."""
     grid = Occupancy(torch.zeros((32,) * 3, dtype=torch.bool))
-    index, kept = grid.tighten(rays(5))
-    assert len(index) == len(kept) == 0
-    found = scoring.FieldView(Slab(), grid, 0.01).render(rays(5), torch.Generator().manual_seed(0))
-    assert [v.shape for v in found] == [(5, 3), (5,), (5, 3), (5, 3)] and not any(v.any() for v in found)
+    index, remaining = grid.tighten(rays(5))
+    assert len(index) == len(remaining) == 0
+    result = scoring.FieldView(Slab(), grid, 0.01).render(rays(5), torch.Generator().manual_seed(0))
+    assert [v.shape for v in result] == [(5, 3), (5,), (5, 3), (5, 3)] and not any(v.any() for v in result)
 
 
 def ball(cells=48, radius=0.5, sigma=40.0):
@@ -283,17 +283,17 @@ def test_psnr_of_a_known_error(monkeypatch):
 
     monkeypatch.setattr(scoring.FieldView, "render", constant)
     field = scoring.FieldView(None, None, 0.01)
-    told = []
-    found = scoring.score(field, pool, views=1, tell=told.append)
-    assert found.linear == pytest.approx(20.0, abs=1e-3)
+    reported = []
+    result = scoring.score(field, pool, views=1, tell=reported.append)
+    assert result.linear == pytest.approx(20.0, abs=1e-3)
     # sRGB of 0.5 and 0.6: 0.73536 and 0.79774 → −20 lg 0.06238
-    assert found.srgb == found.object == found.each[0] == pytest.approx(24.10, abs=0.01)
-    assert found.alpha_rmse == pytest.approx(0.25) and told == [1.0]
-    found = scoring.score(field, pool)
-    assert found.each == pytest.approx([24.10, 24.10 + 10 * math.log10(4 / 3)], abs=0.01)
-    assert found.srgb == pytest.approx(np.mean(found.each)) and found.linear == pytest.approx(20.625, abs=1e-3)
-    assert found.object == pytest.approx((24.10 + 120) / 2, abs=0.01)  # no error counts as 1e-12
-    assert found.alpha_rmse == pytest.approx(math.sqrt((0.25**2 + (0.25**2 + 3 * 0.75**2) / 4) / 2))
+    assert result.srgb == result.object == result.each[0] == pytest.approx(24.10, abs=0.01)
+    assert result.alpha_rmse == pytest.approx(0.25) and reported == [1.0]
+    result = scoring.score(field, pool)
+    assert result.each == pytest.approx([24.10, 24.10 + 10 * math.log10(4 / 3)], abs=0.01)
+    assert result.srgb == pytest.approx(np.mean(result.each)) and result.linear == pytest.approx(20.625, abs=1e-3)
+    assert result.object == pytest.approx((24.10 + 120) / 2, abs=0.01)  # no error counts as 1e-12
+    assert result.alpha_rmse == pytest.approx(math.sqrt((0.25**2 + (0.25**2 + 3 * 0.75**2) / 4) / 2))
     # Three pixels of each at most, the same ones in every call; with gains of their own, constants are met exactly.
     assert scoring.score(field, pool, most=6) == scoring.score(field, pool, most=6)
     fit = scoring.score(dataclasses.replace(field, light=scoring.Light(fit=True)), pool, views=1)
@@ -302,7 +302,7 @@ def test_psnr_of_a_known_error(monkeypatch):
 
 @pytest.mark.parametrize("rim", [False, True])
 def test_training_shades_by_the_phase_function_seen_from_the_light(rim):
-    """What photographs are compared with is what the renderers' phase function gives for ω_i = ω_o."""
+    """Photographs are compared with the value of the renderers' phase function for ω_i = ω_o."""
     cos, roughness, specular = np.linspace(0.05, 1, 20), np.linspace(0.2, 1, 20), np.linspace(0, 0.9, 20)
     w, n = (np.sqrt(1 - cos**2), 0 * cos, cos), (0 * cos, 0 * cos, 1 + 0 * cos)
     diffuse, gloss = microfacet.scattering(numpy_ops, w, w, n, roughness)
@@ -330,10 +330,10 @@ def test_held_out_score_of_a_network_that_knows_no_shadow():
     # A lens so long that all of its pixels see the same point.
     pool = shots.photographs(np.ones((1, 5, 10, 4), np.float32), focal=1e6, c2w=shots.facing((0, 0, -3.0))[None])
     field = Field()
-    found = held_out.score(field, scoring.occupied(field), pool)
+    result = held_out.score(field, scoring.occupied(field), pool)
     # 4096 pairs of deviation 0.3, and voxels of 1/128 that smear the surface
-    assert found["bias"] == pytest.approx(1 - (1 - math.log(2)) / 2, abs=0.03)
-    assert found["bias"] < found["rms"] < 1
+    assert result["bias"] == pytest.approx(1 - (1 - math.log(2)) / 2, abs=0.03)
+    assert result["bias"] < result["rms"] < 1
 
 
 def test_rough_lobes_cost_more():
@@ -342,7 +342,7 @@ def test_rough_lobes_cost_more():
     image = volume.Image(color=None, alpha=None, x=None, shaded=None, index=None,
                          weight=torch.tensor([0.5, 0.25, 0.25]), reflectance=networks.Reflectance(None, None, *gloss),
                          radiance=None, raw=None, bounced=0.0)
-    wanted = 0.5 * 0.2 * 60.5 + 0.25 * 0.4 * (0.5 + 60 / 256) + 0.25 * (math.exp(-7) * 60.5 + 0.4)
-    assert float(losses.gloss(image, 0.0, 0.5, 4)) == pytest.approx(wanted / 4)
+    target = 0.5 * 0.2 * 60.5 + 0.25 * 0.4 * (0.5 + 60 / 256) + 0.25 * (math.exp(-7) * 60.5 + 0.4)
+    assert float(losses.gloss(image, 0.0, 0.5, 4)) == pytest.approx(target / 4)
     above = dataclasses.replace(image, reflectance=networks.Reflectance(None, None, gloss[0], 0.04 + 0.96 * gloss[1]))
-    assert float(losses.gloss(above, 0.04, 0.5, 4)) == pytest.approx(wanted / 4, rel=1e-5)
+    assert float(losses.gloss(above, 0.04, 0.5, 4)) == pytest.approx(target / 4, rel=1e-5)

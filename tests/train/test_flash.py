@@ -37,13 +37,14 @@ def test_light_at_the_camera_is_the_collocated_formula(rim):
     u = torch.rand(n, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     d, t, light = directions(n), 2 + 2 * u[:, 0], torch.tensor([[30.0, 20.0, 10.0]]).double().expand(n, 3)
     camera = torch.tensor([[0.4, -0.3, 3.0]]).double()
-    x, seen = camera + t[:, None] * d, Optical(0.01 + 3 * u[:, 1], 5 * u[:, 2])
+    x, optical = camera + t[:, None] * d, Optical(0.01 + 3 * u[:, 1], 5 * u[:, 2])
     reflectance = directions(n, 3), *materials(n)
-    found = shots.flash(camera, TransmittanceTargets()).send(seen, reflectance, d, x, torch.zeros(n).long(), light, rim)
-    _, v = seen.weights()
+    lamp = shots.flash(camera, TransmittanceTargets())
+    actual = lamp.send(optical, reflectance, d, x, torch.zeros(n).long(), light, rim)
+    _, v = optical.weights()
     expected = v[:, None] * volume.shade(reflectance, d, t, light, rim)
     assert 0.4 < float((expected > 0).any(1).double().mean()) < 0.6, "what faces the camera, and what does not"
-    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(actual, expected, rtol=1e-9, atol=1e-15)
 
 
 class Skin:
@@ -110,15 +111,15 @@ def test_a_thin_skin_is_the_integral_over_its_depth(rim):
         # Cells of unequal depths.
         places = np.sort(np.random.default_rng(0).uniform(0, 0.8, 30))
         places = np.concatenate([[0], places, [0.8]]) / wo[2]
-        seen = Optical(*(torch.as_tensor(v) for v in (np.diff(places), places[:-1])))
+        optical = Optical(*(torch.as_tensor(v) for v in (np.diff(places), places[:-1])))
         one = torch.ones(31).double()
         row = {"n": n, "wo": wo, "wi": wi}
         row = {k: torch.as_tensor(v).expand(31, 3) for k, v in row.items()}
         reflectance = row["n"], albedo * one[:, None].expand(31, 3), roughness * one, specular * one
-        found = shots.flash(torch.as_tensor(2 * wi[None]), TransmittanceTargets()).send(
-            seen, reflectance, -row["wo"], torch.zeros(31, 3).double(), torch.zeros(31).long(),
+        actual = shots.flash(torch.as_tensor(2 * wi[None]), TransmittanceTargets()).send(
+            optical, reflectance, -row["wo"], torch.zeros(31, 3).double(), torch.zeros(31).long(),
             5 * one[:, None].expand(31, 3), rim)
-        np.testing.assert_allclose(found.sum(0), expected, rtol=1e-6)  # of the quadrature
+        np.testing.assert_allclose(actual.sum(0), expected, rtol=1e-6)  # of the quadrature
 
 
 def test_nothing_is_sent_from_below():
@@ -126,12 +127,12 @@ def test_nothing_is_sent_from_below():
     n = 300
     d, normal = directions(n, 5), directions(n, 6)
     lamp = shots.flash(directions(1, 7) * 3, TransmittanceTargets())
-    seen = Optical(torch.full((n,), 0.5).double(), torch.zeros(n).double())
+    optical = Optical(torch.full((n,), 0.5).double(), torch.zeros(n).double())
     wi, _ = lamp.toward(torch.zeros(n).long(), torch.zeros(n, 3).double())
-    found = lamp.send(seen, (normal, *materials(n)), d, torch.zeros(n, 3).double(), torch.zeros(n).long(),
+    actual = lamp.send(optical, (normal, *materials(n)), d, torch.zeros(n, 3).double(), torch.zeros(n).long(),
                       torch.ones(n, 3).double(), False)
     both = ((normal * wi).sum(1) > 0) & ((normal * -d).sum(1) > 0)
-    assert (found[both] > 0).all() and (found[~both] == 0).all() and 30 < int(both.sum()) < n - 30
+    assert (actual[both] > 0).all() and (actual[~both] == 0).all() and 30 < int(both.sum()) < n - 30
 
 
 def test_gradients():
@@ -165,25 +166,25 @@ def test_gradients():
 
 
 def test_places_are_right_up_and_forward_of_the_lenses():
-    """Of all splits, one after the other, in field coordinates, also where those are not the world's."""
+    """Positions are those of all splits, in field coordinates, also where these are not the world's."""
     offset, center, radius = (0.3, -0.2, 0.5), np.array([1.0, -2.0, 0.5]), 1.7
     c2w = shots.around(5, 6.0)
     c2w[:, :3, 3] += center
     blank = np.zeros((5, 2, 2, 4), np.uint8)
-    given = {"center": center, "radius": radius}
-    first = shots.photographs(blank[:3], c2w=c2w[:3], offset=offset, **given)
-    second = shots.photographs(blank[3:], c2w=c2w[3:], first=3, **given)
+    options = {"center": center, "radius": radius}
+    first = shots.photographs(blank[:3], c2w=c2w[:3], offset=offset, **options)
+    second = shots.photographs(blank[3:], c2w=c2w[3:], first=3, **options)
     lamp = flash.Flash([first, second], True, TransmittanceTargets())
     truth = ((c2w @ (0.3, -0.2, -0.5, 1.0))[:, :3] - center) / radius
     lenses = (c2w[:, :3, 3] - center) / radius
     np.testing.assert_allclose(lamp.place, np.concatenate([truth[:3], lenses[3:]]), atol=1e-6)
     assert not first.on_lens and second.on_lens
-    found = lamp.places(torch.tensor(offset) / radius)
-    np.testing.assert_allclose(found, truth, atol=1e-6)
+    actual = lamp.places(torch.tensor(offset) / radius)
+    np.testing.assert_allclose(actual, truth, atol=1e-6)
     np.testing.assert_allclose(lamp.places(torch.zeros(3)), lenses, atol=1e-6)
     np.testing.assert_allclose(lamp.place[3:], lenses[3:], atol=1e-6)  # nothing moved so far
     lamp.move(torch.tensor(offset) / radius)
-    assert torch.equal(lamp.place, found)
+    assert torch.equal(lamp.place, actual)
     x = torch.tensor([[0.1, 0.2, 0.3], [0.4, 0.0, 0.0]])
     wi, distance = lamp.toward(torch.tensor([4, 1]), x)
     np.testing.assert_allclose(x.numpy() + (distance * wi).numpy(), truth[[4, 1]], atol=1e-6)
@@ -191,7 +192,7 @@ def test_places_are_right_up_and_forward_of_the_lenses():
 
 CENTRE, RADIUS = np.array([0.2, -0.1, 0.15]), 0.3
 LAMPS = torch.tensor([[0.5, 0.3, 3.0], [-0.4, 0.0, -0.5]])
-"""One far away, one within the unit sphere."""
+"""A far lamp, and one within the unit sphere."""
 
 
 def ball(log_sigma: float) -> TransmittanceTargets:
@@ -200,22 +201,22 @@ def ball(log_sigma: float) -> TransmittanceTargets:
     axis = (np.arange(k) + 0.5) * (2 / k) - 1
     z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
     inside = ((np.stack([x, y, z], -1) - CENTRE) ** 2).sum(-1) < RADIUS**2
-    found = TransmittanceTargets()
-    found.log_sigma = torch.as_tensor(np.where(inside, log_sigma, -12.0)[None, None], dtype=torch.float32)
-    found.reach = 1.0
-    return found
+    actual = TransmittanceTargets()
+    actual.log_sigma = torch.as_tensor(np.where(inside, log_sigma, -12.0)[None, None], dtype=torch.float32)
+    actual.reach = 1.0
+    return actual
 
 
 def way(x: np.ndarray, lamp: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """``(nearest, through)``: how near the ways from `x` (n, 3) to `lamp` (3,) come to the ball's centre, and how much
     of them is in it."""
-    away = lamp - x
-    length = np.linalg.norm(away, axis=1)
-    away /= length[:, None]
-    middle = ((CENTRE - x) * away).sum(1)
+    path = lamp - x
+    length = np.linalg.norm(path, axis=1)
+    path /= length[:, None]
+    middle = ((CENTRE - x) * path).sum(1)
     at = middle.clip(0, length)
-    nearest = np.linalg.norm(x + at[:, None] * away - CENTRE, axis=1)
-    half = np.sqrt((RADIUS**2 - ((x + middle[:, None] * away - CENTRE) ** 2).sum(1)).clip(0))
+    nearest = np.linalg.norm(x + at[:, None] * path - CENTRE, axis=1)
+    half = np.sqrt((RADIUS**2 - ((x + middle[:, None] * path - CENTRE) ** 2).sum(1)).clip(0))
     return nearest, ((middle + half).clip(0, length) - (middle - half).clip(0, length)).clip(0)
 
 
@@ -225,13 +226,13 @@ def test_shadow_and_light_are_where_an_opaque_ball_puts_them():
     x = x[np.linalg.norm(x - CENTRE, axis=1) > RADIUS + 0.04]
     lamp = shots.flash(LAMPS, ball(6.0))
     for number in (0, 1):
-        found = lamp.reaching(torch.full((len(x),), number), torch.as_tensor(x, dtype=torch.float32)).numpy()
+        actual = lamp.reaching(torch.full((len(x),), number), torch.as_tensor(x, dtype=torch.float32)).numpy()
         nearest, _ = way(x, LAMPS[number].numpy().astype(float))
         # Voxels of 1/64 smear the ball's rim.
         shadow, light = nearest < RADIUS - 0.025, nearest > RADIUS + 0.025
         assert shadow.sum() > 100 and light.sum() > 1000
-        assert (found[shadow] < 0.01).all(), found[shadow].max()
-        assert (found[light] > 0.999).all(), found[light].min()
+        assert (actual[shadow] < 0.01).all(), actual[shadow].max()
+        assert (actual[light] > 0.999).all(), actual[light].min()
     unknown = shots.flash(LAMPS, TransmittanceTargets())
     assert (unknown.reaching(torch.zeros(9).long(), torch.zeros(9, 3)) == 1).all()
 
@@ -241,11 +242,11 @@ def test_a_skin_is_lit_from_outside_of_its_own_matter():
     normal = directions(2000, 4).float()
     x = torch.as_tensor(CENTRE).float() + (RADIUS - 0.005) * normal
     lamp, view = shots.flash(LAMPS, ball(6.0)), torch.zeros(2000).long()
-    found = lamp.lit(view, x, 0.3 * normal)  # mean normals are shorter than 1
+    actual = lamp.lit(view, x, 0.3 * normal)  # mean normals are shorter than 1
     cos = (normal * lamp.toward(view, x)[0]).sum(1)
     # At grazing angles the lift of 0.02 is not out of voxels of 1/64, and on the other side goes past them.
-    assert (found[cos > 0.45] > 0.99).all(), found[cos > 0.45].min()
-    assert (found[cos < -0.5] < 0.01).all(), found[cos < -0.5].max()
+    assert (actual[cos > 0.45] > 0.99).all(), actual[cos > 0.45].min()
+    assert (actual[cos < -0.5] < 0.01).all(), actual[cos < -0.5].max()
     assert float(lamp.reaching(view, x - 0.015 * normal)[cos > 0.45].mean()) < 0.5
     assert (shots.flash(LAMPS, ball(6.0), solid=False).lit(view, x, normal) == 1).all()
 
@@ -266,10 +267,10 @@ def test_thick_skins_do_not_shade_themselves(thick):
     at = o - t[:, None] * normal
     lamp, view = shots.flash(LAMPS, marched), torch.zeros(500).long()
     cos = (normal * lamp.toward(view, at)[0]).sum(1)
-    found = lamp.lit(view, at, normal)
+    actual = lamp.lit(view, at, normal)
     # What is left above the place where the ray begins: σ over its logarithm's slope, of the highest lift if need be.
     rest = max(flash.CLEAR * thick, 0.7 * np.exp(-flash.LIFTS[-1] / thick)) / 0.6
-    assert float(found[cos > 0.6].min()) > np.exp(-1.1 * rest) > 0.83 and float(found[cos < -0.6].max()) < 0.03
+    assert float(actual[cos > 0.6].min()) > np.exp(-1.1 * rest) > 0.83 and float(actual[cos < -0.6].max()) < 0.03
     places = flash.above(marched, at, normal)
     height = ((places - at) * normal).sum(1)
     np.testing.assert_allclose(places, at + height[:, None] * normal, atol=1e-6)
@@ -279,10 +280,10 @@ def test_thick_skins_do_not_shade_themselves(thick):
     # The first that is out of matter: the one before is in it.
     depth = ((RADIUS - (at - torch.as_tensor(CENTRE).float()).norm(dim=1))[:, None] - levels) / thick
     clear = depth < np.log(flash.CLEAR)
-    wanted = torch.where(clear.any(1), clear.to(torch.uint8).argmax(1), len(levels) - 1)
+    target = torch.where(clear.any(1), clear.to(torch.uint8).argmax(1), len(levels) - 1)
     # ln σ between voxels of 1/64 is not that of the radius.
-    assert float((nearest.indices == wanted).float().mean()) > 0.8
-    assert float((nearest.indices - wanted).abs().max()) <= 1
+    assert float((nearest.indices == target).float().mean()) > 0.8
+    assert float((nearest.indices - target).abs().max()) <= 1
 
 
 def test_points_in_smoke_are_lit_one_by_one():
@@ -298,13 +299,13 @@ def test_points_in_smoke_are_lit_one_by_one():
     np.testing.assert_allclose(lamp.reaching(view, tx), np.exp(-sigma * length), rtol=0.06)
     normal, d = directions(n, 10).float(), directions(n, 11).float()
     albedo, roughness, specular = (v.float() for v in materials(n))
-    seen = Optical(torch.full((n,), 0.2), torch.full((n,), 0.7))
+    optical = Optical(torch.full((n,), 0.2), torch.full((n,), 0.7))
     light = torch.full((n, 3), 6.0)
-    found = lamp.send(seen, (normal, albedo, roughness, specular), d, tx, view, light, False)
-    away = LAMPS[view].numpy() - x
-    distance = np.linalg.norm(away, axis=1)
-    wi, wo, m = ((v / np.linalg.norm(v, axis=1, keepdims=True)).T for v in (away, -d.numpy(), normal.numpy()))
+    actual = lamp.send(optical, (normal, albedo, roughness, specular), d, tx, view, light, False)
+    path = LAMPS[view].numpy() - x
+    distance = np.linalg.norm(path, axis=1)
+    wi, wo, m = ((v / np.linalg.norm(v, axis=1, keepdims=True)).T for v in (path, -d.numpy(), normal.numpy()))
     diffuse, gloss = microfacet.scattering(numpy_ops, tuple(wi), tuple(wo), tuple(m), roughness.numpy())
     lobe = ((1 - specular.numpy()) * diffuse)[:, None] * albedo.numpy() + (specular.numpy() * gloss)[:, None]
     weight = np.exp(-0.7) * (1 - np.exp(-0.2)) * np.exp(-sigma * length) * 6 / distance**2
-    np.testing.assert_allclose(found, weight[:, None] * lobe, rtol=0.06, atol=1e-6)
+    np.testing.assert_allclose(actual, weight[:, None] * lobe, rtol=0.06, atol=1e-6)

@@ -47,9 +47,9 @@ def test_the_preset_is_the_papers():
 def test_draw_at_known_places():
     """Weights 0, 1, 3, 0 on quarters of [0, 1]: a quarter of the samples in the second, the rest in the third."""
     u = torch.tensor([[0.0, 0.125, 0.25, 0.625, 0.9985]])
-    found = hierarchical.inverse_cdf(torch.tensor([[0.0, 1.0, 3.0, 0.0]]), u)
+    actual = hierarchical.inverse_cdf(torch.tensor([[0.0, 1.0, 3.0, 0.0]]), u)
     # Every cell gets a weight of 1e-5 besides, which moves shares by as much.
-    np.testing.assert_allclose(found[0, 1:], [0.375, 0.5, 0.625, 0.7495], atol=1e-4)
+    np.testing.assert_allclose(actual[0, 1:], [0.375, 0.5, 0.625, 0.7495], atol=1e-4)
     even = hierarchical.inverse_cdf(torch.zeros(1, 4), u)
     np.testing.assert_allclose(even, u, atol=1e-6)  # float32
 
@@ -84,26 +84,26 @@ def test_view_of_a_half_space():
     o, d = torch.tensor([0.2, 0.0, -3.0]).expand(n, 3), torch.tensor([0.0, 0.0, 1.0]).expand(n, 3)
     t0, t1 = sphere_span(o, d)
     rays = Rays(o, d, t0, t1, torch.zeros(n, 4), torch.ones(n, 3), torch.zeros(n, dtype=torch.long))
-    seen = hierarchical.view(Slab(), Slab(), rays, (64, 128), torch.Generator().manual_seed(0))
-    assert seen.t.shape == (n, 192) and (seen.t.diff(dim=1) >= 0).all()
-    assert (seen.t >= t0[:, None]).all() and (seen.t <= t1[:, None] + 1e-5).all()
-    z = seen.t - 3
+    rendered = hierarchical.view(Slab(), Slab(), rays, (64, 128), torch.Generator().manual_seed(0))
+    assert rendered.t.shape == (n, 192) and (rendered.t.diff(dim=1) >= 0).all()
+    assert (rendered.t >= t0[:, None]).all() and (rendered.t <= t1[:, None] + 1e-5).all()
+    z = rendered.t - 3
     expected = torch.exp(-8 * z.clamp(min=0))
     # The front is an edge of the coarse cells (of 1/32): in the middle between a fine sample right behind it and the
     # coarse one before it, σ begins up to 1/64 too early.
-    assert float((seen.tau - expected).abs().max()) < 1 - np.exp(-8 / 64)
+    assert float((rendered.tau - expected).abs().max()) < 1 - np.exp(-8 / 64)
     # 64 coarse samples, 31 of them in front; of the fine ones, all but the first coarse cell's lie behind.
     assert 31 <= float((z < 0).float().sum(1).mean()) < 31 + 128 * 8 / 32
-    np.testing.assert_allclose(seen.fine.alpha, 1 - np.exp(-8 * np.sqrt(1 - 0.04)), rtol=1e-3)
+    np.testing.assert_allclose(rendered.fine.alpha, 1 - np.exp(-8 * np.sqrt(1 - 0.04)), rtol=1e-3)
     # ∫ e^{−16 z} 8 dz = 1/2 at t ≈ 3: SURFACE · 1/2 · albedo/π / t², within the front's error and the spread of t
-    np.testing.assert_allclose(seen.fine.color.mean(0), 0.5 / np.pi / 3.06**2, rtol=0.03)
+    np.testing.assert_allclose(rendered.fine.color.mean(0), 0.5 / np.pi / 3.06**2, rtol=0.03)
 
 
 def test_gradients_of_the_transmittance_loss_stay_in_its_network(photographs, tmp_path):
     recipe = run(photographs, tmp_path / "f").recipe
     batch = recipe.patches()
-    seen = hierarchical.view(recipe.coarse, recipe.networks, batch, (16, 16), recipe.generator)
-    terms = recipe.ntf_loss(seen, batch, batch.target[:, :3])
+    rendered = hierarchical.view(recipe.coarse, recipe.networks, batch, (16, 16), recipe.generator)
+    terms = recipe.ntf_loss(rendered, batch, batch.target[:, :3])
     assert set(terms) == {"transmittance", "lit colour"}
     for term in terms.values():
         grown = torch.autograd.grad(term, list(recipe.parameters().values()), retain_graph=True, allow_unused=True)
@@ -115,12 +115,12 @@ def test_gradients_of_the_transmittance_loss_stay_in_its_network(photographs, tm
 
 
 def test_transmittance_learns_from_a_field(photographs, tmp_path):
-    """One batch, again and again: the loss falls to less than half."""
+    """The loss falls to less than half if the same batch is repeated."""
     recipe = run(photographs, tmp_path / "f").recipe
     rays = recipe.random_rays()
     with torch.no_grad():
-        seen = hierarchical.view(recipe.coarse, recipe.networks, rays, (16, 16), recipe.generator)
-    values = [recipe.learner.descend("ntf", recipe.ntf_loss(seen, rays, seen.fine.color)["transmittance"], 1.0)
+        rendered = hierarchical.view(recipe.coarse, recipe.networks, rays, (16, 16), recipe.generator)
+    values = [recipe.learner.descend("ntf", recipe.ntf_loss(rendered, rays, rendered.fine.color)["transmittance"], 1.0)
               for _ in range(60)]
     assert values[-1] < 0.5 * values[0]
 

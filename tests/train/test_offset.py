@@ -1,4 +1,4 @@
-"""Where the flash stands beside the lens, from shading that is made for a known place."""
+"""Position of the flash beside the lens, estimated from shading that was computed for a known position."""
 
 import numpy as np
 import pytest
@@ -34,17 +34,17 @@ def observed(place: tuple[float, float, float], points: int = 500, outliers: flo
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     x = RADIUS * normal
     right, up, forward = place
-    away = (C2W @ (right, up, -forward, 1.0))[:, None, :3] - x
-    distance = np.linalg.norm(away, axis=2)
-    cosine = (away * normal).sum(2) / distance
+    path = (C2W @ (right, up, -forward, 1.0))[:, None, :3] - x
+    distance = np.linalg.norm(path, axis=2)
+    cosine = (path * normal).sum(2) / distance
     value = rng.uniform(-2, 0, points) + rng.uniform(-0.7, 0.7, (VIEWS, 1)) + np.log(cosine.clip(0.01))
     value = value - 2 * np.log(distance) + 0.03 * rng.normal(size=value.shape)
     kind = rng.uniform(size=value.shape)
     value = np.where(kind < outliers / 2, value - rng.uniform(0.5, 3, value.shape), value)
     value = np.where(kind > 1 - outliers / 2, value + rng.uniform(0.3, 2, value.shape), value)
     toward = C2W[:, None, :3, 3] - x
-    seen = (toward * normal).sum(2) / np.linalg.norm(toward, axis=2) > offset.FACING
-    return offset.Observed(*(torch.as_tensor(v, dtype=torch.float32) for v in (x, normal, value * seen, seen)))
+    shown = (toward * normal).sum(2) / np.linalg.norm(toward, axis=2) > offset.FACING
+    return offset.Observed(*(torch.as_tensor(v, dtype=torch.float32) for v in (x, normal, value * shown, shown)))
 
 
 def degrees_apart(a, b) -> float:
@@ -58,11 +58,11 @@ def degrees_apart(a, b) -> float:
 def test_a_known_place_is_found(place, within):
     """To a degree; what it is nearer to the object than the lens is not looked for, and changes the direction by some.
     """
-    seen, lights = observed(place), flashes()
-    found = offset.estimate(seen, lights, VIEWS, DISTANCE)
-    assert found.shape == (3,) and float(found[2]) == 0
-    assert degrees_apart(found, place) < within, found
-    there, lens = (offset.cost(seen, lights.places(torch.tensor(v))[:VIEWS]) for v in (place, (0.0, 0.0, 0.0)))
+    data, lights = observed(place), flashes()
+    actual = offset.estimate(data, lights, VIEWS, DISTANCE)
+    assert actual.shape == (3,) and float(actual[2]) == 0
+    assert degrees_apart(actual, place) < within, actual
+    there, lens = (offset.cost(data, lights.places(torch.tensor(v))[:VIEWS]) for v in (place, (0.0, 0.0, 0.0)))
     assert 0 <= there <= lens < 1 and (there < 0.7 * lens or not any(place))
 
 
@@ -105,22 +105,22 @@ def test_what_photographs_show_of_points():
     grid = Occupancy(torch.ones((64,) * 3, dtype=torch.bool))
     baked.update(Ball(), grid)
     marched.update(Ball(), grid)
-    seen = offset.observe(pool, pool[pool.random(1500, torch.Generator().manual_seed(0))], baked, marched)
-    count = len(seen.x)
-    assert count > 500 and seen.value.shape == seen.used.shape == (views, count) and seen.normal.shape == (count, 3)
-    np.testing.assert_allclose((seen.x - CENTRE).norm(dim=1), RADIUS, atol=0.02)  # voxels of 1/64
-    assert float((seen.normal * F.normalize(seen.x - CENTRE, dim=1)).sum(1).min()) > 0.98  # steps of 1/48, blurred
-    used = seen.used > 0
-    assert ((seen.used == 0) | (seen.used == 1)).all() and (seen.used.sum(0) >= 3).all()
-    error = (seen.value - seen.x @ HUE)[used]
+    data = offset.observe(pool, pool[pool.random(1500, torch.Generator().manual_seed(0))], baked, marched)
+    count = len(data.x)
+    assert count > 500 and data.value.shape == data.used.shape == (views, count) and data.normal.shape == (count, 3)
+    np.testing.assert_allclose((data.x - CENTRE).norm(dim=1), RADIUS, atol=0.02)  # voxels of 1/64
+    assert float((data.normal * F.normalize(data.x - CENTRE, dim=1)).sum(1).min()) > 0.98  # steps of 1/48, blurred
+    used = data.used > 0
+    assert ((data.used == 0) | (data.used == 1)).all() and (data.used.sum(0) >= 3).all()
+    error = (data.value - data.x @ HUE)[used]
     # A pixel is 0.02 wide at the ball, more at its rim; the points are off its surface by a voxel.
     assert float(error.abs().quantile(0.95)) < 0.03 and abs(float(error.mean())) < 0.005
     # What is used is what faces the camera and is in the picture, apart from points at the limits of either.
     sure, never = torch.zeros_like(used), torch.zeros_like(used)
     for number in range(views):
-        away = pool.origin[number].float() - seen.x
-        cosine = (away * (seen.x - CENTRE)).sum(1) / RADIUS / away.norm(dim=1)
-        local = -away.double() @ pool.rotation[number]
+        path = pool.origin[number].float() - data.x
+        cosine = (path * (data.x - CENTRE)).sum(1) / RADIUS / path.norm(dim=1)
+        local = -path.double() @ pool.rotation[number]
         at = local[:, :2] / -local[:, 2:] * torch.tensor([1, -1]) * torch.as_tensor(focal) + size / 2
         inside = (at > 1).all(1) & (at < size - 1).all(1)
         dark = (at < 21).all(1)

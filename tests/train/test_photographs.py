@@ -30,30 +30,30 @@ def crooked(kind: str = "uint8") -> schema.Split:
 
 
 def test_rays_are_those_of_the_data_set():
-    """All pixels' against :func:`pixel_rays` in float64, and where they meet the unit sphere against the quadratic."""
+    """Rays of all pixels agree with :func:`pixel_rays` in float64, their ends in the sphere with the quadratic."""
     split = crooked()
     pool = shots.Photographs(split, 7)
     assert (len(pool), pool.views, pool.height, pool.width) == (N * HEIGHT * WIDTH, N, HEIGHT, WIDTH)
-    found = pool[:]
+    actual = pool[:]
     origin, direction = schema.pixel_rays(split.c2w, split.focal, WIDTH, HEIGHT, split.principal)
     o, d = ((origin - CENTER) / RADIUS).reshape(-1, 3), direction.reshape(-1, 3)
-    np.testing.assert_allclose(found.o, o, rtol=0, atol=2.0**-23 * 4)  # rounded to float32 once
-    np.testing.assert_allclose(found.d, d, rtol=0, atol=2.0**-24)
-    assert found.o.dtype == found.d.dtype == found.t0.dtype == torch.float32
+    np.testing.assert_allclose(actual.o, o, rtol=0, atol=2.0**-23 * 4)  # rounded to float32 once
+    np.testing.assert_allclose(actual.d, d, rtol=0, atol=2.0**-24)
+    assert actual.o.dtype == actual.d.dtype == actual.t0.dtype == torch.float32
     middle = -(o * d).sum(1)
     square = middle**2 - (o * o).sum(1) + 1
     hit = square > 1e-4
     assert 0.05 < hit.mean() < 0.9
     half = np.sqrt(square[hit])
-    np.testing.assert_allclose(found.t0.numpy()[hit], middle[hit] - half, atol=2e-4)  # a root of float32 differences
-    np.testing.assert_allclose(found.t1.numpy()[hit], middle[hit] + half, atol=2e-4)
-    assert (found.t1 == found.t0).numpy()[square < -1e-4].all()
-    np.testing.assert_array_equal(found.view, 7 + np.repeat(np.arange(N), HEIGHT * WIDTH))
-    np.testing.assert_allclose(found.light, 1 / RADIUS**2, rtol=1e-6)
-    some = torch.tensor([5, 700, 0, 5])
-    for index in (some, slice(100, 200, 7)):
+    np.testing.assert_allclose(actual.t0.numpy()[hit], middle[hit] - half, atol=2e-4)  # a root of float32 differences
+    np.testing.assert_allclose(actual.t1.numpy()[hit], middle[hit] + half, atol=2e-4)
+    assert (actual.t1 == actual.t0).numpy()[square < -1e-4].all()
+    np.testing.assert_array_equal(actual.view, 7 + np.repeat(np.arange(N), HEIGHT * WIDTH))
+    np.testing.assert_allclose(actual.light, 1 / RADIUS**2, rtol=1e-6)
+    subset = torch.tensor([5, 700, 0, 5])
+    for index in (subset, slice(100, 200, 7)):
         for name in ("o", "d", "t0", "t1", "target", "light", "view"):
-            assert torch.equal(getattr(pool[index], name), getattr(found, name)[index]), name
+            assert torch.equal(getattr(pool[index], name), getattr(actual, name)[index]), name
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -62,10 +62,10 @@ def test_pixels_are_decoded_as_the_readers_say(kind):
     pool = shots.Photographs(split)
     expected = images.linear(split.images).reshape(-1, 4)
     np.testing.assert_array_equal(pool[:].target, expected)
-    some = torch.tensor([300, 2, 2, len(pool) - 1])
-    found = pool.pixels(some)
-    assert found.dtype == torch.float32 and pool.quantized == (kind == "uint8")
-    np.testing.assert_array_equal(found, expected[some])
+    subset = torch.tensor([300, 2, 2, len(pool) - 1])
+    actual = pool.pixels(subset)
+    assert actual.dtype == torch.float32 and pool.quantized == (kind == "uint8")
+    np.testing.assert_array_equal(actual, expected[subset])
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -113,22 +113,22 @@ def test_windows_hold_every_pixel_that_sees_a_ball(distance, margin):
     every = pool[:]
     for points in (0.3 * torch.rand(40, 3, generator=generator), 0.5 * torch.rand(1, 3, generator=generator) - 0.25):
         pool.look_at(points, margin)
-        away = points[None] - pool.origin[:, None].float()
-        along = torch.einsum("vpk,vnk->vpn", away, every.d.view(n, -1, 3))
-        across = ((away**2).sum(2)[:, :, None] - along**2).clamp(min=0).sqrt()
-        seen = ((across < margin) & (along > 0)).any(1).view(n, size, size)
-        assert int(seen.sum()) > 200
-        share = 0.0
+        path = points[None] - pool.origin[:, None].float()
+        along = torch.einsum("vpk,vnk->vpn", path, every.d.view(n, -1, 3))
+        across = ((path**2).sum(2)[:, :, None] - along**2).clamp(min=0).sqrt()
+        observed = ((across < margin) & (along > 0)).any(1).view(n, size, size)
+        assert int(observed.sum()) > 200
+        fraction = 0.0
         for number, (top, bottom, left, right) in enumerate(pool.windows.tolist()):
             assert 0 <= top < bottom <= size and 0 <= left < right <= size
-            share += (bottom - top) * (right - left) / size**2 / n
-            rest = seen[number].clone()
+            fraction += (bottom - top) * (right - left) / size**2 / n
+            rest = observed[number].clone()
             rest[top:bottom, left:right] = False
             assert not rest.any(), (number, rest.nonzero()[0], pool.windows[number])
-            rows = seen[number].any(1).nonzero()[:, 0]
+            rows = observed[number].any(1).nonzero()[:, 0]
             if len(points) == 1 and len(rows) and 0 < rows[0] and rows[-1] < size - 1:  # not much more than that
                 assert bottom - top <= rows[-1] - rows[0] + 1 + 6 + 0.7 * margin * 90 * distance
-        assert share < 0.8
+        assert fraction < 0.8
     outside = torch.tensor([[5.0, 5.0, 5.0]])
     pool.look_at(outside, margin)
     assert (pool.windows[:, 1] > pool.windows[:, 0]).all() and (pool.windows[:, 3] > pool.windows[:, 2]).all()
@@ -154,6 +154,6 @@ def test_frames():
 
 def test_lights_at_the_lens():
     c2w, blank = shots.around(2), np.zeros((2, 1, 1, 4), np.uint8)
-    for share, wanted in ((0, True), (0.9, True), (1.1, False)):
-        offset = (0, share * ON_LENS * RADIUS, 0)
-        assert shots.photographs(blank, c2w=c2w, offset=offset, radius=RADIUS).on_lens is wanted
+    for fraction, on_lens in ((0, True), (0.9, True), (1.1, False)):
+        offset = (0, fraction * ON_LENS * RADIUS, 0)
+        assert shots.photographs(blank, c2w=c2w, offset=offset, radius=RADIUS).on_lens is on_lens

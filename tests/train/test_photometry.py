@@ -17,39 +17,39 @@ RELATIVE = FACTORS / np.exp(np.log(FACTORS).mean(0))
 """The same of geometric mean 1."""
 
 
-def toy(albedo, rows=slice(3, 9), kind="float32", **given):
+def toy(albedo, rows=slice(3, 9), kind="float32", **options):
     """An object of that `albedo` (…, 3) in some rows of photographs with those factors, before a bright background that
     belongs to nothing."""
     pictures = np.zeros((VIEWS, SIDE, SIDE, 4))
-    pictures[..., 3], pictures[..., :3] = 0.4 * ("masked" not in given), 0.9
+    pictures[..., 3], pictures[..., :3] = 0.4 * ("masked" not in options), 0.9
     pictures[:, rows] = 1
     pictures[:, rows, :, :3] = albedo * FACTORS[:, None, None]
-    return shots.photographs(levels(pictures) if kind == "uint8" else pictures.astype(kind), **given)
+    return shots.photographs(levels(pictures) if kind == "uint8" else pictures.astype(kind), **options)
 
 
 @pytest.mark.parametrize(("kind", "tolerance"), [("float32", 1e-5), ("float16", 2e-3), ("uint8", 0.05)])
 def test_gains_start_at_the_brightness_of_the_object(kind, tolerance):
     """Which is right where all photographs see the same; the background does not count. Levels of 0.05 are 3 %
     apart."""
-    for given in ({}, {"masked": False}):
-        found = Gains(toy((0.3, 0.2, 0.1), kind=kind, first=4, **given))
-        np.testing.assert_allclose(found.all().detach(), RELATIVE, rtol=tolerance)
-        some = torch.tensor([9, 4, 4])
-        assert torch.equal(found(some), found.all()[[5, 0, 0]])
+    for options in ({}, {"masked": False}):
+        actual = Gains(toy((0.3, 0.2, 0.1), kind=kind, first=4, **options))
+        np.testing.assert_allclose(actual.all().detach(), RELATIVE, rtol=tolerance)
+        subset = torch.tensor([9, 4, 4])
+        assert torch.equal(actual(subset), actual.all()[[5, 0, 0]])
 
 
 def test_gains_have_the_geometric_mean_1_whatever_their_parameters():
-    found = Gains(toy((0.3, 0.2, 0.1)))
+    actual = Gains(toy((0.3, 0.2, 0.1)))
     generator = torch.Generator().manual_seed(0)
     for _ in range(5):
         with torch.no_grad():
-            found.logs.copy_(5 * torch.randn(VIEWS, 3, generator=generator) + 2)
-        np.testing.assert_allclose(found.all().detach().log().mean(0), 0, atol=1e-6)
-    before = found.all().detach()
+            actual.logs.copy_(5 * torch.randn(VIEWS, 3, generator=generator) + 2)
+        np.testing.assert_allclose(actual.all().detach().log().mean(0), 0, atol=1e-6)
+    before = actual.all().detach()
     with torch.no_grad():
-        found.logs += torch.tensor([3.0, -1.0, 0.5])
-    torch.testing.assert_close(found.all().detach(), before, rtol=1e-5, atol=0)
-    assert found.logs.requires_grad and found.all().requires_grad
+        actual.logs += torch.tensor([3.0, -1.0, 0.5])
+    torch.testing.assert_close(actual.all().detach(), before, rtol=1e-5, atol=0)
+    assert actual.logs.requires_grad and actual.all().requires_grad
 
 
 def test_a_photograph_without_the_object_starts_at_1():
@@ -103,9 +103,9 @@ def test_factors_of_held_back_photographs_are_least_squares():
     assert float((predicted * target)[:, 2].sum() / predicted[:, 2].square().sum()) < 1.5
     # By channel: red stays exact where only blue is saturated.
     target[:, 2] = 1
-    found = fitted(predicted, target)
-    torch.testing.assert_close(found[:2], factors[:2])
-    assert found.isfinite().all()
+    actual = fitted(predicted, target)
+    torch.testing.assert_close(actual[:2], factors[:2])
+    assert actual.isfinite().all()
 
 
 def test_what_levels_count():
@@ -124,6 +124,6 @@ def test_what_levels_count():
         for row, (have, want, alpha, counts) in enumerate(cases):
             predicted[row, place], target[row, place], target[row, 3], expected[row, place] = have, want, alpha, counts
         predicted.requires_grad_()
-        found = trust(predicted, target)
-        np.testing.assert_array_equal(found, expected)
-        assert not found.requires_grad
+        actual = trust(predicted, target)
+        np.testing.assert_array_equal(actual, expected)
+        assert not actual.requires_grad

@@ -49,13 +49,13 @@ def test_a_run_killed_twice_ends_where_an_undisturbed_one_ends(photographs, undi
     execute(photographs, out, "step 10", code=-signal.SIGKILL)
     assert {p.name for p in tmp_path.iterdir()} == {"f.ckpt"}
     execute(photographs, out, "write 2", code=-signal.SIGKILL)  # after the first write at step 12, in that at step 16
-    left, checkpoint = sorted((p.name for p in tmp_path.iterdir()), key=len, reverse=True)
-    assert checkpoint == "f.ckpt" and left.startswith("f.ckpt.") and left.endswith(".part")
+    partial, checkpoint = sorted((p.name for p in tmp_path.iterdir()), key=len, reverse=True)
+    assert checkpoint == "f.ckpt" and partial.startswith("f.ckpt.") and partial.endswith(".part")
     execute(photographs, out)
-    (expected, tensors), (found, values) = undisturbed, result(out)
-    assert list(found["losses"]) == [str(i) for i in range(12, STEPS)], "one interval of 4 steps was lost, no more"
-    assert all(expected["losses"][k] == v for k, v in found["losses"].items())
-    assert found["history"] == expected["history"]
+    (expected, tensors), (actual, values) = undisturbed, result(out)
+    assert list(actual["losses"]) == [str(i) for i in range(12, STEPS)], "one interval of 4 steps was lost, no more"
+    assert all(expected["losses"][k] == v for k, v in actual["losses"].items())
+    assert actual["history"] == expected["history"]
     for name, value in tensors.items():
         assert value.tobytes() == values[name].tobytes(), name
     assert {p.name for p in tmp_path.iterdir()} == {"f", "f.html", "f.npz", "f.json"}
@@ -73,8 +73,8 @@ def test_two_processes_are_one(photographs, undisturbed, tmp_path):
     launcher = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2")
     text = execute(photographs, out, launcher=launcher)
     assert text.count("step 18: the field is finished") == 1, "one process prints"
-    (expected, tensors), (found, values) = undisturbed, result(out)
-    relative = {k: abs(found["losses"][k] / v - 1) for k, v in expected["losses"].items()}
+    (expected, tensors), (actual, values) = undisturbed, result(out)
+    relative = {k: abs(actual["losses"][k] / v - 1) for k, v in expected["losses"].items()}
     assert len(relative) == STEPS and max(relative.values()) < 1e-5, relative
     for name, value in tensors.items():  # of order 1
         assert np.sqrt(np.mean((values[name] - value) ** 2)) < 1e-4, name

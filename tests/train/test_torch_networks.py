@@ -67,8 +67,8 @@ def test_mixture_read_from_optical_depths(dtype, tolerance):
               for level in depth_profile.LEVELS]
     expected = np.stack(reference.ray_mixture(arch, tensors, x, d, places, profile[:, 0])[1]).transpose(2, 0, 1)
     with torch.no_grad():
-        _, found = nets.ray_mixture(*(torch.tensor(v, dtype=dtype) for v in (x, d, profile.copy())))
-    assert (np.abs(found.numpy() - expected) / np.abs(expected).max((0, 1))).max() <= tolerance
+        _, result = nets.ray_mixture(*(torch.tensor(v, dtype=dtype) for v in (x, d, profile.copy())))
+    assert (np.abs(result.numpy() - expected) / np.abs(expected).max((0, 1))).max() <= tolerance
     assert 0.2 < (profile[:, 0] > 4).mean() < 0.9, "opaque and translucent rays"
 
 

@@ -39,8 +39,8 @@ def test_a_finished_field_learns_another_transmittance(photographs, tmp_path, mo
     old, new = tmp_path / "old", tmp_path / "new"
     train(photographs, old, steps=8)
     report = train(photographs, new, steps=25, field=old, ntf="logistic", visibility_mlp=True)
-    (before, kept), (after, tensors) = field_file.load(old), field_file.load(new)
-    for name, value in kept.items():
+    (before, remaining), (after, tensors) = field_file.load(old), field_file.load(new)
+    for name, value in remaining.items():
         if name.startswith(("density", "reflectance")):
             assert np.array_equal(tensors[name], value), name
     assert after.architecture.transmittance.components == 1 and after.architecture.visibility is not None

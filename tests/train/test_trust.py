@@ -64,7 +64,7 @@ def test_rolling_back_restores_the_state_and_halves_the_rate(photographs, tmp_pa
     run.recipe.advance()
     run.clock.step = 1
     run.keep()
-    before, drawn = run.state(), torch.rand(1, generator=run.generator)
+    before, sampled = run.state(), torch.rand(1, generator=run.generator)
     run.generator.set_state(before["random"])
     rates = []
     for _ in range(2):
@@ -82,7 +82,7 @@ def test_rolling_back_restores_the_state_and_halves_the_rate(photographs, tmp_pa
             for key, value in moments.items():
                 assert torch.equal(value, after["learner"]["optimizers"][name]["state"][index][key]), (name, index, key)
     assert torch.equal(random, after["random"]), "the batch that failed does not come again"
-    assert not torch.equal(drawn, torch.rand(1, generator=run.generator))
+    assert not torch.equal(sampled, torch.rand(1, generator=run.generator))
     run.recipe.advance()
     assert run.learner.optimizers["field"].param_groups[0]["lr"] == rates[0] / 2
 

@@ -14,8 +14,7 @@ DISTANCE = 3.2
 
 
 def coarsen(monkeypatch) -> None:
-    """The preset `fast` on grids whose upkeep takes no longer than its steps: for runs of some steps that need not
-    learn."""
+    """Give the preset `fast` coarse grids, for runs of a few steps that need not learn."""
     from mi_ntf.train import config, scoring
 
     monkeypatch.setitem(config.PRESETS, "fast", dataclasses.replace(config.PRESETS["fast"], cells=48, bake=64))
@@ -23,7 +22,7 @@ def coarsen(monkeypatch) -> None:
 
 
 def glance(monkeypatch) -> None:
-    """Finished fields are compared with 500 pixels of the photographs: for runs whose scores do not matter."""
+    """Compare finished fields with 500 pixels of the photographs, for runs whose scores do not matter."""
     from mi_ntf.train import scoring
 
     whole = scoring.score
@@ -56,13 +55,13 @@ def photograph(c2w: np.ndarray, focal: float, size: int, oversample: int = 3, of
         hit = t < nearest
         nearest = np.where(hit, t, nearest)
         x = o + np.where(hit, t, 1)[..., None] * d
-        away = light - x
-        distance = np.linalg.norm(away, axis=-1)
-        away = away / distance[..., None]
-        cos = np.maximum(np.sum((x - center) / radius * away, -1), 0)
+        toward_light = light - x
+        distance = np.linalg.norm(toward_light, axis=-1)
+        toward_light = toward_light / distance[..., None]
+        cos = np.maximum(np.sum((x - center) / radius * toward_light, -1), 0)
         for other in SPHERES:
             if other[0] != center and any(offset):
-                between = _meet(x, away, *other[:2])
+                between = _meet(x, toward_light, *other[:2])
                 cos = np.where((between > 0) & (between < distance), 0, cos)
         value = np.asarray(albedo) / np.pi * (cos * INTENSITY / distance**2)[..., None]
         image[hit] = np.concatenate([value, np.ones((n, n, 1))], -1)[hit]
@@ -70,13 +69,13 @@ def photograph(c2w: np.ndarray, focal: float, size: int, oversample: int = 3, of
 
 
 def flash(c2w: np.ndarray, offset) -> np.ndarray:
-    """Where the light is that stands `offset`, right, up, forward, from the lens."""
+    """Return the position of a light at `offset`, right, up, forward, from the lens."""
     right, up, forward = offset
     return (c2w @ (right, up, -forward, 1.0))[:3]
 
 
 def _meet(o: np.ndarray, d: np.ndarray, center, radius: float) -> np.ndarray:
-    """Where rays enter a sphere; infinity where they do not."""
+    """Return the distances at which rays enter a sphere; infinity where they miss it."""
     b = np.sum((o - center) * d, -1)
     disc = b**2 - np.sum((o - center) ** 2, -1) + radius**2
     return np.where(disc > 0, -b - np.sqrt(np.maximum(disc, 0)), np.inf)
