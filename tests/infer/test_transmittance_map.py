@@ -16,7 +16,7 @@ from mi_ntf.infer.grid import baked
 from mi_ntf.infer.lights import LightTable
 from mi_ntf.infer.network import NetworkField
 from mi_ntf.infer.profile import DepthProfile
-from mi_ntf.infer.visibility.light_rays import DIRECTIONAL, FRUSTUM, SPHERE, LightRays, frames
+from mi_ntf.infer.visibility.light_rays import COLUMNS, DIRECTIONAL, FRUSTUM, KIND, SPHERE, LightRays, frames
 from mi_ntf.infer.visibility.map_source import CLEAR, Source, field_source, network_source
 from mi_ntf.infer.visibility.ray_network import RayNetwork
 from mi_ntf.infer.visibility.raymarch import optical_depth
@@ -176,7 +176,7 @@ def test_texels_are_square_and_no_more_than_asked_for(grid):
     tall = grid.hull * [0.3, 1.0, 0.3]
     for name in ("sun", "lamp", "far"):
         (row,) = frames(table(name), tall, 64)
-        columns = row[11]
+        columns = row[COLUMNS]
         lines = np.floor((64**2 + 0.5) / columns)
         assert 0.95 * 64**2 < columns * lines <= 64**2
         assert np.linalg.norm(row[:3]) / np.linalg.norm(row[4:7]) == pytest.approx(1, abs=0.06)  # whole texels
@@ -185,7 +185,7 @@ def test_texels_are_square_and_no_more_than_asked_for(grid):
 
 def test_which_lights_look_everywhere(grid):
     """A frustum where it covers the object, all directions where the light is near or within."""
-    kinds = frames(table(*LIGHTS), grid.hull, 32)[:, 15]
+    kinds = frames(table(*LIGHTS), grid.hull, 32)[:, KIND]
     np.testing.assert_array_equal(kinds, [DIRECTIONAL, FRUSTUM, FRUSTUM, FRUSTUM, SPHERE])
 
 

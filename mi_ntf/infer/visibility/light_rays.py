@@ -24,8 +24,8 @@ from ..backend import floats
 from ..lights import LightTable
 from ..types import Array, Float, Mask, UInt32, Vector
 
-ROW = 16
-"""Numbers of a light's row."""
+ROW, COLUMNS, KIND = 16, 11, 15
+"""Numbers in a row of :class:`Light`, and the positions of its `columns` and its `kind`."""
 PART = 128
 """Lights whose rectangles are searched at a time, so that the arrays stay in the processor's cache."""
 NEAREST_DEPTH = 0.2
@@ -77,7 +77,7 @@ class LightRays:
     def __init__(self, lights: LightTable, hull: np.ndarray, resolution: int, dj: ModuleType):
         self.dj, self.m, self.count = dj, resolution, lights.count
         rows = frames(lights, hull, resolution)
-        self.parallel, self.full = not (rows[:, 15] > 0).any(), bool((rows[:, 15] == SPHERE).any())
+        self.parallel, self.full = not (rows[:, KIND] > 0).any(), bool((rows[:, KIND] == SPHERE).any())
         self._rows = floats(rows, dj)
         self._texels = dr.opaque(dj.UInt32, resolution**2)
         self._area = dr.opaque(dj.Float, resolution**2 + 0.5)
@@ -94,7 +94,7 @@ class LightRays:
         first = self.dj.UInt32(index) * (ROW // 4)
         axes = (dr.gather(self.dj.Array4f, self._rows, first + i) for i in range(2))
         fu, fv = (dot((c[0], c[1], c[2]), x) + c[3] for c in axes)
-        columns = dr.gather(self.dj.Float, self._rows, first * 4 + 11)
+        columns = dr.gather(self.dj.Float, self._rows, first * 4 + COLUMNS)
         lines = dr.floor(self._area / columns)
         inside = (fu > -0.5) & (fv > -0.5) & (fu < columns - 0.5) & (fv < lines - 0.5)
         tu, tv = (dr.clip(dr.floor(f + r), 0, n - 1) for f, r, n in ((fu, u[0], columns), (fv, u[1], lines)))

@@ -20,15 +20,13 @@ from ...core import files
 from ...core.errors import MiNtfError
 from ...infer.lights import LightTable
 from ...infer.texels import DTYPES
-from ...infer.visibility.light_rays import frames
+from ...infer.visibility.light_rays import COLUMNS, frames
 from ...infer.visibility.method import Options
 from ...infer.visibility.transmittance_map import TransmittanceMap
 from ..scene.media import NRFMedium
 from .map_cache import description
 
 ATTRIBUTE = "mi_ntf"
-COLUMNS = 11
-"""Index of the number of columns in a row of :func:`.light_rays.frames`."""
 
 
 def write(path: Path, medium: NRFMedium, lights: LightTable, options: Options, maps: Iterable[TransmittanceMap]
