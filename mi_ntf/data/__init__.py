@@ -1,2 +1,1 @@
-"""Data sets of photographs with a flash: the format (`schema`), everything that is read (`readers`), and the virtual
-camera that makes them (`capture`)."""
+"""Data sets of photographs with a flash: format (`schema`), readers (`readers`), virtual camera (`capture`)."""

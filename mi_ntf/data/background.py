@@ -12,19 +12,14 @@ import numpy as np
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.data.images import linear, opencv
 
-EMPTY, UNKNOWN, MATTER = 0, 128, 255
-"""Alpha of the three kinds of pixels."""
-DARKEST = 0.08
-"""Brightest border that passes for black, as a fraction of the object's brightness."""
+EMPTY, UNKNOWN, MATTER = 0, 128, 255  # alpha of the three kinds of pixels
+DARKEST = 0.08  # brightest border that passes for black, as a fraction of the object's brightness
 NOISE, FAINT, CLEAR = 6.0, 0.005, 0.1
 """Thresholds above the border's brightness. A pixel is lit from NOISE deviations of the border's noise or FAINT of the
 object's brightness on, and it is matter from CLEAR on: the lens's glow around bright things is below."""
-CLOSE, AROUND = 0.05, 0.03
-"""Parts of the object in shadow may lie in gaps of up to 2 CLOSE between lit parts, and within AROUND of these."""
-SPECK = 0.01
-"""Lit parts with less than this fraction of the largest one's area are dust or noise."""
-RIM = 0.02
-"""Width of the border from which the room's brightness is measured."""
+CLOSE, AROUND = 0.05, 0.03  # shadows of the object fill gaps of 2 CLOSE between lit parts, and surround them by AROUND
+SPECK = 0.01  # lit parts with less than this fraction of the largest one's area are dust or noise
+RIM = 0.02  # width of the border from which the room's brightness is measured
 
 
 def alpha(stored: np.ndarray, where: str) -> np.ndarray:

@@ -230,37 +230,13 @@ def photograph(task: tuple[Request, int]) -> None:
 def capture(scene: Path, out: Path, *, views: int = 100, size: int = 128, test_views: int = 20, spp: int = 64,
             seed: int = 0, flash_offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
             workers: jobs.Workers = jobs.Workers()) -> dict[str, object]:  # noqa: B008
-    """Photograph a scene into a data set. The same call resumes what an earlier run began.
+    """Photograph a scene (Mitsuba XML) into the data set `out`. The same call resumes what an earlier run began.
 
-    Parameters
-    ----------
-    scene : Path
-        Mitsuba XML file of surfaces and media.
-    out : Path
-        Folder of the data set.
-    views, test_views : int
-        Photographs for training and for tests; max(4, views // 20) are added for validation.
-    size : int
-        Width and height in pixels.
-    spp : int
-        Paths for each pixel.
-    seed : int
-        Seed of views and paths.
-    flash_offset : tuple of float
-        Place of the flash right, up and forward of the lens, in scene lengths.
-    workers : Workers
-        Processes that render the views.
-
-    Returns
-    -------
-    dict
-        "center" and "radius" of the object's sphere, the numbers of images "rendered" and "kept", and "seconds".
-
-    Raises
-    ------
-    MiNtfError
-        If the scene cannot be photographed, if the folder holds a capture with other settings, or, after all others,
-        if views fail.
+    `views` are for training, and max(4, views // 20) are added for validation. `size` is the width and height in
+    pixels; each pixel has `spp` paths. `flash_offset` is the flash's place right, up and forward of the lens in scene
+    lengths. The result has the "center" and "radius" of the object's sphere, the numbers of images "rendered" and
+    "kept", and "seconds". Raises MiNtfError if the scene cannot be photographed, if the folder holds a capture with
+    other settings, or, after all others, if views fail.
     """
     for name, value in (("views", views), ("size", size), ("test_views", test_views), ("spp", spp)):
         if value < 1:

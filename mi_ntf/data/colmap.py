@@ -139,9 +139,6 @@ def _opengl(image: StoredImage) -> np.ndarray:
     return c2w
 
 
-# --- files ------------------------------------------------------------------------------------------------------------
-
-
 def _suffix(folder: Path) -> str | None:
     """Return the suffix of the model's files, None if there is no model; binary files come first."""
     return next((s for s in (".bin", ".txt") if (folder / f"cameras{s}").is_file() and (folder / f"images{s}").is_file()
@@ -189,9 +186,6 @@ def _points(rows: Iterator[tuple[float, ...]]) -> np.ndarray:
     if not np.isfinite(points).all():
         raise ValueError("a point is not finite")
     return points
-
-
-# --- text -------------------------------------------------------------------------------------------------------------
 
 
 def _rows(text: str) -> Iterator[list[str]]:
@@ -245,11 +239,8 @@ def _points_txt(text: str) -> np.ndarray:
     return _points((float(words[1]), float(words[2]), float(words[3])) for words in _rows(text))
 
 
-# --- binary: little-endian, counts before items -----------------------------------------------------------------------
-
-
 class _Bytes:
-    """Cursor in a file. `struct` raises beyond the end, so wrong counts end there."""
+    """Cursor in a binary file: little-endian, counts before items. `struct` raises beyond the end."""
 
     def __init__(self, data: bytes):
         self.data, self.position = data, 0

@@ -17,12 +17,9 @@ from mi_ntf.core.errors import MiNtfError, shown
 if TYPE_CHECKING:
     from PIL import Image, ImageCms
 
-TOLERANCE = 2
-"""Levels by which a colour may differ from the expected one for a profile to count as sRGB or as linear Rec. 709."""
-SRGB_GAMMA = 1 / 2.2
-"""`gAMA` of files in sRGB, by the specification."""
-PRIMARIES = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06)
-"""x and y of red, green and blue of Rec. 709 and sRGB."""
+TOLERANCE = 2  # levels by which colours may differ for a profile to count as sRGB or as linear Rec. 709
+SRGB_GAMMA = 1 / 2.2  # `gAMA` of files in sRGB, by the specification
+PRIMARIES = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06)  # x and y of red, green and blue of Rec. 709 and sRGB
 
 
 class Conversion(NamedTuple):
@@ -30,8 +27,7 @@ class Conversion(NamedTuple):
 
     transform: "ImageCms.ImageCmsTransform"
     title: str
-    changes: bool
-    """True if the conversion changes colours by more than ``TOLERANCE`` levels."""
+    changes: bool  # True if the conversion changes colours by more than ``TOLERANCE`` levels
 
 
 def to_srgb(image: "Image.Image", path: Path) -> "tuple[Image.Image, str | None]":

@@ -13,14 +13,10 @@ from mi_ntf.core.errors import MiNtfError
 from mi_ntf.data.images import linear
 from mi_ntf.data.poses import footprint, nearest_point
 
-MARGIN = 1.02
-"""Sphere's radius over the hull's: room for a soft surface. The hull's cells leave some room already."""
-COVERED = 0.1
-"""Alpha from which a pixel shows the object: compression noise and the rim of one pixel are below."""
-ALBEDO = 0.8
-"""Albedo that the brightest surface is assumed to have."""
-SAMPLES = 1 << 22
-"""Pixels that estimate the intensity, of all photographs together."""
+MARGIN = 1.02  # sphere's radius over the hull's: room for a soft surface. The hull's cells leave some room already
+COVERED = 0.1  # alpha from which a pixel shows the object: compression noise and the rim of one pixel are below
+ALBEDO = 0.8  # albedo that the brightest surface is assumed to have
+SAMPLES = 1 << 22  # pixels that estimate the intensity, of all photographs together
 
 
 class Sphere(NamedTuple):
@@ -123,18 +119,14 @@ def _carve(low: np.ndarray, edge: float, shape: np.ndarray, images: np.ndarray, 
         full = pixels > 0 if clear else ~window.inside | (pixels > 0)
         cells, views = cells[full], (views + window.inside)[full]
         if not len(cells):
-            raise _nothing_left(i, len(c2w))
+            break
     cells = cells[2 * views >= len(c2w)]
     if not len(cells):
-        raise _nothing_left(len(c2w) - 1, len(c2w))
+        raise MiNtfError(f"no point in space is covered by the object in all photographs (photograph {i} of 0 to "
+                         f"{len(c2w) - 1} for training takes the last one away), so poses and masks do not belong "
+                         "together; check that poses are camera-to-world with OpenGL axes, the field of view, and that "
+                         "no mask is inverted (white: object)")
     return cells
-
-
-def _nothing_left(photograph: int, count: int) -> MiNtfError:
-    return MiNtfError(f"no point in space is covered by the object in all photographs (photograph {photograph} of 0 to "
-                      f"{count - 1} for training takes the last one away), so poses and masks do not belong together; "
-                      "check that poses are camera-to-world with OpenGL axes, the field of view, and that no mask is "
-                      "inverted (white: object)")
 
 
 def _shell(cells: np.ndarray) -> np.ndarray:

@@ -13,18 +13,15 @@ from mi_ntf.core.errors import MiNtfError
 if TYPE_CHECKING:
     from PIL import Image
 
-ORIENTATION, WIDTH, LENGTH = 0x0112, 256, 257
-"""Tags of Exif and TIFF."""
-INVERSE = (0, 1, 2, 3, 4, 5, 8, 7, 6)
-"""The orientation that undoes each one."""
+ORIENTATION, WIDTH, LENGTH = 0x0112, 256, 257  # tags of Exif and TIFF
+INVERSE = (0, 1, 2, 3, 4, 5, 8, 7, 6)  # the orientation that undoes each one
 
 
 class Header(NamedTuple):
     """Header of an image file."""
 
     orientation: int
-    size: tuple[int, int]
-    """(width, height) in pixels."""
+    size: tuple[int, int]  # (width, height) in pixels
     has_alpha: bool
 
 

@@ -1,13 +1,12 @@
 """EXR files: the display window of the layer that holds the rendered picture.
 
-    R, G, B[, A]             channels without a layer's name are the picture
-    ViewLayer.Combined.R     layers (Blender, Nuke) or parts: the only one that has R, G and B, or the only one that
-                             is called Combined, Beauty or RGBA, is the picture
-    display window           the camera's image; pixels outside the data window are black and empty
+Channels R, G, B[, A] without a layer's name are the picture. Otherwise it is the only layer (ViewLayer.Combined.R, of
+Blender and Nuke) or part that has R, G and B, or the only one that is called Combined, Beauty or RGBA. Pixels of the
+display window outside the data window are black and empty.
 """
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -18,10 +17,8 @@ from mi_ntf.data.colour import PRIMARIES
 if TYPE_CHECKING:
     import OpenEXR
 
-PICTURES = ("combined", "beauty", "rgba")
-"""Last part of the names of layers that hold the rendered picture, in lower case."""
-LARGEST = 1 << 16
-"""Pixels of a display window's side."""
+PICTURES = ("combined", "beauty", "rgba")  # last part of the names of layers of rendered pictures, in lower case
+LARGEST = 1 << 16  # pixels of a display window's side
 
 
 class Layer(NamedTuple):
@@ -40,7 +37,10 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray | None, list[str]]:
         layer = _picture(file, path)
         header = file.header(layer.part)
         assumed = [f"the layer '{layer.name}' of an EXR file is its picture"] if layer.name else []
-        _check_primaries(header, path)
+        primaries = header.get("chromaticities")
+        if primaries is not None and np.abs(np.array(primaries[:6]) - PRIMARIES).max() > 0.01:
+            raise MiNtfError(f"{path}: its 'chromaticities' are {shown([round(v, 4) for v in primaries[:6]])}, other "
+                             "primaries than Rec. 709's; convert it to linear Rec. 709 (sRGB primaries)")
         (low, high), (left_top, right_bottom) = header["dataWindow"], header["displayWindow"]
         planes = {key: np.array(channel.pixels, dtype=np.float32) for key, channel in layer.channels.items()}
     if (low != left_top).any() or (high != right_bottom).any():
@@ -96,13 +96,6 @@ def _picture(file: "OpenEXR.File", path: Path) -> Layer:
                          f"called {', '.join(PICTURES)}; write the rendered picture as R, G, B, A without a layer")
     (key,) = chosen
     return Layer(*key, {channel: layers[key][channel] for channel in "RGBA" if channel in layers[key]})
-
-
-def _check_primaries(header: dict[str, Any], path: Path) -> None:
-    primaries = header.get("chromaticities")
-    if primaries is not None and np.abs(np.array(primaries[:6]) - PRIMARIES).max() > 0.01:
-        raise MiNtfError(f"{path}: its 'chromaticities' are {shown([round(v, 4) for v in primaries[:6]])}, other "
-                         "primaries than Rec. 709's; convert it to linear Rec. 709 (sRGB primaries)")
 
 
 def _windowed(plane: np.ndarray, offset: np.ndarray, size: np.ndarray) -> np.ndarray:

@@ -20,8 +20,7 @@ from mi_ntf.core import ops, srgb
 from mi_ntf.core.errors import MiNtfError, shown
 from mi_ntf.data import colour, exif, exr
 
-LINEAR = srgb.decode(ops, np.arange(256) / 255.0).astype(np.float32)
-"""sRGB's 256 levels in linear light."""
+LINEAR = srgb.decode(ops, np.arange(256) / 255.0).astype(np.float32)  # sRGB's 256 levels in linear light
 
 
 def linear(stored: np.ndarray) -> np.ndarray:
@@ -43,14 +42,10 @@ def levels(pixels: np.ndarray) -> np.ndarray:
 class Decoded(NamedTuple):
     """Content of an image file."""
 
-    rgb: np.ndarray
-    """(H, W, 3): 8-bit sRGB levels, or linear float32."""
-    alpha: np.ndarray | None
-    """(H, W): 8-bit, or float32."""
-    straight: bool
-    """True if the colour is not yet multiplied by alpha."""
-    assumed: tuple[str, ...] = ()
-    """Assumptions about the file, a clause each."""
+    rgb: np.ndarray  # (H, W, 3): 8-bit sRGB levels, or linear float32
+    alpha: np.ndarray | None  # (H, W): 8-bit, or float32
+    straight: bool  # True if the colour is not yet multiplied by alpha
+    assumed: tuple[str, ...] = ()  # assumptions about the file, a clause each
 
 
 def as_linear(image: Decoded, mask: np.ndarray | None = None) -> np.ndarray:

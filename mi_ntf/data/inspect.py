@@ -18,27 +18,12 @@ POINTS = 2000  # of the reconstructed points, in the figure of the cameras
 
 
 def inspect(folder: Path, out: Path | None = None, **options: Any) -> Numbers:
-    """Read the data set in `folder`, write the page and return the numbers.
+    """Read the data set in `folder` with `options` of :func:`load_dataset`, write the page and return the numbers.
 
-    Parameters
-    ----------
-    folder : Path
-        Folder of the data set.
-    out : Path, optional
-        File of the page, DIR-inspect.html in the current folder by default.
-    **options
-        Options of :func:`load_dataset`. Those that are None are ignored.
-
-    Returns
-    -------
-    dict
-        "folder", "form", "said" (sentences of the reader), "assumed" (the assumptions among them), "warnings", "page",
-        "views" (one mapping for each photograph) and the keys of :func:`measures.numbers`.
-
-    Raises
-    ------
-    MiNtfError
-        If the data set has a fault, or the page cannot be written.
+    The page `out` is DIR-inspect.html in the current folder by default. Options that are None are ignored. The keys of
+    the result are "folder", "form", "said" (sentences of the reader), "assumed" (the assumptions among them),
+    "warnings", "page", "views" (one mapping for each photograph) and those of :func:`measures.numbers`. Raises
+    MiNtfError if the data set has a fault, or the page cannot be written.
     """
     folder = Path(folder)
     out = Path(f"{folder.resolve().name}-inspect.html") if out is None else Path(out)

@@ -14,10 +14,8 @@ from mi_ntf.core.errors import MiNtfError
 from mi_ntf.data.images import opencv
 from mi_ntf.data.schema import Camera
 
-LONGEST = 32766
-"""Largest side in pixels that OpenCV's `remap` supports."""
-SCALES = (0.5, 4.0)
-"""Range of the factor by which the focal length may change when the picture is made straight."""
+LONGEST = 32766  # largest side in pixels that OpenCV's `remap` supports
+SCALES = (0.5, 4.0)  # range of the factor by which the focal length may change when the picture is made straight
 
 
 def shrunk(width: int, height: int, size: int | None) -> tuple[int, int]:

@@ -23,7 +23,16 @@ FORM = "LLFF data set (poses_bounds.npy)"
 def read(folder: Path) -> DataSet:
     """Read all photographs as one split, `train`. Raises MiNtfError."""
     path, images = folder / "poses_bounds.npy", folder / "images"
-    rows = _rows(path)
+    try:
+        stored = np.load(path, mmap_mode="r", allow_pickle=False)  # a wrong header then allocates no memory
+    except Exception as error:  # NumPy raises many kinds for a damaged file
+        raise MiNtfError(f"{path}: cannot be read as an array of NumPy ({shown(str(error))}); write it again with "
+                         "LLFF's imgs2poses.py") from None
+    if stored.ndim != 2 or stored.shape[1] != 17 or not len(stored) or stored.dtype.kind not in "fiu":
+        raise MiNtfError(f"{path}: is an array of {stored.dtype} with shape {stored.shape}, expected numbers (N, 17); "
+                         "write it again with LLFF's imgs2poses.py")
+    with np.errstate(all="ignore"):  # `_view` reports infinity
+        rows = np.array(stored, np.float64)
     if not images.is_dir():
         raise MiNtfError(f"{images} does not exist; put the photographs of {path} there")
     names = sorted(p.name for p in images.iterdir() if p.suffix.lower() in SUFFIXES)
@@ -32,20 +41,6 @@ def read(folder: Path) -> DataSet:
                          "in the order of the names: take out the photographs that have no pose")
     return DataSet(FORM, {"train": [_view(row, f"{path}, row {i} ({name})", folder, name)
                                     for i, (row, name) in enumerate(zip(rows, names, strict=True))]})
-
-
-def _rows(path: Path) -> np.ndarray:
-    """Return (N, 17) float64. The file is mapped, so that a wrong header allocates no memory."""
-    try:
-        rows = np.load(path, mmap_mode="r", allow_pickle=False)
-    except Exception as error:  # NumPy raises many kinds for a damaged file
-        raise MiNtfError(f"{path}: cannot be read as an array of NumPy ({shown(str(error))}); write it again with "
-                         "LLFF's imgs2poses.py") from None
-    if rows.ndim != 2 or rows.shape[1] != 17 or not len(rows) or rows.dtype.kind not in "fiu":
-        raise MiNtfError(f"{path}: is an array of {rows.dtype} with shape {rows.shape}, expected numbers (N, 17); "
-                         "write it again with LLFF's imgs2poses.py")
-    with np.errstate(all="ignore"):  # `_view` reports infinity
-        return np.array(rows, np.float64)
 
 
 def _view(row: np.ndarray, where: str, folder: Path, name: str) -> View:

@@ -19,12 +19,9 @@ from mi_ntf.data import exif
 if TYPE_CHECKING:
     from PIL import Image
 
-BRIGHT = 0.75
-"""Fraction of white that the brightest level of a mask of fractions reaches."""
-LABELS, COLOURS = 16, 256
-"""Largest numbers of levels and of colours of a mask of labels."""
-BLACK = 16
-"""Levels of noise that JPEG may add: channels up to this level count as black, and channels this close as grey."""
+BRIGHT = 0.75  # fraction of white that the brightest level of a mask of fractions reaches
+LABELS, COLOURS = 16, 256  # largest numbers of levels and of colours of a mask of labels
+BLACK = 16  # noise of JPEG: channels up to this level count as black, and channels that differ by less as grey
 
 
 def read(path: Path) -> tuple[np.ndarray, str | None]:

@@ -79,15 +79,9 @@ class Page:
         """Add a paragraph that stands out."""
         self._parts.append(f'<p class="warning">⚠ {escape(text)}</p>')
 
-    def table(self, header: Sequence[object], rows: Iterable[Sequence[object]], folded: str = "",
-              groups: Sequence[tuple[str, int]] = ()) -> None:
-        """Add a table, one text or number a cell.
-
-        If `folded` is given, the page shows this text until it is clicked. `groups` is a line above the header of
-        texts with the number of columns that each spans.
-        """
-        lines = ["".join(f'<th colspan="{span}">{escape(text)}</th>' for text, span in groups)] if groups else []
-        lines += ["".join(f"<th>{escape(str(cell))}</th>" for cell in header)]
+    def table(self, header: Sequence[object], rows: Iterable[Sequence[object]], folded: str = "") -> None:
+        """Add a table, one text or number a cell. The text `folded`, if any, hides it until it is clicked."""
+        lines = ["".join(f"<th>{escape(str(cell))}</th>" for cell in header)]
         lines += ["".join(f"<td>{escape(str(cell))}</td>" for cell in row) for row in rows]
         table = "<table>" + "".join(f"<tr>{line}</tr>\n" for line in lines) + "</table>"
         self.scrolling(f"<details><summary>{escape(folded)}</summary>{table}</details>" if folded else table, "table")
@@ -100,16 +94,11 @@ class Page:
             self._image(encode(array), caption, f'{small} width="{width}"', f' style="max-width: {max(width, 150)}px"')
         self._parts.append("</div>")
 
-    def figure(self, figure: "Figure", caption: str = "", vector: bool = False) -> None:
-        """Add a figure on the page's background; its text and axes should be ``GREY``.
-
-        `vector` draws it as SVG, which suits figures of few lines.
-        """
+    def figure(self, figure: "Figure", caption: str = "") -> None:
+        """Add a figure on the page's background; its text and axes should be ``GREY``."""
         buffer = io.BytesIO()
-        metadata = {"Date": None} if vector else {}  # the same figure is the same page
-        figure.savefig(buffer, format="svg" if vector else "png", dpi=150, transparent=True, metadata=metadata)
-        uri = _uri("svg+xml" if vector else "png", buffer.getvalue())
-        self._image(uri, caption, f' width="{int(96 * figure.get_figwidth())}"')
+        figure.savefig(buffer, format="png", dpi=150, transparent=True)
+        self._image(_uri("png", buffer.getvalue()), caption, f' width="{int(96 * figure.get_figwidth())}"')
 
     def curves(self, title: str, curves: Mapping[str, tuple[Sequence[float], Sequence[float]]], xlabel: str = "",
                ylabel: str = "", log: bool = False) -> None:

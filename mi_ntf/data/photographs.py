@@ -28,23 +28,11 @@ class Photographs(NamedTuple):
 
 def load(views: list[View], size: int | None = None, black: bool = False, assumed: Assumptions | None = None
          ) -> Photographs:
-    """Read the photographs of a split.
+    """Read the photographs of a split, scaled down to a longer side of `size` pixels.
 
-    Parameters
-    ----------
-    views : list of View
-        All photographs have one size in the end: those that lie otherwise than the first are turned by 90 degrees.
-    size : int, optional
-        Longer side in pixels to which photographs are scaled down.
-    black : bool
-        Alpha comes from the black background (`background`) instead of masks.
-    assumed : Assumptions, optional
-        Receives the assumptions about the files.
-
-    Raises
-    ------
-    MiNtfError
-        If a photograph or its mask cannot be read or does not fit.
+    With `black`, alpha comes from the black background (`background`) instead of masks. All photographs have one size
+    in the end: those that lie otherwise than the first are turned by 90 degrees. `assumed` receives the assumptions.
+    Raises MiNtfError.
     """
     stored, straighten, intrinsics, poses = np.empty((0, 0, 0, 4), np.uint8), lens.Straightener(), [], []
     assumed = Assumptions() if assumed is None else assumed
@@ -111,17 +99,13 @@ def read(view: View, size: int | None, black: bool, straighten: lens.Straightene
         if target != (width, height):
             pixels, camera = lens.shrink(pixels, camera, target)
         if whole:
-            pixels = _as_levels(pixels)
+            stored = np.empty(pixels.shape, np.uint8)
+            for rows in images.strips(pixels):
+                stored[rows] = images.levels(pixels[rows])
+            pixels = stored
     if black:
         pixels[..., 3] = background.alpha(pixels, str(view.image)) * (1 if whole else 1 / 255)
     return pixels, camera
-
-
-def _as_levels(pixels: np.ndarray) -> np.ndarray:
-    stored = np.empty(pixels.shape, np.uint8)
-    for rows in images.strips(pixels):
-        stored[rows] = images.levels(pixels[rows])
-    return stored
 
 
 def _mask(view: View, image: images.Decoded, assumed: Assumptions) -> np.ndarray | None:

@@ -36,8 +36,7 @@ class Footprint(NamedTuple):
     right: np.ndarray
     top: np.ndarray
     bottom: np.ndarray
-    inside: np.ndarray
-    """(K,) bool: the cell's centre falls into the image."""
+    inside: np.ndarray  # (K,) bool: the cell's centre falls into the image
 
     def pixels(self, mask: np.ndarray) -> np.ndarray:
         """Return the number of True pixels of `mask` (H, W) in each window (K,), from a summed-area table."""

@@ -135,8 +135,9 @@ def _load(folder: Path, data: DataSet, views: Views, say: Say, size: int | None,
     intensities = {name: np.stack([np.full(3, estimate) if v.light_intensity is None else v.light_intensity
                                    for v in split]).astype(np.float32) for name, split in views.items()}
     return {name: Split(*loaded[name], lights[name], intensities[name], center, radius,
-                        tuple(_name(view, folder) for view in split), not black, calibrated,
-                        first.light_pos is not None)
+                        tuple(str(path.relative_to(folder) if path.is_relative_to(folder) else path)
+                              for path in (view.image for view in split)),
+                        not black, calibrated, first.light_pos is not None)
             for name, split in views.items()}
 
 
@@ -250,7 +251,3 @@ def _check_masks(views: list[View], stored: np.ndarray) -> None:
             most = float(image[..., 3].max()) / (255 if image.dtype == np.uint8 else 1)
             raise MiNtfError(f"{view.image}: its alpha is {most:.2g} at most, so it shows no object; repair its mask "
                              "(white: object) or take the photograph out")
-
-
-def _name(view: View, folder: Path) -> str:
-    return str(view.image.relative_to(folder) if view.image.is_relative_to(folder) else view.image)

@@ -1,15 +1,11 @@
 """Readers of `transforms_<split>.json` (our captures, NeRF-synthetic, NRHints) and of nerfstudio's `transforms.json`.
 
-A file of one split (:func:`read_splits`). The three dialects differ in the entries that may be missing:
+:func:`read_splits` reads a file for each split. The camera is `camera_angle_x` (radians), or NRHints'
+`camera_intrinsics` [cx, cy, fx, fy] (pixels). `file_path` may lack its extension, which NRHints names in `file_ext`.
+`pl_pos` is x, y, z or x, y, z, 1; without it the light is at the camera. `pl_intensity` is one number or RGB. Missing
+`w`, `h`, `pl_intensity` and `unit_sphere` are derived from the images.
 
-    camera         `camera_angle_x` (radians), or NRHints' `camera_intrinsics` [cx, cy, fx, fy] (pixels)
-    w, h           missing: taken from the images
-    file_path      with or without extension; NRHints names it in `file_ext`
-    pl_pos         x, y, z or x, y, z, 1; missing: the light is at the camera
-    pl_intensity   one number or RGB; missing: estimated
-    unit_sphere    missing: estimated
-
-nerfstudio's and instant-ngp's file (:func:`read_nerfstudio`):
+:func:`read_nerfstudio` reads the file of nerfstudio and instant-ngp:
 
     fl_x, fl_y, cx, cy, w, h     pixels, for all frames or in each; (0, 0) is the corner of the top left pixel. Missing
                                  fl_y: fl_x; missing cx, cy: the middle; missing fl_x: `camera_angle_x` (radians)
@@ -19,8 +15,8 @@ nerfstudio's and instant-ngp's file (:func:`read_nerfstudio`):
     train_filenames, val_filenames, test_filenames    file_path of the frames of each split
 
 Frames of nerfstudio without a photograph are dropped, as instant-ngp does. Every fault names file, frame and value.
-Sources: the public loaders of NeRF (Mildenhall et al. 2020) and NRHints (Zeng et al. 2023); nerfstudio's documentation,
-"Data conventions", and for k4 its undistortion (`full_images_datamanager`), which refuses it as well.
+Sources: the loaders of NeRF (Mildenhall et al. 2020) and NRHints (Zeng et al. 2023); nerfstudio's "Data conventions",
+and for k4 its undistortion (`full_images_datamanager`), which refuses it as well.
 """
 
 import dataclasses
@@ -102,9 +98,6 @@ def _load(path: Path, assumed: list[str]) -> tuple[Entries, list[object]]:
     return data, data["frames"]
 
 
-# --- cameras ----------------------------------------------------------------------------------------------------------
-
-
 def _intrinsics(data: Entries, where: str) -> Camera | float:
     """Return the camera of a split."""
     if "camera_intrinsics" not in data:
@@ -154,9 +147,6 @@ def _size(entries: Entries, where: str) -> tuple[int, int] | None:
     if "w" not in entries and "h" not in entries:
         return None
     return int(_positive(entries, "w", where)), int(_positive(entries, "h", where))
-
-
-# --- frames and splits ------------------------------------------------------------------------------------------------
 
 
 def _view(entry: object, where: str, folder: Path, camera: Camera | float, size: tuple[int, int] | None) -> View:
@@ -225,9 +215,6 @@ def _named_splits(data: Entries, views: list[View], path: Path) -> tuple[dict[st
         raise MiNtfError(f"{path}: {', '.join(lists)} name all {len(views)} frames, which leaves none to train on; "
                          "name fewer, or write 'train_filenames'")
     return {"train": rest, **splits}, []
-
-
-# --- single entries ---------------------------------------------------------------------------------------------------
 
 
 def _sphere(data: Entries, path: Path) -> Sphere | None:

@@ -2,12 +2,12 @@
 
     run(work, tasks, Workers("dask", 2))
 
-``work`` is a function of a module that takes one task and returns something small; both are pickled. What it makes it
-writes itself, under another name first (:mod:`mi_ntf.core.files`): a task may be done twice, by a worker that was
-thought lost or in a second attempt, and must then give the same.
+``work`` is a function of a module that takes one task and returns something small; both are pickled. It writes its
+files itself, under another name first (:mod:`mi_ntf.core.files`). A task may run twice, on a worker that was thought
+lost or in a second attempt, and must then give the same result.
 
-Engines: ``local``, processes of this machine; ``submitit``, an array of Slurm or subprocesses; ``dask``, the workers of
-a Dask scheduler or of a cluster of this machine. None is imported before it is asked for.
+The engine ``local`` uses processes of this machine, ``submitit`` an array of Slurm jobs or subprocesses, and ``dask``
+the workers of a Dask scheduler or a cluster of this machine. An engine is imported only when it is needed.
 """
 
 from .options import Workers

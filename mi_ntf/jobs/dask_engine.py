@@ -1,4 +1,4 @@
-"""The workers of a Dask scheduler, or a cluster of this machine that lives as long as the work."""
+"""Workers of a Dask scheduler, or of a cluster of this machine that lives as long as the work."""
 
 import contextlib
 import itertools
@@ -8,7 +8,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import distributed
 
@@ -16,67 +15,63 @@ from ..core.errors import MiNtfError
 from .options import Workers, gpus
 from .worker import Answer, Setup, attempt, environment
 
-PATIENCE = 20
-"""Seconds to wait for a scheduler to answer."""
-AHEAD, LEAST = 4, 32
-"""Tasks that the scheduler has for each of its workers, and in all at least: it is slow with very many."""
-COUNT = 5.0
-"""Seconds between counts of the workers."""
-TALK = ("distributed.scheduler", "distributed.client")
-"""Loggers that have four lines for every worker that is lost; the one of its restart, of another, stays."""
+PATIENCE = 20  # seconds to wait for a scheduler to answer
+AHEAD, LEAST = 4, 32  # tasks at the scheduler for each worker, and in all at least: it is slow with very many
+COUNT = 5.0  # seconds between counts of the workers
+LOGGERS = ("distributed.scheduler", "distributed.client")  # they print four lines for every worker that is lost
 
 
 class Dask:
-    """Dask gives the tasks of a worker that is lost to others, four times at most, by itself."""
+    """Dask itself gives the tasks of a worker that is lost to others, four times at most."""
 
     def __init__(self, workers: Workers, work: bytes, tell: Callable[[str], None]):
         self._work, self._threads = work, workers.threads
         self._gpus: list[str] = []
-        with contextlib.ExitStack() as back:  # what is to be ended or put back
-            for logger in map(logging.getLogger, TALK):
-                back.callback(logger.setLevel, logger.level)
+        with contextlib.ExitStack() as stack:  # everything that `close` ends or restores
+            for logger in map(logging.getLogger, LOGGERS):
+                stack.callback(logger.setLevel, logger.level)
                 logger.setLevel(logging.CRITICAL)
-            at = workers.scheduler or self._local(workers, back)
-            self._client = _connect(at)
-            back.callback(self._client.close)
+            address = workers.scheduler or self._local(workers, stack)
+            self._client = _connect(address)
+            stack.callback(self._client.close)
             self._ended = distributed.as_completed([], loop=self._client.loop, raise_errors=False, with_results=True)
-            self._going: dict[Any, int] = {}
-            self._waiting: deque[tuple[int, Any, str]] = deque()
+            self._running: dict[distributed.Future[Answer], int] = {}
+            self._waiting: deque[tuple[int, object, str]] = deque()
             self._room, self._counted = LEAST, -COUNT
             self._number = itertools.count()
             self.about = f"Dask's dashboard: {self._client.dashboard_link}"
             if not self._workers():
-                tell(f"no worker has joined {at} yet; start some with: dask worker {at}")
-            self._back = back.pop_all()
+                tell(f"no worker has joined {address} yet; start some with: dask worker {address}")
+            self._stack = stack.pop_all()
 
-    def _local(self, workers: Workers, back: contextlib.ExitStack) -> Any:
-        """A cluster of this machine."""
-        self._threads, self._gpus = workers.share(), gpus()
+    def _local(self, workers: Workers, stack: contextlib.ExitStack) -> distributed.LocalCluster:
+        """Start a cluster of this machine."""
+        self._threads, self._gpus = workers.threads_each(), gpus()
         variables = Setup(self._threads).variables()
-        back.enter_context(environment(variables))  # Dask sets them in this process, too, and leaves them
-        # No limit of memory: the share that Dask would kill at is no measure of what a picture needs for a moment.
+        stack.enter_context(environment(variables))  # Dask sets them in this process, too, and never restores them
+        # No limit of memory: Dask's limit is no measure of the memory that a picture needs for a moment.
         try:
-            with _ctrl_c_is_ours():
+            with _without_ctrl_c():
                 cluster = distributed.LocalCluster(
                     n_workers=workers.workers, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0",
                     memory_limit=0, env=variables)
         except RuntimeError as error:
             raise MiNtfError(f"the Dask cluster of this machine did not start ({error}); a script that starts one must "
                              "be a file that begins its work below `if __name__ == '__main__':`") from None
-        back.callback(cluster.close)
+        stack.callback(cluster.close)
         return cluster
 
-    def submit(self, index: int, task: Any, avoid: str = "") -> None:
-        """Put a task behind the others."""
+    def submit(self, index: int, task: object, avoid: str = "") -> None:
+        """Queue a task."""
         self._waiting.append((index, task, avoid))
 
     def answer(self) -> Answer:
-        """The next one; the scheduler is given work before."""
+        """Give queued tasks to the scheduler and return the next answer."""
         self._fill()
-        future, found = next(self._ended)
-        index = self._going.pop(future)
-        if isinstance(found, Answer):
-            return found
+        future, result = next(self._ended)
+        index = self._running.pop(future)
+        if isinstance(result, Answer):
+            return result
         if self._client.status != "running":
             raise MiNtfError(f"the Dask scheduler is gone (connection {self._client.status}); start it and run the "
                              "same command again")
@@ -89,37 +84,39 @@ class Dask:
     def _fill(self) -> None:
         if self._waiting and time.monotonic() - self._counted > COUNT:
             self._room, self._counted = max(LEAST, AHEAD * len(self._workers())), time.monotonic()
-        while self._waiting and len(self._going) < self._room:
+        while self._waiting and len(self._running) < self._room:
             index, task, avoid = self._waiting.popleft()
-            others = [name for name in self._workers() if name != avoid] if avoid else []
+            allowed = [name for name in self._workers() if name != avoid] if avoid else []
             future = self._client.submit(
                 try_task, self._work, index, task, self._threads, self._gpus, pure=False,
-                key=f"mi-ntf-{index}-{next(self._number)}", workers=others or None, allow_other_workers=bool(others))
-            self._going[future] = index
+                key=f"mi-ntf-{index}-{next(self._number)}", workers=allowed or None, allow_other_workers=bool(allowed))
+            self._running[future] = index
             self._ended.add(future)
 
     def _workers(self) -> list[str]:
-        """Addresses."""
+        """Return the workers' addresses."""
         return list(self._client.scheduler_info(n_workers=-1)["workers"])
 
     def close(self) -> None:
-        """Cancel what is not done; a cluster of this machine ends."""
-        self._client.cancel(list(self._going), force=True)
-        self._going.clear()
-        self._back.close()
+        """Cancel unfinished tasks; a cluster of this machine ends."""
+        self._client.cancel(list(self._running), force=True)
+        self._running.clear()
+        self._stack.close()
 
 
-def try_task(work: bytes, index: int, task: Any, threads: int | None, devices: list[str]) -> Answer:
-    """In a worker: one attempt. `threads`: those of the worker unless given; `devices`: GPUs that the cluster's
-    workers, which have numbers for names, divide among themselves."""
-    worker: Any = distributed.get_worker()
-    gpu = devices[int(worker.name) % len(devices)] if devices else None
+def try_task(work: bytes, index: int, task: object, threads: int | None, devices: list[str]) -> Answer:
+    """Make one attempt in a worker, which has its own number of threads if `threads` is None.
+
+    The workers of a local cluster, whose names are numbers, divide the GPUs `devices` among themselves.
+    """
+    worker = distributed.get_worker()
+    gpu = devices[int(str(worker.name)) % len(devices)] if devices else None
     return attempt(Setup(threads or worker.state.nthreads, gpu), work, index, task, worker.address)
 
 
 @contextlib.contextmanager
-def _ctrl_c_is_ours() -> Iterator[None]:
-    """Within, processes are started that do not hear Ctrl-C: this one ends them, and they would all print frames."""
+def _without_ctrl_c() -> Iterator[None]:
+    """Make processes that start in the block ignore Ctrl-C: this process ends them, and they would print tracebacks."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -130,7 +127,7 @@ def _ctrl_c_is_ours() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def _connect(address: Any) -> distributed.Client:
+def _connect(address: str | distributed.LocalCluster) -> distributed.Client:
     try:
         return distributed.Client(address, timeout=PATIENCE, set_as_default=False)
     except (OSError, ValueError) as error:

@@ -1,44 +1,47 @@
-"""Processes of this machine, one pipe each; of the standard library alone."""
+"""Processes of this machine, with one pipe each, from the standard library alone."""
 
+import contextlib
 import multiprocessing
 import pickle
 import signal
 from collections import deque
 from multiprocessing import connection
-from typing import Any
+from multiprocessing.process import BaseProcess
+from typing import cast
 
 from .options import Workers, gpus
 from .worker import Answer, Setup, environment, serve
 
 
 class Local:
-    """Workers that take the next task when they are done with one. A process that failed a task is replaced: its next
-    attempt is in another one, whatever state the failure has left."""
+    """Worker processes that take the next task when they have finished one.
+
+    A process that failed a task is replaced: the next attempt has a new process, whatever state the failure has left.
+    """
 
     about = ""
 
     def __init__(self, workers: Workers, work: bytes):
-        own = gpus()
-        count = workers.workers or 1
-        setups = [Setup(workers.share(), own[k % len(own)] if own else None) for k in range(count)]
-        self._waiting: deque[tuple[int, Any]] = deque()
-        self._slots = [_Slot(setup, work) for setup in setups]
+        devices = gpus()
+        self._waiting: deque[tuple[int, object]] = deque()
+        self._slots = [_Slot(Setup(workers.threads_each(), devices[k % len(devices)] if devices else None), work)
+                       for k in range(workers.workers or 1)]
 
-    def submit(self, index: int, task: Any, avoid: str = "") -> None:
-        """Put a task behind the others."""
+    def submit(self, index: int, task: object, avoid: str = "") -> None:
+        """Queue a task."""
         self._waiting.append((index, task))
 
     def answer(self) -> Answer:
-        """The next one; idle workers are given work before."""
+        """Give work to idle workers and return the next answer."""
         for slot in self._slots:
             if slot.index is None and self._waiting:
                 slot.give(*self._waiting.popleft())
-        busy = {slot.pipe: slot for slot in self._slots if slot.index is not None}
-        ready: Any = connection.wait(list(busy))[0]
-        found = busy[ready].take()
-        if found.error:
-            busy[ready].end()
-        return found
+        busy = {slot.pipe: slot for slot in self._slots if slot.pipe is not None and slot.index is not None}
+        slot = busy[cast(connection.Connection, connection.wait(list(busy))[0])]
+        answer = slot.take()
+        if answer.error:
+            slot.end()
+        return answer
 
     def close(self) -> None:
         """End all processes at once."""
@@ -47,50 +50,48 @@ class Local:
 
 
 class _Slot:
-    """Place of one worker. `index`: of the task that it has, None while it has none."""
+    """Place of one worker; `index` is the number of its task, or None."""
 
     def __init__(self, setup: Setup, work: bytes):
         self._setup, self._work = setup, work
-        self._process: Any = None
-        self.pipe: Any = None
+        self._process: BaseProcess | None = None
+        self.pipe: connection.Connection | None = None
         self.index: int | None = None
 
-    def give(self, index: int, task: Any) -> None:
-        """Hand over a task, to a new process if need be."""
+    def give(self, index: int, task: object) -> None:
+        """Hand over a task, to a new process if necessary."""
         if self._process is None or not self._process.is_alive():
             self.end()
-            self._start()
+            context = multiprocessing.get_context("spawn")  # Dr.Jit's threads do not survive a fork
+            self.pipe, theirs = context.Pipe()
+            self._process = context.Process(target=serve, args=(theirs, self._setup, self._work), daemon=True)
+            with environment(self._setup.variables()):
+                self._process.start()
+            theirs.close()
+        assert self.pipe is not None
         self.index = index
-        try:
+        with contextlib.suppress(OSError):  # it has ended since: `take` reports that
             self.pipe.send_bytes(pickle.dumps((index, task)))
-        except OSError:
-            pass  # it has ended since: `take` finds that out
 
     def take(self) -> Answer:
-        """What became of it."""
+        """Return the answer to the task."""
         index, self.index = self.index, None
-        assert index is not None
+        assert index is not None and self.pipe is not None and self._process is not None
         try:
-            return self.pipe.recv()
+            answer: Answer = self.pipe.recv()
+            return answer
         except (EOFError, OSError):
             self._process.join()
-            code = self._process.exitcode
-            how = f"by signal {signal.Signals(-code).name}" if code < 0 else f"with status {code}"
+            code = self._process.exitcode or 0
+            end = f"by signal {signal.Signals(-code).name}" if code < 0 else f"with status {code}"
             memory = "; had it enough memory?" if code == -signal.SIGKILL else ""
-            return Answer(index, error=f"the process that worked on it ended {how}{memory}", lost=True)
+            return Answer(index, error=f"the process that worked on it ended {end}{memory}", lost=True)
 
     def end(self) -> None:
-        if self._process is not None:
+        """Kill the process."""
+        if self._process is not None and self.pipe is not None:
             self._process.kill()
             self._process.join()
             self._process.close()
             self.pipe.close()
         self._process, self.index = None, None
-
-    def _start(self) -> None:
-        context = multiprocessing.get_context("spawn")  # Dr.Jit's threads do not survive a fork
-        self.pipe, theirs = context.Pipe()
-        self._process = context.Process(target=serve, args=(theirs, self._setup, self._work), daemon=True)
-        with environment(self._setup.variables()):
-            self._process.start()
-        theirs.close()

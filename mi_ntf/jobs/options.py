@@ -1,35 +1,37 @@
-"""Which workers to use, as options of commands."""
+"""Options of commands that choose the workers."""
 
 import importlib
 import os
 import subprocess
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 from ..core.errors import MiNtfError
+
+MODULES = {"dask": "distributed", "submitit": "submitit"}  # package that an engine needs
 
 
 @dataclass(frozen=True)
 class Workers:
-    """Who does the tasks. Without options it is this process, one task after the other."""
+    """Workers for the tasks. Without options this process does one task after the other."""
 
     engine: Literal["local", "submitit", "dask"] = "local"
     """local: processes of this machine. submitit: a Slurm array, or subprocesses where there is no Slurm. dask: the
     workers of --scheduler, or of this machine."""
     workers: int | None = None
-    """Processes that work at the same time."""
+    """Number of processes that work at the same time."""
     threads: int | None = None
-    """Threads of each; its share of this machine's cores unless given."""
+    """Threads of each worker. Default: the cores of this machine divided by the number of workers."""
     scheduler: str | None = None
     """Address of a running Dask scheduler, as tcp://HOST:8786."""
 
     @property
     def here(self) -> bool:
-        """Whether the tasks are done in this process."""
+        """True if this process does the tasks."""
         return self == Workers() or self == Workers(workers=1)
 
     def check(self) -> None:
-        """Raise the MiNtfError of options that do not fit together."""
+        """Raise MiNtfError if options do not fit together."""
         if self.engine not in ("local", "submitit", "dask"):
             raise MiNtfError(f"engine is '{self.engine}', must be local, submitit or dask")
         for name in ("workers", "threads"):
@@ -46,32 +48,31 @@ class Workers:
             more = ", or --scheduler ADDRESS" if self.engine == "dask" else ""
             raise MiNtfError(f"the engine {self.engine} needs a number of workers; give --workers N{more}")
 
-    def share(self) -> int:
-        """Threads of a worker of this machine."""
+    def check_installed(self) -> None:
+        """Raise MiNtfError if the package of the engine is not installed."""
+        module = MODULES[self.engine]
+        try:
+            importlib.import_module(module)
+        except ImportError as error:
+            raise MiNtfError(f"the engine {self.engine} needs {module} ({error}); install it with: "
+                             "pip install 'mi-ntf[cluster]'") from None
+
+    def threads_each(self) -> int:
+        """Return the number of threads of a worker of this machine."""
         return self.threads or max(1, cores() // (self.workers or 1))
 
 
 def cores() -> int:
-    """Cores that this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def gpus() -> list[str]:
-    """GPUs of this machine, in the words of CUDA_VISIBLE_DEVICES; those alone where that is set."""
-    if (own := os.environ.get("CUDA_VISIBLE_DEVICES")) is not None:
-        return [word for word in own.split(",") if word]
+    """Return the GPUs of this machine, or those in CUDA_VISIBLE_DEVICES, as this variable names them."""
+    if (visible := os.environ.get("CUDA_VISIBLE_DEVICES")) is not None:
+        return [word for word in visible.split(",") if word]
     try:
         listed = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, timeout=60, check=True).stdout
     except (OSError, subprocess.SubprocessError):
         return []
     return [str(i) for i, _ in enumerate(line for line in listed.splitlines() if line.startswith("GPU "))]
-
-
-def load(engine: str) -> Any:
-    """The library of an engine. Raises MiNtfError where it is not installed."""
-    module = {"dask": "distributed"}.get(engine, engine)
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise MiNtfError(f"the engine {engine} needs {module} ({error}); install it with: "
-                         "pip install 'mi-ntf[cluster]'") from None

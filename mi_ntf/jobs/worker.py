@@ -9,50 +9,46 @@ import pickle
 import platform
 import signal
 import threading
-import time
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from multiprocessing.connection import Connection
 
 from ..core import errors
 from ..core.variants import enough_threads
 
-THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-"""Read by PyTorch and NumPy when they are loaded."""
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")  # PyTorch and NumPy read them once
 
 
 @dataclass(frozen=True)
 class Setup:
-    """Set-up of a worker. `threads`: None leaves them as they are; `gpu`: CUDA_VISIBLE_DEVICES, None leaves it."""
+    """Set-up of a worker; None leaves a setting as it is."""
 
     threads: int | None = None
-    gpu: str | None = None
+    gpu: str | None = None  # value of CUDA_VISIBLE_DEVICES
 
     def variables(self) -> dict[str, str]:
-        """Environment variables."""
-        found = {} if self.threads is None else dict.fromkeys(THREAD_VARIABLES, str(self.threads))
-        return found | ({} if self.gpu is None else {"CUDA_VISIBLE_DEVICES": self.gpu})
+        """Return the environment variables."""
+        threads = {} if self.threads is None else dict.fromkeys(THREAD_VARIABLES, str(self.threads))
+        return threads | ({} if self.gpu is None else {"CUDA_VISIBLE_DEVICES": self.gpu})
 
 
 @dataclass(frozen=True)
 class Answer:
-    """Outcome of one attempt at task `index`: `value`, pickled, or `error`, a sentence that is not empty. `where`:
-    who tried; `lost`: the worker ended; `last`: another attempt is of no use."""
+    """Outcome of one attempt at task `index`."""
 
     index: int
-    value: bytes = b""
-    error: str = ""
-    where: str = ""
-    seconds: float = 0.0
-    lost: bool = False
-    last: bool = False
+    value: bytes = b""  # pickled result
+    error: str = ""  # a sentence if the attempt failed
+    where: str = ""  # name of the worker
+    lost: bool = False  # the worker ended
+    last: bool = False  # another attempt is of no use
 
 
 _one_at_a_time = threading.Lock()  # a Dask worker may have several threads, Mitsuba has one variant
 _prepared: set[Setup] = set()
-_loaded: dict[bytes, Callable] = {}
+_loaded: dict[bytes, Callable[[object], object]] = {}
 
 
 def prepare(setup: Setup) -> None:
@@ -68,30 +64,28 @@ def prepare(setup: Setup) -> None:
     _prepared.add(setup)
 
 
-def attempt(setup: Setup, work: bytes, index: int, task: Any, where: str = "") -> Answer:
+def attempt(setup: Setup, work: bytes, index: int, task: object, where: str = "") -> Answer:
     """Try one task of the pickled function `work`, which is loaded after the set-up."""
     where = where or f"{platform.node()}:{os.getpid()}"
     with _one_at_a_time:
-        start = time.perf_counter()
         try:
             prepare(setup)
             if work not in _loaded:
                 _loaded[work] = pickle.loads(work)
-            value = pickle.dumps(_loaded[work](task))
+            return Answer(index, pickle.dumps(_loaded[work](task)), where=where)
         except Exception as error:
-            return Answer(index, error=told(error), where=where, seconds=time.perf_counter() - start)
-        return Answer(index, value, where=where, seconds=time.perf_counter() - start)
+            return Answer(index, error=describe(error), where=where)
 
 
-def told(error: BaseException) -> str:
-    """A sentence, never empty; with frames where the user wants them."""
+def describe(error: BaseException) -> str:
+    """Return a sentence about `error`, with a traceback if the user wants one. It is never empty."""
     text = errors.sentence(error) or type(error).__name__
     return f"{text}\n{''.join(traceback.format_exception(error))}" if errors.debug() else text
 
 
 @contextmanager
 def environment(variables: dict[str, str]) -> Iterator[None]:
-    """Within, processes are started with `variables` besides."""
+    """Add `variables` to the environment of the processes that are started in the block."""
     before = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
     try:
@@ -104,8 +98,8 @@ def environment(variables: dict[str, str]) -> Iterator[None]:
                 os.environ[name] = value
 
 
-def serve(pipe: Any, setup: Setup, work: bytes) -> None:
-    """A worker of the engine ``local``: (index, task) come by `pipe`, answers go, until it is closed."""
+def serve(pipe: Connection, setup: Setup, work: bytes) -> None:
+    """Be a worker of the engine ``local``: answer each (index, task) that comes through `pipe` until it is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that started this one, which ends it
     while True:
         try:
@@ -115,11 +109,13 @@ def serve(pipe: Any, setup: Setup, work: bytes) -> None:
         pipe.send(attempt(setup, work, index, task))
 
 
-def do_share(setup: Setup, work: bytes, share: list[tuple[int, Any]], path: str) -> None:
-    """A job of the engine ``submitit``: the (index, task) of `share` one after the other. Each answer is appended to
-    the file `path`, a length of 8 bytes before it: what is done when the job is lost is not lost with it."""
+def do_tasks(setup: Setup, work: bytes, tasks: list[tuple[int, object]], path: str) -> None:
+    """Be a job of the engine ``submitit``: do each (index, task) and append its answer to the file `path`.
+
+    A length of 8 bytes precedes each answer. Answers that are written stay if the job is lost.
+    """
     with open(path, "ab") as stream:
-        for index, task in share:
+        for index, task in tasks:
             answer = pickle.dumps(attempt(setup, work, index, task))
             stream.write(len(answer).to_bytes(8, "little") + answer)
             stream.flush()
@@ -127,15 +123,16 @@ def do_share(setup: Setup, work: bytes, share: list[tuple[int, Any]], path: str)
 
 
 def read_answers(path: str, offset: int) -> tuple[list[Answer], int]:
-    """Whole answers of a file of :func:`do_share` from `offset` on, and where the next begins."""
+    """Return the whole answers in a file of :func:`do_tasks` from `offset` on, and the offset of the next one."""
     try:
         with open(path, "rb") as stream:
             stream.seek(offset)
             content = stream.read()
     except FileNotFoundError:
         return [], offset
-    found, at = [], 0
-    while len(content) >= at + 8 and len(content) >= (end := at + 8 + int.from_bytes(content[at:at + 8], "little")):
-        found.append(pickle.loads(content[at + 8:end]))
-        at = end
-    return found, offset + at
+    answers, start = [], 0
+    while (len(content) >= start + 8
+           and len(content) >= (end := start + 8 + int.from_bytes(content[start:start + 8], "little"))):
+        answers.append(pickle.loads(content[start + 8:end]))
+        start = end
+    return answers, offset + start

@@ -82,21 +82,6 @@ def test_curves_are_drawn_in_their_colours():
     assert (figure[..., 3] == 0).mean() > 0.8  # the page shows through
 
 
-def test_figures_of_lines_and_headers_over_several_columns():
-    page = Page("p")
-    figure = new_figure(2, 1)
-    figure.add_subplot().plot([0, 1], [1, 2])
-    page.figure(figure, vector=True)
-    page.table(["", "a", "b"], [[1, 2, 3]], groups=[("", 1), ("both <", 2)])
-    html = page.html()
-    [(kind, content)] = URI.findall(html)
-    assert kind == "svg+xml" and b"<svg" in base64.b64decode(content) and 'width="192"' in html
-    assert '<tr><th colspan="1"></th><th colspan="2">both &lt;</th></tr>\n<tr><th></th><th>a</th>' in html
-    again = Page("p")
-    again.figure(figure, vector=True)
-    assert content in again.html() or "clipPath" in base64.b64decode(content).decode()
-
-
 def test_written_whole_or_not_at_all(tmp_path, monkeypatch):
     path = tmp_path / "page.html"
     full().write(path)

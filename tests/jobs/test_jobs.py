@@ -5,7 +5,6 @@ import sys
 from pathlib import Path
 
 import mitsuba as mi
-import numpy as np
 import pytest
 from helpers import chores
 from helpers.variants import VARIANT
@@ -13,7 +12,7 @@ from helpers.variants import VARIANT
 from mi_ntf import cli, jobs
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.data import capture
-from mi_ntf.jobs import cost, options, running, worker
+from mi_ntf.jobs import options, running, worker
 
 SCENE = """<scene version="3.9.0">
     <integrator type="path"/>
@@ -131,7 +130,7 @@ def test_what_cannot_be_sent_is_said():
 def test_answers_are_read_as_far_as_they_are_whole(tmp_path):
     path = str(tmp_path / "answers")
     assert worker.read_answers(path, 0) == ([], 0)
-    worker.do_share(worker.Setup(), worker.pickle.dumps(chores.square), [(7, 3), (8, 4)], path)
+    worker.do_tasks(worker.Setup(), worker.pickle.dumps(chores.square), [(7, 3), (8, 4)], path)
     whole = Path(path).read_bytes()
     both, end = worker.read_answers(path, 0)
     assert [(a.index, worker.pickle.loads(a.value)) for a in both] == [(7, 9), (8, 16)] and end == len(whole)
@@ -175,9 +174,3 @@ def test_a_scheduler_that_does_not_answer(monkeypatch):
     monkeypatch.setattr(dask_engine, "PATIENCE", 0.5)
     with pytest.raises(MiNtfError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9"):
         jobs.run(chores.square, [1], jobs.Workers("dask", scheduler="tcp://127.0.0.1:9"), quiet=True)
-
-
-def test_the_cost_of_a_task_is_measured():
-    found = cost.measure("local", count=50)
-    assert 0 < found["per_task"] < 0.1 and found["start"] > 0
-    assert np.isfinite(cost.speedup("local", seconds=0.2))
