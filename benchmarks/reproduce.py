@@ -354,7 +354,7 @@ def _ray(scene: Scene) -> tuple[np.ndarray, np.ndarray, float]:
 
 def _transmittance(medium: Any, visibility: str, x: Any, wi: Any, lights: np.ndarray) -> np.ndarray:
     """Return the transmittance from `x` along `wi` without an end; tables are made for the directions `lights`."""
-    built = building.build(visibility, medium, timing.table_of(lights), building.Options(FINE))
+    built: Any = building.build(visibility, medium, timing.table_of(lights), building.Options(FINE))
     width = dr.width(x)
     infinite, active = dr.full(mi.Float, dr.inf, width), dr.full(mi.Bool, True, width)
     return np.array(built.tau(x, wi, infinite, dr.zeros(mi.UInt32, width), active), np.float64)
