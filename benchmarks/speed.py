@@ -276,15 +276,17 @@ def light_error_figures(scene: Any, medium: Any, sizes: Sizes) -> Figures:
     picture, table = Picture(scene, medium, sizes.error_image), table_of(spheres.fibonacci(sizes.single_lights))
     truth = picture.images(table, building.build("raymarch", medium, table, building.Options(FINE)))
     lit = [i for i, image in enumerate(truth) if image.any()]
-    methods = {f"map_{words}": ("transmittance_map", building.Options(FINE, sizes.error_map, map_components=n))
-               for n, words in ((1, "one"), (2, "two"))} | {"atlas": ("transmittance_atlas", building.Options(STEP))}
+    methods = {f"map_{words}": (f"maps of {sizes.error_map}² texels and {words} logistic{'s' * (n > 1)} a texel",
+                                "transmittance_map", building.Options(FINE, sizes.error_map, map_components=n))
+               for n, words in ((1, "one"), (2, "two"))}
+    methods["atlas"] = "the atlas", "transmittance_atlas", building.Options(STEP)
     figures: Figures = {}
-    for key, (name, options) in methods.items():
+    for key, (title, name, options) in methods.items():
         images = picture.images(table, building.build(name, medium, table, options))
         each = [100 * relative_rmse(images[i], truth[i]) for i in lit] or [0.0]
         total = 100 * relative_rmse(np.sum(images, 0), np.sum(truth, 0)) if lit else 0.0
         figures[f"light_error_{key}"] = figure(
-            f"relative RMSE under each of {len(lit)} lights alone, {name}, to a march on the same points", "%", each,
+            f"relative RMSE of {title} to a march on the same points, under each of {len(lit)} lights alone", "%", each,
             sum=total)
     return figures
 

@@ -108,32 +108,74 @@ def speed(values: Values) -> str:
     return table(["what", "measured"], rows)
 
 
+def speed_paper(values: Values) -> str:
+    """Return how much faster maps are than volumes, by networks of the paper's size and by ours."""
+    columns = {"unculled": "unculled", "culled": "culled", "own_unculled": "our network, volume unculled",
+               "own_culled": "our network, culled"}
+    rows = {"stage_{}": "transmittance of 500 lights, 600² rays each (391 ×)",
+            "whole_{}_600": "whole picture of 600² pixels, maps of 600² texels (92 ×)",
+            "whole_{}_128": "whole picture of 600² pixels, maps of 128² texels"}
+    return table(["volume over map", *columns.values()],
+                 [[title, *(spread(values[key.format(column)], "×") for column in columns)]
+                  for key, title in rows.items()])
+
+
+def speed_methods(values: Values) -> str:
+    """Return the seconds and the error of one picture by each method."""
+    names = [key.removeprefix("method_error_") for key in values if key.startswith("method_error_")]
+    title = values[f"method_{names[0]}"]["title"].rpartition(",")[0]
+
+    def over(other: str, name: str) -> str:
+        ratio = values.get(f"method_{other}_over_{name}")
+        return spread(ratio, "×") if ratio else ""
+
+    return table([title, "seconds", "speed-up over `raymarch`", "over `transmittance_volume`", "relative RMSE"], [
+        [f"`{name}`", spread(values[f"method_{name}"], form=_seconds), over("raymarch", name),
+         over("transmittance_volume", name), f"{values[f'method_error_{name}']['median']:.1f} %"] for name in names])
+
+
+def speed_fields(values: Values) -> str:
+    """Return nanoseconds per point and light, by method and by the representation of the field."""
+    columns = {"voxels": "voxels", "shipped": "shipped networks", "paper": "networks of the paper's size"}
+    names = [key.removeprefix("setting_voxels_") for key in values if key.startswith("setting_voxels_")]
+    return table(["ns per point and light", *columns.values()], [
+        [f"`{name}`", *(spread(values[key]) if (key := f"setting_{column}_{name}") in values else ""
+                        for column in columns)] for name in names])
+
+
 def speed_full(values: Values) -> str:
-    """Return all figures."""
-    return table(["what", "measured", "extrapolated from"],
-                 [[f["title"].replace("_", "\\_"), spread(f, f["unit"]), f.get("extrapolated", "")]
-                  for key, f in values.items() if "median" in f])
+    """Return all figures that the other tables of speed do not show."""
+    others = ("stage", "whole", "method", "setting")
+    return table(["what", "measured"], [[f["title"].replace("_", "\\_"), spread(f, f["unit"])]
+                                        for key, f in values.items() if "median" in f and not key.startswith(others)])
+
+
+KINDS = {"random": "random directions", "same": "the same lights", "env": "environment", "area": "area light"}
+"""Titles of what `benchmarks.loops` compares."""
 
 
 def _loops(case: str) -> Callable[[Values], str]:
     """Return a function that makes the table of a case of `benchmarks.loops`."""
+    kinds = case in ("loop", "sampled")
+    more = {"whole": ["relative RMSE"], "sampled": ["time to equal noise"]}.get(case, [])
+    header = ["scene", *(["towards" if case == "loop" else "light"] if kinds else []), "method",
+              "ns" if case == "loop" else "seconds", "speed-up", *more]
+
     def rows(values: Values) -> str:
         lines = []
         for scene, row in values[case].items():
-            parts = {"": row} if case in ("whole", "floor", "bounces") else row
-            for kind, part in parts.items():
-                lines += [[scene, kind or case, f"`{m}`", *cells(part, m)] for m in part if m in METHODS]
-        header = {"loop": ["ns", "speed-up"], "whole": ["seconds", "speed-up", "relative RMSE"],
-                  "sampled": ["seconds", "speed-up", "time to equal noise"], "floor": ["seconds", "speed-up"],
-                  "bounces": ["seconds", "speed-up"]}[case]
-        return table(["scene", "what", "method", *header], lines, 3)
+            for kind, part in row.items() if kinds else [("", row)]:
+                lines += [[scene, *([KINDS[kind]] if kinds else []), f"`{m}`", *cells(part, m)]
+                          for m in part if m in METHODS]
+        return table(header, lines, len(header) - 2 - len(more))
 
     def cells(part: Values, method: str) -> list[str]:
         row = part[method]
         if case == "loop":
-            return [spread(row), "" if method == "raymarch" else spread(part["ratio"], "×")]
-        more = {"whole": lambda: [percent(row["error"])], "sampled": lambda: [number(row["equal_noise"])]}
-        return [spread(row["seconds"], form=_seconds), spread(row["ratio"], "×"), *more.get(case, list)()]
+            return [spread(row), "" if method == METHODS[0] else spread(part["ratio"], "×")]
+        last = {"whole": lambda: [percent(row["error"])], "sampled": lambda: [number(row["equal_noise"])]}
+        ratio = "" if method == METHODS[0] else spread(row["ratio"], "×")
+        return [spread(row["seconds"], form=_seconds), ratio, *last.get(case, list)()]
 
     return rows
 
@@ -204,7 +246,10 @@ TABLES: dict[str, tuple[str, Callable[[Values], str]]] = {
     "demo": ("demo", lambda values: demo_rows(values["rows"], full=False)),
     "demo-full": ("demo", lambda values: demo_rows(values["rows"], full=True)),
     "speed": ("speed", speed),
+    "speed-paper": ("speed", speed_paper),
     "speed-full": ("speed", speed_full),
+    "speed-methods": ("speed", speed_methods),
+    "speed-fields": ("speed", speed_fields),
     **{f"loops-{case}": ("loops", _loops(case)) for case in ("loop", "whole", "sampled", "floor", "bounces")},
     **{f"dial-{case}": ("dial", _dial(case)) for case in ("error", "noise", "time", "effects", "stock")},
     "brightness": ("fields", brightness),

@@ -35,10 +35,10 @@ SEQUENCE = {"frames": 120, "size": 256, "first": 2.1, "each": spread(0.4), "late
             "ratio": 10.5, "memory": [400.0, 404.0]}
 VALUES = {"loops": LOOPS, "dial": {case: [ROW] for case in dial.CASES}, "fields": FIELDS, "sequence": SEQUENCE}
 EXPECTED = {
-    "loops-loop": "| statue | random | `transmittance_atlas` | 18.7 (16.8 to 20.6) | 9.4 × (8.46 to 10.3) |",
-    "loops-whole": "| statue | whole | `transmittance_atlas` | 2.00 (1.80 to 2.20) | 4 × (3.6 to 4.4) | 1.0 % |",
-    "loops-sampled": "| statue | area | `raymarch` | 2.00 (1.80 to 2.20) | 4 × (3.6 to 4.4) | 0.27 |",
-    "loops-floor": "| knot | floor | `raymarch` | 2.00 (1.80 to 2.20) | 4 × (3.6 to 4.4) |",
+    "loops-loop": "| statue | random directions | `transmittance_atlas` | 18.7 (16.8 to 20.6) | 9.4 × (8.46 to 10.3) |",
+    "loops-whole": "| statue | `transmittance_atlas` | 2.00 (1.80 to 2.20) | 4 × (3.6 to 4.4) | 1.0 % |",
+    "loops-sampled": "| statue | area light | `raymarch` | 2.00 (1.80 to 2.20) |  | 0.27 |",
+    "loops-floor": "| knot | `raymarch` | 2.00 (1.80 to 2.20) |  |",
     "dial-error": "| statue | point | 1 | 1.2 % | 3.20 | 3.00 | 1.07 | 9.00 |",
     "dial-noise": "| statue | point | 0.03 | 0.031 | 0.030 | 16 | 3.20 |",
     "dial-stock": "| statue | point | 3.20 | 16 | 320 | 1.07 |",
