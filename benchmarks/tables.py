@@ -95,8 +95,8 @@ def speed(values: Values) -> str:
     rows = []
     if (record.RESULTS / "loops.json").is_file():
         whole = record.read("loops")["values"]["whole"]["statue"]
-        named = [f"`{m}` ({percent(whole[m]['error'])} error)" for m in METHODS[1:]]
-        rows.append([f"whole picture, `raymarch` over {'; over '.join(named)}",
+        errors = "; ".join(percent(whole[m]["error"]) for m in METHODS[1:])
+        rows.append([f"whole picture, `raymarch` over {'; '.join(f'`{m}`' for m in METHODS[1:])} (errors {errors})",
                      "; ".join(f"{number(whole[m]['ratio']['median'])} ×" for m in METHODS[1:])])
     rows += [
         ["transmittance of 500 lights, networks of the paper's size: volume over map, unculled (391 ×)",
