@@ -1,10 +1,6 @@
 """Configuration of the documentation site: `make docs` builds it into out/docs without a network."""
 
-import sys
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).parent))
-from mi_ntf import __version__  # noqa: E402
+from mi_ntf import __version__
 
 project = "mi_ntf"
 author = "the mi_ntf authors"

@@ -99,7 +99,8 @@ def smaller(words):
         if option in words:
             words[words.index(option) + 1] = value
     if words[0] == "mitsuba":
-        if "scenes/" in words[-1] or "gallery/" in words[-1]:  # a swapped one is small by itself
+        words = [re.sub("^res=.*", "res=16", word) for word in words]
+        if "scenes/" in words[-1]:  # a swapped one is small by itself
             words[1:1] = ["-D", "res=16"]
     elif words[:2] == ["python", "docs/gallery/make.py"]:
         words += ["--size", "12", "--spp", "1", "--out", "pictures"]
