@@ -20,7 +20,7 @@ SAMPLES = 1 << 22  # pixels that estimate the intensity, of all photographs toge
 
 
 class Sphere(NamedTuple):
-    """The object's sphere in world units."""
+    """Sphere around the object, in world units."""
 
     center: np.ndarray
     radius: float

@@ -28,13 +28,13 @@ def inspect(folder: Path, out: Path | None = None, **options: Any) -> Numbers:
     folder = Path(folder)
     out = Path(f"{folder.resolve().name}-inspect.html") if out is None else Path(out)
     files.check(out)
-    said: list[str] = []
-    splits = load_dataset(folder, said.append, **{k: v for k, v in options.items() if v is not None})
+    messages: list[str] = []
+    splits = load_dataset(folder, messages.append, **{k: v for k, v in options.items() if v is not None})
     rows = measures.measure(splits)
     numbers = measures.numbers(splits, rows)
     form, _ = find_form(folder)
-    data = {"folder": str(folder), "form": form.name, "said": said,
-            "assumed": [text for text in said if text.startswith(assumptions.PREFIX)], **numbers,
+    data = {"folder": str(folder), "form": form.name, "said": messages,
+            "assumed": [text for text in messages if text.startswith(assumptions.PREFIX)], **numbers,
             "warnings": measures.warnings(numbers, rows), "page": str(out),
             "views": [{key: _plain(value) for key, value in row._asdict().items()} for row in rows]}
     _page(folder, form.read(folder), splits, rows, data).write(out)

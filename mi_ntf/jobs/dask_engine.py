@@ -24,7 +24,7 @@ LOGGERS = ("distributed.scheduler", "distributed.client")  # they print four lin
 class Dask:
     """Dask itself gives the tasks of a worker that is lost to others, four times at most."""
 
-    def __init__(self, workers: Workers, work: bytes, tell: Callable[[str], None]):
+    def __init__(self, workers: Workers, work: bytes, notify: Callable[[str], None]):
         self._work, self._threads = work, workers.threads
         self._gpus: list[str] = []
         with contextlib.ExitStack() as stack:  # everything that `close` ends or restores
@@ -41,7 +41,7 @@ class Dask:
             self._number = itertools.count()
             self.about = f"Dask's dashboard: {self._client.dashboard_link}"
             if not self._workers():
-                tell(f"no worker has joined {address} yet; start some with: dask worker {address}")
+                notify(f"no worker has joined {address} yet; start some with: dask worker {address}")
             self._stack = stack.pop_all()
 
     def _local(self, workers: Workers, stack: contextlib.ExitStack) -> distributed.LocalCluster:

@@ -95,17 +95,17 @@ def each(work: Callable[[Task], Result], tasks: Sequence[Task], workers: Workers
     workers.check()
     if not tasks:
         return
-    with _bar(title, len(tasks), quiet) as (tell, advance):
+    with _bar(title, len(tasks), quiet) as (notify, advance):
         if workers.here:
             for index, task in enumerate(tasks):
                 yield _do(work, index, task)
                 advance()
             return
-        engine = _engine(workers, _pickled(work), folder, tell)
+        engine = _engine(workers, _pickled(work), folder, notify)
         try:
             if engine.about:
-                tell(engine.about)
-            for answer in _answers(engine, tasks, names, BARREN + 2 * (workers.workers or 0), tell):
+                notify(engine.about)
+            for answer in _answers(engine, tasks, names, BARREN + 2 * (workers.workers or 0), notify):
                 yield Done(answer.index, cast(Result, None if answer.error else pickle.loads(answer.value)),
                            answer.error)
                 advance()
@@ -121,7 +121,7 @@ def _do(work: Callable[[Task], Result], index: int, task: Task) -> Done[Result]:
         return Done(index, cast(Result, None), describe(error))
 
 
-def _answers(engine: Engine, tasks: Sequence[object], names: Sequence[str], barren: int, tell: Callable[[str], None]
+def _answers(engine: Engine, tasks: Sequence[object], names: Sequence[str], barren: int, notify: Callable[[str], None]
              ) -> Iterator[Answer]:
     """Yield the last answer to each task, which is tried until it is done or has failed often enough."""
     for index, task in enumerate(tasks):
@@ -135,14 +135,14 @@ def _answers(engine: Engine, tasks: Sequence[object], names: Sequence[str], barr
             raise MiNtfError(f"{lost} workers ended one after the other without an answer, the last one: "
                              f"{answer.error}; mend that and run again")
         if answer.error and not answer.last and attempts[answer.index] < ATTEMPTS:
-            tell(f"{_name(answer.index, names)}: {answer.error}; it is tried again")
+            notify(f"{_name(answer.index, names)}: {answer.error}; it is tried again")
             engine.submit(answer.index, tasks[answer.index], answer.where)
             continue
         waiting -= 1
         yield answer
 
 
-def _engine(workers: Workers, work: bytes, folder: Path | None, tell: Callable[[str], None]) -> Engine:
+def _engine(workers: Workers, work: bytes, folder: Path | None, notify: Callable[[str], None]) -> Engine:
     if workers.engine == "local":
         from .local_engine import Local
 
@@ -151,7 +151,7 @@ def _engine(workers: Workers, work: bytes, folder: Path | None, tell: Callable[[
     if workers.engine == "dask":
         from .dask_engine import Dask
 
-        return Dask(workers, work, tell)
+        return Dask(workers, work, notify)
     from .submitit_engine import Submitit
 
     if folder is None:
@@ -178,13 +178,13 @@ def _bar(title: str, total: int, quiet: bool) -> Iterator[tuple[Callable[[str], 
     with nullcontext() if quiet else progress:
         bar = progress.add_task(title, total=total)
 
-        def tell(text: str) -> None:
+        def notify(text: str) -> None:
             if quiet:
                 print(text, file=sys.stderr)
             else:
                 console.print(text, markup=False, soft_wrap=True)
 
-        yield tell, lambda: progress.advance(bar)
+        yield notify, lambda: progress.advance(bar)
 
 
 def _name(index: int, names: Sequence[str]) -> str:

@@ -25,7 +25,7 @@ SPHERES = [(np.array(center), radius) for center, radius, _ in two_spheres.SPHER
 
 
 def true_bounds() -> tuple[np.ndarray, float]:
-    """The smallest sphere around two spheres: on the line through their centres."""
+    """Return the smallest sphere around two spheres: its centre is on the line through their centres."""
     (a, r), (b, s) = SPHERES
     along = (b - a) / np.linalg.norm(b - a)
     return estimates.bounding_sphere(np.stack([a - r * along, b + s * along]))
@@ -49,12 +49,12 @@ def _save(folder: Path, name: str, picture: np.ndarray) -> None:
 
 
 def splits() -> dict[str, range]:
-    """The views of train, val and test."""
+    """Return the views of train, val and test."""
     return {"train": range(VIEWS - 2), "val": range(VIEWS - 2, VIEWS - 1), "test": range(VIEWS - 1, VIEWS)}
 
 
 def capture(folder: Path) -> Path:
-    """As `mi-ntf capture` writes it."""
+    """Write the set as `mi-ntf capture` does."""
     for split, views in splits().items():
         frames = []
         for i in views:
@@ -65,7 +65,7 @@ def capture(folder: Path) -> Path:
 
 
 def blender(folder: Path) -> Path:
-    """As NeRF-synthetic: PNG, names without extension, nothing of light or size."""
+    """Write the set as NeRF-synthetic has it: PNG, names without extension, no light and no size."""
     for split, views in splits().items():
         frames = []
         for i in views:
@@ -76,7 +76,7 @@ def blender(folder: Path) -> Path:
 
 
 def nrhints(folder: Path) -> Path:
-    """As NRHints: light positions, intrinsics [cx, cy, fx, fy], extension apart."""
+    """Write the set as NRHints has it: light positions, intrinsics [cx, cy, fx, fy], extensions apart from names."""
     for split, views in splits().items():
         frames = []
         for i in views:
@@ -89,7 +89,7 @@ def nrhints(folder: Path) -> Path:
 
 
 def colmap(folder: Path, model: str = "PINHOLE", points: bool = True) -> Path:
-    """As COLMAP's text export: world-to-camera, OpenCV axes; masks beside opaque photographs."""
+    """Write COLMAP's text export: world-to-camera, OpenCV axes; masks beside opaque photographs."""
     place = folder / "sparse" / "0"
     place.mkdir(parents=True)
     numbers = {"PINHOLE": [FOCAL, FOCAL, SIZE / 2, SIZE / 2], "SIMPLE_PINHOLE": [FOCAL, SIZE / 2, SIZE / 2],
@@ -114,7 +114,7 @@ def colmap(folder: Path, model: str = "PINHOLE", points: bool = True) -> Path:
 
 
 def nerfstudio(folder: Path) -> Path:
-    """As `ns-process-data` writes it: one file, intrinsics in pixels, splits by lists of names."""
+    """Write the set as `ns-process-data` does: one file, intrinsics in pixels, splits by lists of names."""
     frames = []
     for i, c2w in enumerate(C2W):
         _save(folder, f"images/frame_{i:05d}.png", PICTURES[i])
@@ -127,7 +127,7 @@ def nerfstudio(folder: Path) -> Path:
 
 
 def llff(folder: Path, factor: int = 1) -> Path:
-    """As LLFF's `imgs2poses.py`: poses of photographs `factor` times as large as those that are there."""
+    """Write the set as LLFF's `imgs2poses.py` does: poses of photographs `factor` times as large as the files."""
     rows = []
     for i, c2w in enumerate(C2W):
         _save(folder, f"images/IMG_{i:03d}.png", PICTURES[i])

@@ -19,9 +19,11 @@ SIZE = 160
 FOCAL = schema.focal_length(forms.ANGLE, SIZE)
 
 
-def taken(c2w, room=0.002, noise=0.0015, rng=None) -> tuple[np.ndarray, np.ndarray]:
-    """``(8-bit RGB levels, alpha)`` of the two spheres in a room that is not quite dark, by a camera that is not quite
-    without noise; one sphere has a black band. Linear light below 1."""
+def photograph(c2w, room=0.002, noise=0.0015, rng=None) -> tuple[np.ndarray, np.ndarray]:
+    """Return 8-bit RGB levels and alpha of the two spheres in a room that is not quite dark.
+
+    The camera is not quite without noise, and one sphere has a black band. Linear light is below 1.
+    """
     rng = np.random.default_rng(0) if rng is None else rng
     picture = two_spheres.photograph(c2w, FOCAL, SIZE, 2) * (forms.SCALE, forms.SCALE, forms.SCALE, 1)
     picture[70:80, :, :3] *= 0.01
@@ -32,16 +34,16 @@ def taken(c2w, room=0.002, noise=0.0015, rng=None) -> tuple[np.ndarray, np.ndarr
 @pytest.mark.parametrize("view", range(5))
 @pytest.mark.parametrize("dtype", [np.uint8, np.float32])
 def test_matter_lies_in_the_silhouette_and_emptiness_outside_of_it(view, dtype):
-    levels, alpha = taken(forms.C2W[view])
+    levels, alpha = photograph(forms.C2W[view])
     stored = np.concatenate([levels, np.full((SIZE, SIZE, 1), 255, np.uint8)], -1)
-    found = background.alpha(stored if dtype == np.uint8 else images.linear(stored), "here")
-    assert set(np.unique(found)) == {background.EMPTY, background.UNKNOWN, background.MATTER}
-    assert (found[alpha < 0.5] != background.MATTER).all() and (found[alpha > 0] != background.EMPTY).all()
+    result = background.alpha(stored if dtype == np.uint8 else images.linear(stored), "here")
+    assert set(np.unique(result)) == {background.EMPTY, background.UNKNOWN, background.MATTER}
+    assert (result[alpha < 0.5] != background.MATTER).all() and (result[alpha > 0] != background.EMPTY).all()
     core = ndimage.binary_erosion(alpha == 1, iterations=4) & (np.abs(np.arange(SIZE) - 74.5) > 8)[:, None]
     bright = core & (images.LINEAR[levels].max(-1) > 0.25 * images.LINEAR[levels].max())
-    assert (found[bright] == background.MATTER).mean() > 0.99
+    assert (result[bright] == background.MATTER).mean() > 0.99
     far = ndimage.distance_transform_edt(alpha == 0) > (2 * background.CLOSE + background.AROUND) * SIZE
-    assert (found[far] == background.EMPTY).all() and far.mean() > 0.2
+    assert (result[far] == background.EMPTY).all() and far.mean() > 0.2
 
 
 def test_dust_is_dropped_and_parts_of_the_object_are_kept():
@@ -51,17 +53,18 @@ def test_dust_is_dropped_and_parts_of_the_object_are_kept():
     light[60:140, 184:200, :3] = 0.4   # a part beyond a narrow shadow
     light[90:110, 120:140, :3] = 0     # a hole
     light[20:22, 20:22, :3] = 0.6      # dust
-    found = background.alpha(light, "here")
-    assert (found[10:32, 10:32] == background.EMPTY).all()
-    assert (found[92:108, 122:138] == background.UNKNOWN).all() and (found[62:138, 181:183] == background.UNKNOWN).all()
-    assert (found[64:84, 104:176] == background.MATTER).all() and (found[64:136, 188:196] == background.MATTER).all()
+    result = background.alpha(light, "here")
+    assert (result[10:32, 10:32] == background.EMPTY).all()
+    assert (result[92:108, 122:138] == background.UNKNOWN).all()
+    assert (result[62:138, 181:183] == background.UNKNOWN).all()
+    assert (result[64:84, 104:176] == background.MATTER).all() and (result[64:136, 188:196] == background.MATTER).all()
 
 
 def test_an_object_that_leaves_the_picture():
     light = np.full((100, 150, 4), 1e-4, np.float32)
     light[60:, 50:100, :3] = 0.3
-    found = background.alpha(light, "here")
-    assert (found[63:, 53:97] == background.MATTER).all() and (found[:40] == background.EMPTY).all()
+    result = background.alpha(light, "here")
+    assert (result[63:, 53:97] == background.MATTER).all() and (result[:40] == background.EMPTY).all()
 
 
 @pytest.mark.parametrize(("room", "text"), [
@@ -69,32 +72,32 @@ def test_an_object_that_leaves_the_picture():
           r"linear light, .* up to 8% of that; darken the room, or make masks .*`rembg p -om .* --masks DIR"),
     (None, r"a.png: its background is not black: the median of its border is 0, its brightest percent 0 in")])
 def test_what_is_not_dark_is_refused_with_what_to_do(room, text):
-    pixels = np.zeros((SIZE, SIZE, 3), np.uint8) if room is None else taken(forms.C2W[0], room=room)[0]
+    pixels = np.zeros((SIZE, SIZE, 3), np.uint8) if room is None else photograph(forms.C2W[0], room=room)[0]
     with pytest.raises(MiNtfError, match=text):
         background.alpha(np.concatenate([pixels, pixels[..., :1]], -1), "a.png")
 
 
 def write(folder, **room):
-    """A Blender data set of opaque photographs in a dark room."""
+    """Write a Blender data set of opaque photographs in a dark room."""
     rng = np.random.default_rng(4)
     for split, views in forms.splits().items():
         frames = []
         for i in views:
             (folder / split).mkdir(exist_ok=True)
-            Image.fromarray(taken(forms.C2W[i], rng=rng, **room)[0]).save(folder / split / f"{i}.png")
+            Image.fromarray(photograph(forms.C2W[i], rng=rng, **room)[0]).save(folder / split / f"{i}.png")
             frames.append({"file_path": f"{split}/{i}", "transform_matrix": forms.C2W[i].tolist()})
         (folder / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": forms.ANGLE, "frames": frames}))
     return folder
 
 
 def test_a_data_set_without_masks(tmp_path):
-    said = []
-    splits = load_dataset(write(tmp_path), said.append, background="black")
+    messages = []
+    splits = load_dataset(write(tmp_path), messages.append, background="black")
     split = splits["train"]
     assert not any(s.masked for s in splits.values()) and split.images.dtype == np.uint8
-    assert said[0].endswith("16 photographs, 160x160 pixels, black background")
-    assert any("is known to be empty" in s for s in said)
-    assert any("sphere is found from the lit regions' visual hull" in s for s in said)
+    assert messages[0].endswith("16 photographs, 160x160 pixels, black background")
+    assert any("is known to be empty" in s for s in messages)
+    assert any("sphere is found from the lit regions' visual hull" in s for s in messages)
     for center, radius in forms.SPHERES:
         assert np.linalg.norm(center - split.center) + radius <= split.radius
     assert split.radius < 1.3 * forms.true_bounds()[1]  # the margin of silhouettes is 0.03 of 160 pixels and more

@@ -88,17 +88,19 @@ def test_collocated_radiance_of_a_diffuse_sphere_is_the_closed_form(sphere_set):
 
 
 def test_a_flash_beside_the_lens_lights_the_sphere_from_there(tmp_path):
-    """Radiance of the diffuse sphere at the point that the middle pixel sees, ⟨n,ω⟩ I/d² and all, for a flash right of,
-    above and in front of the lens."""
+    """The radiance of the diffuse sphere in the middle pixel is ⟨n,ω⟩ I/d² times albedo over π.
+
+    The flash is right of, above and in front of the lens.
+    """
     beside = np.array([0.6, 0.9, 0.3])
     small(write(tmp_path), tmp_path / "out", spp=1024, flash_offset=tuple(beside))
     split = load_dataset(tmp_path / "out")["train"]
     for i in range(3):
         camera, (right, up, back) = split.c2w[i][:3, 3], split.c2w[i][:3, :3].T
         np.testing.assert_allclose(split.light_pos[i], camera + beside @ [right, up, -back], atol=1e-6)  # float32
-        away = split.light_pos[i] - (np.array([2, -1, 0.5]) + 0.7 * back)
-        distance = np.linalg.norm(away)
-        expected = np.array([0.8, 0.4, 0.2]) / np.pi * split.light_intensity[i] * (away @ back) / distance**3
+        to_flash = split.light_pos[i] - (np.array([2, -1, 0.5]) + 0.7 * back)
+        distance = np.linalg.norm(to_flash)
+        expected = np.array([0.8, 0.4, 0.2]) / np.pi * split.light_intensity[i] * (to_flash @ back) / distance**3
         # the cosine's deviation in the pixel is a percent, the mean's of 1024 paths a thirtieth of that
         np.testing.assert_allclose(split.images[i, 16, 16, :3], expected, rtol=5e-3)
     with pytest.raises(MiNtfError, match="forward at most half"):
@@ -110,7 +112,7 @@ def test_a_flash_beside_the_lens_lights_the_sphere_from_there(tmp_path):
 def test_photographs_of_a_medium_are_the_integral_over_light_dimmed_twice(tmp_path):
     small(write(tmp_path, MEDIUM), tmp_path / "out", size=32, views=2, spp=128)
     split = load_dataset(tmp_path / "out")["train"]
-    seen, expected, offset = [], [], []
+    measured, expected, offset = [], [], []
     for i, image in enumerate(split.images):
         origins, directions = schema.pixel_rays(split.c2w[i], split.focal[i], 32, 32, split.principal[i])
         middle = ((np.array([2, -1, 0.5]) - origins) * directions).sum(-1)
@@ -120,24 +122,25 @@ def test_photographs_of_a_medium_are_the_integral_over_light_dimmed_twice(tmp_pa
         falloff = np.exp(-2 * 1.5 * u) / (middle[..., None] - half[..., None] + u) ** 2
         column = 1.5 / (4 * np.pi) * falloff.sum(-1) * (2 * half / 200)
         radiance = column[..., None] * [0.8, 0.4, 0.2] * split.light_intensity[i]
-        seen.append(image)
+        measured.append(image)
         expected.append(np.concatenate([radiance, 1 - np.exp(-1.5 * 2 * half)[..., None]], -1))
         offset.append(across)
         assert not image[across > 0.8].any()
-    seen, expected, offset = np.stack(seen), np.stack(expected), np.stack(offset)
+    measured, expected, offset = np.stack(measured), np.stack(expected), np.stack(offset)
     for near, far in ((0.0, 0.3), (0.3, 0.6)):  # at the rim a pixel's mean is not its centre's value
         ring = (offset >= near) & (offset < far)
         # at least 20 000 paths, each with a deviation of about the mean: 0.7 %; the quadrature's error is below 0.01 %.
         # With the light dimmed once, the radiance would be 40 % higher.
-        np.testing.assert_allclose(seen[ring].mean(0), expected[ring].mean(0), rtol=0.03)
+        np.testing.assert_allclose(measured[ring].mean(0), expected[ring].mean(0), rtol=0.03)
 
 
 def test_surface_integrators_do_not_photograph_media(tmp_path):
-    own = cap._load(write(tmp_path, MEDIUM))[1]
+    volpath = cap._load(write(tmp_path, MEDIUM))[1]
     other = cap._load(write(tmp_path, MEDIUM.replace("volpath", "path")))[1]
     surface = cap._load(write(tmp_path, SPHERE.replace('type="path"', 'type="direct"')))[1]
-    assert [x.class_name() for x in (own, other, surface)] == ["VolumetricPathIntegrator"] * 2 + ["DirectIntegrator"]
-    assert "max_depth = 2" in str(own) and "max_depth = 6" in str(other)
+    assert [x.class_name() for x in (volpath, other, surface)] == [
+        "VolumetricPathIntegrator", "VolumetricPathIntegrator", "DirectIntegrator"]
+    assert "max_depth = 2" in str(volpath) and "max_depth = 6" in str(other)
 
 
 def test_white_surface_at_the_centre_has_radiance_one(sphere_set):
@@ -229,7 +232,7 @@ def test_scenes_that_cannot_be_photographed_say_why(tmp_path, text, message):
 
 
 def of_albedo(folder, value):
-    """The sphere with an albedo that only a raw texture may have."""
+    """Return the scene file of the sphere with an albedo that only a raw texture may have."""
     mi.util.write_bitmap(str(folder / "albedo.exr"), np.full((2, 2, 3), value, np.float32), write_async=False)
     texture = """<texture type="bitmap" name="reflectance"><boolean name="raw" value="true"/>
         <string name="filename" value="albedo.exr"/></texture>"""

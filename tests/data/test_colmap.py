@@ -15,12 +15,12 @@ from mi_ntf.data.readers import load_dataset
 
 
 def load(folder: Path):
-    said = []
-    return load_dataset(folder, said.append), "\n".join(said)
+    messages = []
+    return load_dataset(folder, messages.append), "\n".join(messages)
 
 
 def change(name: str, function):
-    """An edit of one of the model's text files, as bytes."""
+    """Return an edit of one of the model's text files, as bytes."""
     def edit(folder: Path) -> None:
         path = folder / "sparse/0" / name
         path.write_bytes(function(path.read_bytes()))
@@ -46,7 +46,7 @@ def encoded(folder: Path, encoding: str) -> None:
 
 
 def in_a_folder(folder: Path) -> None:
-    """Named as on Windows."""
+    """Move a photograph into a folder, and name it as on Windows."""
     for kind in ("images", "masks"):
         (folder / kind / "ring").mkdir()
         (folder / kind / "003.png").rename(folder / kind / "ring" / "003.png")
@@ -54,7 +54,7 @@ def in_a_folder(folder: Path) -> None:
 
 
 def with_other_extensions(folder: Path) -> None:
-    """The model says .JPG; masks are called after that, photographs are .PNG."""
+    """Rename files: the model says .JPG, masks are called after that, and photographs are .PNG."""
     for path in (folder / "masks").iterdir():
         path.rename(path.with_suffix(".JPG.png"))
     for path in (folder / "images").iterdir():
@@ -75,11 +75,11 @@ def with_other_extensions(folder: Path) -> None:
         "another extension", "Windows separators"])
 def test_every_photograph_is_read(tmp_path, edit):
     edit(forms.colmap(tmp_path))
-    splits, said = load(tmp_path)
+    splits, messages = load(tmp_path)
     poses, pictures = (np.concatenate([getattr(split, key) for split in splits.values()]) for key in ("c2w", "images"))
     apart = np.abs(poses[:, None] - forms.C2W).max((2, 3))
     order = apart.argmin(1)
-    assert sorted(order) == list(range(forms.VIEWS)) and apart.min(1).max() < 1e-6 and "have no pose" not in said
+    assert sorted(order) == list(range(forms.VIEWS)) and apart.min(1).max() < 1e-6 and "have no pose" not in messages
     # the file's 8 bits, and those over black: `test_readers.check_8_bit_pixels`
     np.testing.assert_allclose(images.linear(pictures), forms.PICTURES[order], atol=(2 * 2.3 + 1) * 0.5 / 255)
 
@@ -118,7 +118,7 @@ def test_latin_1_in_binary_models(tmp_path):
 
 
 def small(folder: Path, place: str, count: int) -> Path:
-    """A copy of the model in `place` with the first `count` images."""
+    """Copy the model to `place` with the first `count` images."""
     shutil.copytree(folder / "sparse/0", folder / place)
     path = folder / place / "images.txt"
     path.write_text("".join(path.read_text().splitlines(keepends=True)[:2 * count]))
@@ -138,11 +138,11 @@ def test_the_model_with_most_photographs(tmp_path, places, chosen):
         shutil.copytree(tmp_path / "whole/part", tmp_path / place)
         shutil.rmtree(tmp_path / "whole/part")
     assert whole.is_dir()
-    splits, said = load(tmp_path)
+    splits, messages = load(tmp_path)
     assert sum(len(split.images) for split in splits.values()) == 16
-    told = ", ".join(f"{place} with {n}" for place, n in ({"sparse/0": 16} | places).items())
+    sizes = ", ".join(f"{place} with {n}" for place, n in ({"sparse/0": 16} | places).items())
     assert (f"assumed: of {len({'sparse/0': 16} | places)} COLMAP models the one with most photographs is read, "
-            f"{tmp_path / chosen} ({told}); name a model's own folder to read another") in said.split("\n")
+            f"{tmp_path / chosen} ({sizes}); name a model's own folder to read another") in messages.split("\n")
 
 
 def test_a_model_is_read_by_its_own_folder(tmp_path):
@@ -150,6 +150,6 @@ def test_a_model_is_read_by_its_own_folder(tmp_path):
     small(forms.colmap(tmp_path), "sparse/1", 15)
     shutil.copytree(tmp_path / "sparse/1", tmp_path / "colmap/sparse/0")
     for place in ("sparse/1", "colmap/sparse/0"):
-        splits, said = load(tmp_path / place)
+        splits, messages = load(tmp_path / place)
         assert sum(len(split.images) for split in splits.values()) == 15
-        assert "1 of 16 photographs in" in said and "COLMAP models" not in said
+        assert "1 of 16 photographs in" in messages and "COLMAP models" not in messages

@@ -26,7 +26,7 @@ LINEAR = ("curv", struct.pack(">II", 0, 0)[:8])
 
 
 def profile(space: str, curve=SRGB, kind: bytes = b"RGB ") -> bytes:
-    """A matrix profile after ICC.1:2004-10, version 4."""
+    """Return a matrix profile after ICC.1:2004-10, version 4."""
     s15 = lambda values: b"XYZ \0\0\0\0" + b"".join(struct.pack(">i", round(65536 * v)) for v in values)  # noqa: E731
     code, data = curve
     tone = code.encode() + (b"\0\0\0\0" + data if code == "para" else data)
@@ -58,7 +58,7 @@ COLOURS = np.array([[200, 120, 90], [90, 140, 60], [70, 80, 160], [128, 128, 128
 PICTURE = np.repeat(np.repeat(COLOURS[None], 8, 0), 8, 1)
 
 
-def found(path) -> np.ndarray:
+def decoded(path) -> np.ndarray:
     return images.read_image(path)[4, 4::8, :3]
 
 
@@ -73,7 +73,7 @@ def test_display_p3(tmp_path, name):
     image.save(tmp_path / name, icc_profile=profile("Display P3"), **more)
     expected = light(COLOURS) @ TO_XYZ["Display P3"].T @ np.linalg.inv(TO_XYZ["sRGB"]).T
     assert np.abs(expected / light(COLOURS) - 1).max() > 0.2, "the oracle would find no difference"
-    np.testing.assert_allclose(found(tmp_path / name), expected, atol=(3 if name == "a.jpg" else 1.5) * 2.3 / 255)
+    np.testing.assert_allclose(decoded(tmp_path / name), expected, atol=(3 if name == "a.jpg" else 1.5) * 2.3 / 255)
     assert images.decode(tmp_path / name).assumed == (
         "colours are converted from the ICC profile 'Display P3' to sRGB",)
 
@@ -84,21 +84,21 @@ def test_thumbnails_have_the_same_colours(tmp_path):
     Image.new("RGB", (SIDE, SIDE), tuple(COLOURS[0].tolist())).save(path, icc_profile=profile("Display P3"))
     view = View("", path, "a.png", [], split.c2w[0], Camera(FOCAL, FOCAL, SIDE / 2, SIDE / 2))
     shown = inspect_figures.thumbnail(split, 0, view, 1.0)[120, 120]
-    np.testing.assert_allclose(images.LINEAR[shown], found(path)[0], atol=2.3 / 255)
+    np.testing.assert_allclose(images.LINEAR[shown], decoded(path)[0], atol=2.3 / 255)
 
 
 def test_grey_profiles(tmp_path):
     """A linear grey; and grey with a profile of RGB, which some programs leave there."""
     grey = Image.fromarray(PICTURE[..., 0])
     grey.save(tmp_path / "l.png", icc_profile=profile("grey", LINEAR, b"GRAY"))
-    np.testing.assert_allclose(found(tmp_path / "l.png")[:, 1], COLOURS[:, 0] / 255, atol=0.6 * 2.3 / 255)
+    np.testing.assert_allclose(decoded(tmp_path / "l.png")[:, 1], COLOURS[:, 0] / 255, atol=0.6 * 2.3 / 255)
     grey.save(tmp_path / "p.png", icc_profile=profile("Display P3"))
-    np.testing.assert_allclose(found(tmp_path / "p.png")[:, 1], light(COLOURS[:, 0]), atol=1.5 * 2.3 / 255)
+    np.testing.assert_allclose(decoded(tmp_path / "p.png")[:, 1], light(COLOURS[:, 0]), atol=1.5 * 2.3 / 255)
 
 
-@pytest.mark.parametrize("own", [profile("sRGB"), ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()])
-def test_srgb_profiles_leave_the_levels_alone(tmp_path, own):
-    Image.fromarray(PICTURE).save(tmp_path / "a.png", icc_profile=own)
+@pytest.mark.parametrize("icc", [profile("sRGB"), ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()])
+def test_srgb_profiles_leave_the_levels_alone(tmp_path, icc):
+    Image.fromarray(PICTURE).save(tmp_path / "a.png", icc_profile=icc)
     image = images.decode(tmp_path / "a.png")
     np.testing.assert_array_equal(image.rgb, PICTURE)
     assert image.assumed == ()
@@ -130,7 +130,7 @@ def with_chunks(path, *chunks) -> None:
 ], ids=["linear", "1.8", "sRGB's", "sRGB goes before", "none", "primaries of sRGB"])
 def test_gamma_of_png(tmp_path, chunks, expected):
     with_chunks(tmp_path / "a.png", *chunks)
-    np.testing.assert_allclose(found(tmp_path / "a.png"), expected, atol=0.6 * 2.3 / 255)
+    np.testing.assert_allclose(decoded(tmp_path / "a.png"), expected, atol=0.6 * 2.3 / 255)
 
 
 def test_primaries_of_png_are_refused(tmp_path):
@@ -140,20 +140,20 @@ def test_primaries_of_png_are_refused(tmp_path):
         images.decode(tmp_path / "a.png")
 
 
-@pytest.mark.parametrize(("own", "fault"), [
+@pytest.mark.parametrize(("icc", "fault"), [
     (profile("sRGB", LINEAR), None), (profile("sRGB"), "'sRGB'"), (profile("Display P3", LINEAR), "'Display P3'")])
-def test_deep_tiff_is_linear_or_refused(tmp_path, own, fault):
+def test_deep_tiff_is_linear_or_refused(tmp_path, icc, fault):
     """Pillow writes no 16 bits of RGB, OpenCV no profile: the tag is added to OpenCV's file."""
     cv2.imwrite(str(tmp_path / "a.tif"), PICTURE[..., ::-1].astype(np.uint16) * 257,
                 [cv2.IMWRITE_TIFF_COMPRESSION, 1])
     raw = bytearray((tmp_path / "a.tif").read_bytes())
     at = struct.unpack_from("<I", raw, 4)[0]
     count = struct.unpack_from("<H", raw, at)[0]
-    entries = bytes(raw[at + 2:at + 2 + 12 * count]) + struct.pack("<HHII", 34675, 7, len(own), len(raw))
-    struct.pack_into("<I", raw, 4, len(raw) + len(own))
-    (tmp_path / "a.tif").write_bytes(bytes(raw) + own + struct.pack("<H", count + 1) + entries + b"\0\0\0\0")
+    entries = bytes(raw[at + 2:at + 2 + 12 * count]) + struct.pack("<HHII", 34675, 7, len(icc), len(raw))
+    struct.pack_into("<I", raw, 4, len(raw) + len(icc))
+    (tmp_path / "a.tif").write_bytes(bytes(raw) + icc + struct.pack("<H", count + 1) + entries + b"\0\0\0\0")
     if fault is None:
-        np.testing.assert_allclose(found(tmp_path / "a.tif"), COLOURS / 255, rtol=1e-6)
+        np.testing.assert_allclose(decoded(tmp_path / "a.tif"), COLOURS / 255, rtol=1e-6)
         return
     with pytest.raises(MiNtfError, match=rf"a.tif: its ICC profile is {fault}; TIFF of more than 8 bits is read as"):
         images.decode(tmp_path / "a.tif")

@@ -13,7 +13,7 @@ PICTURE = np.random.default_rng(0).random((6, 8, 4)).astype(np.float32)
 
 
 def write(path, layers: dict[str, np.ndarray], **header):
-    """One part with the channels of `layers`: pictures (H, W, 3 or 4) by the names before R, G, B, A."""
+    """Write one part with the channels of `layers`: pictures (H, W, 3 or 4) by the names before R, G, B, A."""
     channels = {f"{name}{c}": np.ascontiguousarray(picture[..., k]) for name, picture in layers.items()
                 for k, c in enumerate("RGBA"[:picture.shape[-1]])}
     with OpenEXR.File(header, channels) as file:
@@ -21,7 +21,7 @@ def write(path, layers: dict[str, np.ndarray], **header):
 
 
 def windows(data, display) -> dict:
-    """The header of windows (left, top, right, bottom), ends included."""
+    """Return the header of windows (left, top, right, bottom), ends included."""
     return {f"{name}Window": (np.array(box[:2], np.int32), np.array(box[2:], np.int32))
             for name, box in (("data", data), ("display", display))}
 
@@ -53,11 +53,11 @@ def test_field_of_view_of_cropped_renderings(tmp_path):
             (tmp_path / f"{split}/r_{i}.png").unlink()
             part = forms.PICTURES[i, 3:20, 2:22].astype(np.float32)
             write(tmp_path / f"{split}/r_{i}.exr", {"": part}, **windows((2, 3, 21, 19), (0, 0, 23, 23)))
-    said = []
-    split = load_dataset(tmp_path, said.append)["train"]
+    messages = []
+    split = load_dataset(tmp_path, messages.append)["train"]
     np.testing.assert_allclose(split.focal, forms.FOCAL)
     np.testing.assert_allclose(split.images[:, 3:20, 2:22], forms.PICTURES[:14, 3:20, 2:22], atol=1e-3)
-    assert any(text.startswith("assumed: an EXR file's picture is its display window") for text in said)
+    assert any(text.startswith("assumed: an EXR file's picture is its display window") for text in messages)
 
 
 @pytest.mark.parametrize(("names", "chosen"), [
@@ -69,8 +69,8 @@ def test_layers(tmp_path, names, chosen):
     write(tmp_path / "a.exr", layers)
     image = images.decode(tmp_path / "a.exr")
     np.testing.assert_array_equal(np.concatenate([image.rgb, image.alpha[..., None]], -1), PICTURE)
-    told = (f"the layer '{chosen[:-1]}' of an EXR file is its picture",)
-    assert image.assumed == (told if chosen else ())
+    text = (f"the layer '{chosen[:-1]}' of an EXR file is its picture",)
+    assert image.assumed == (text if chosen else ())
 
 
 @pytest.mark.parametrize("names", [("depth", "beauty", "diffuse"), ("diffuse", "beauty"), ("depth", "beauty")])

@@ -39,8 +39,8 @@ def test_levels_over_black_are_the_files_where_it_is_opaque():
     light = np.array([linear(v / 255) for v in range(256)]) * alpha / 255
     near = np.array([linear(max(v, 0) / 255) for v in np.arange(256) - 0.5]), np.array(
         [linear(v / 255) for v in np.arange(256) + 0.5])
-    for found in (stored[..., 1], images.levels(images.as_linear(straight))[..., 1]):
-        assert (light >= near[0][found] - 1e-6).all() and (light <= near[1][found] + 1e-6).all()  # float32
+    for near_level in (stored[..., 1], images.levels(images.as_linear(straight))[..., 1]):
+        assert (light >= near[0][near_level] - 1e-6).all() and (light <= near[1][near_level] + 1e-6).all()  # float32
     np.testing.assert_array_equal(images.levels(images.linear(stored)), stored)
 
 

@@ -22,8 +22,10 @@ SEEN = LINEAR[LEVEL]
 
 
 def six(**changes) -> dict[str, Split]:
-    """A grey square of 20 x 20 of 40 x 40 pixels seen from the six ends of the axes, the first three for training twice
-    as often; the sphere has radius 2."""
+    """Return six photographs of a grey square of 20 x 20 pixels in 40 x 40, from the six ends of the axes.
+
+    The first is also the only one of the split for tests. The sphere has radius 2.
+    """
     images = np.zeros((6, SIDE, SIDE, 4), np.uint8)
     images[:, 10:30, 10:30] = (LEVEL, LEVEL, LEVEL, 255)
     c2w = np.stack([camera_to_world(DISTANCE * axis, np.zeros(3)) for axis in AXES])
@@ -38,8 +40,8 @@ def six(**changes) -> dict[str, Split]:
 
 def of(splits: dict[str, Split]) -> tuple[dict, list[measures.Photograph], str]:
     rows = measures.measure(splits)
-    found = measures.numbers(splits, rows)
-    return found, rows, "\n".join(measures.warnings(found, rows))
+    numbers = measures.numbers(splits, rows)
+    return numbers, rows, "\n".join(measures.warnings(numbers, rows))
 
 
 def changed(**changes) -> tuple[dict, list[measures.Photograph], str]:
@@ -47,32 +49,32 @@ def changed(**changes) -> tuple[dict, list[measures.Photograph], str]:
 
 
 def test_numbers_of_an_even_set():
-    found, rows, warned = changed()
+    numbers, rows, warned = changed()
     assert [row.name for row in rows] == [*(f"{i}.png" for i in range(6)), "test.png"]
-    assert found["photographs"] == {"train": 6, "test": 1} and (found["width"], found["height"]) == (SIDE, SIDE)
-    assert found["coverage"] == {"least": 0.25, "median": 0.25, "most": 0.25} and found["unknown"] == 0
-    assert found["brightness"]["mean"] == pytest.approx(3 * [np.pi * SEEN * DISTANCE**2 / INTENSITY], rel=1e-6)
-    assert found["brightness"]["ratio"] == pytest.approx([1, 1, 1])
-    assert found["saturated"] == found["black"] == 0
-    assert found["distance"]["median"] == pytest.approx(DISTANCE / 2)
-    assert found["pixel"]["median"] == pytest.approx(DISTANCE / FOCAL / 2)
-    assert found["flash_degrees"]["most"] == pytest.approx(0, abs=1e-3)
-    assert found["gap"]["degrees"] == pytest.approx(np.degrees(np.arccos(1 / np.sqrt(3))), abs=0.05)  # a cube's corner
-    assert found["uncovered"]["most"] == 0
+    assert numbers["photographs"] == {"train": 6, "test": 1} and (numbers["width"], numbers["height"]) == (SIDE, SIDE)
+    assert numbers["coverage"] == {"least": 0.25, "median": 0.25, "most": 0.25} and numbers["unknown"] == 0
+    assert numbers["brightness"]["mean"] == pytest.approx(3 * [np.pi * SEEN * DISTANCE**2 / INTENSITY], rel=1e-6)
+    assert numbers["brightness"]["ratio"] == pytest.approx([1, 1, 1])
+    assert numbers["saturated"] == numbers["black"] == 0
+    assert numbers["distance"]["median"] == pytest.approx(DISTANCE / 2)
+    assert numbers["pixel"]["median"] == pytest.approx(DISTANCE / FOCAL / 2)
+    assert numbers["flash_degrees"]["most"] == pytest.approx(0, abs=1e-3)
+    assert numbers["gap"]["degrees"] == pytest.approx(np.degrees(np.arccos(1 / np.sqrt(3))), abs=0.05)  # corner
+    assert numbers["uncovered"]["most"] == 0
     assert warned.splitlines() == [
         "6 photographs for training are few: 60 or more from all sides make a field without holes.",
         "The object's sphere is 40 pixels wide, which shows little detail; use larger photographs."]
-    json.dumps(found)
+    json.dumps(numbers)
 
 
 def test_one_photograph_brighter_and_bluer():
     images = six()["train"].images.copy()
     images[2, 10:30, 10:30, :3] = (150, 150, 200)
-    found, _, warned = changed(images=images)
-    assert found["brightness"]["ratio"] == pytest.approx(
+    numbers, _, warned = changed(images=images)
+    assert numbers["brightness"]["ratio"] == pytest.approx(
         [LINEAR[150] / SEEN, LINEAR[150] / SEEN, LINEAR[200] / SEEN], rel=1e-5)
-    assert found["white_balance"]["red_over_green"] == pytest.approx(1)
-    assert found["white_balance"]["blue_over_green"] == pytest.approx(LINEAR[200] / LINEAR[150], rel=1e-5)
+    assert numbers["white_balance"]["red_over_green"] == pytest.approx(1)
+    assert numbers["white_balance"]["blue_over_green"] == pytest.approx(LINEAR[200] / LINEAR[150], rel=1e-5)
     assert "brightness in blue differs 4.53-fold between 0.png and 2.png" in warned
     assert "red or blue over green, differs 1.89-fold" in warned
     assert "differs" not in changed(images=images, calibrated=True)[2]  # the set says how bright each flash was
@@ -87,11 +89,11 @@ def test_brightness_allows_for_distance_and_intensity():
     images[1, ..., :3] /= 4
     intensity[2] *= 3
     images[2, ..., :3] *= 3
-    found, rows, _ = changed(images=images, c2w=c2w, light_pos=c2w[:, :3, 3], light_intensity=intensity)
-    assert found["brightness"]["ratio"] == pytest.approx([1, 1, 1], rel=1e-6)
+    numbers, rows, _ = changed(images=images, c2w=c2w, light_pos=c2w[:, :3, 3], light_intensity=intensity)
+    assert numbers["brightness"]["ratio"] == pytest.approx([1, 1, 1], rel=1e-6)
     assert rows[1].mean == pytest.approx(rows[0].mean / 4)
-    assert found["distance"] == pytest.approx({"least": 2.5, "median": 2.5, "most": 5})
-    assert found["saturated"] is None  # a linear file's white is not known
+    assert numbers["distance"] == pytest.approx({"least": 2.5, "median": 2.5, "most": 5})
+    assert numbers["saturated"] is None  # a linear file's white is not known
 
 
 def test_saturated_and_black_pixels():
@@ -99,9 +101,9 @@ def test_saturated_and_black_pixels():
     images[3, 10:15, 10:30, 1] = 250  # a quarter of one of seven
     images[4, 10:30, 10:20, :3] = 4
     images[:, 0, 0, :3] = 255  # outside of the mask
-    found, rows, warned = changed(images=images)
-    assert rows[3].saturated == 0.25 and found["saturated"] == pytest.approx(0.25 / 7)
-    assert rows[4].black == 0.5 and found["black"] == pytest.approx(0.5 / 7)
+    numbers, rows, warned = changed(images=images)
+    assert rows[3].saturated == 0.25 and numbers["saturated"] == pytest.approx(0.25 / 7)
+    assert rows[4].black == 0.5 and numbers["black"] == pytest.approx(0.5 / 7)
     assert "3.57 % of the object's pixels are saturated" in warned and "nearly black" not in warned
     images[:, 10:30, 10:20, :3] = 4
     assert "50 % of the object's pixels are nearly black" in changed(images=images)[2]
@@ -112,13 +114,13 @@ def test_saturated_and_black_pixels():
 
 def test_the_direction_nobody_photographed():
     train = six()["train"]
-    kept = slice(0, 5)
-    few = dataclasses.replace(train, images=train.images[kept], c2w=train.c2w[kept], focal=train.focal[kept],
-                              principal=train.principal[kept], light_pos=train.light_pos[kept],
-                              light_intensity=train.light_intensity[kept], names=train.names[kept])
-    found, _, warned = of({"train": few, "test": six()["test"]})
-    assert found["gap"]["degrees"] == pytest.approx(90, abs=0.1)
-    np.testing.assert_allclose(found["gap"]["direction"], [0, 0, -1], atol=0.002)
+    five = slice(0, 5)
+    few = dataclasses.replace(train, images=train.images[five], c2w=train.c2w[five], focal=train.focal[five],
+                              principal=train.principal[five], light_pos=train.light_pos[five],
+                              light_intensity=train.light_intensity[five], names=train.names[five])
+    numbers, _, warned = of({"train": few, "test": six()["test"]})
+    assert numbers["gap"]["degrees"] == pytest.approx(90, abs=0.1)
+    np.testing.assert_allclose(numbers["gap"]["direction"], [0, 0, -1], atol=0.002)
     assert "No camera for training is within 90° of the direction" in warned
 
 
@@ -126,9 +128,9 @@ def test_flash_beside_the_lens():
     train = six()["train"]
     angle = np.radians(18)
     beside = train.light_pos * np.cos(angle) + DISTANCE * np.sin(angle) * np.roll(AXES, 1, axis=1)
-    found, _, _ = changed(light_pos=beside.astype(np.float32))
-    assert found["flash_degrees"]["least"] == pytest.approx(18, abs=1e-3)
-    assert found["flash_degrees"]["most"] == pytest.approx(18, abs=1e-3)
+    numbers, _, _ = changed(light_pos=beside.astype(np.float32))
+    assert numbers["flash_degrees"]["least"] == pytest.approx(18, abs=1e-3)
+    assert numbers["flash_degrees"]["most"] == pytest.approx(18, abs=1e-3)
 
 
 def test_small_objects_and_inverted_masks():
@@ -144,13 +146,13 @@ def test_a_black_background_knows_less():
     images = six()["train"].images.copy()
     images[:, 5:35, 5:35, 3] = 128
     images[:, 10:30, 10:30, 3] = 255
-    found, _, _ = changed(images=images, masked=False)
-    assert found["coverage"]["most"] == 0.25 and found["unknown"] == pytest.approx((900 - 400) / 1600)
-    assert found["brightness"]["mean"] == pytest.approx(3 * [np.pi * SEEN * DISTANCE**2 / INTENSITY], rel=1e-6)
+    numbers, _, _ = changed(images=images, masked=False)
+    assert numbers["coverage"]["most"] == 0.25 and numbers["unknown"] == pytest.approx((900 - 400) / 1600)
+    assert numbers["brightness"]["mean"] == pytest.approx(3 * [np.pi * SEEN * DISTANCE**2 / INTENSITY], rel=1e-6)
 
 
 def test_masks_that_disagree():
-    """One mask of twice the others' width: the hull of the others is 1 to 1.2 half a side wide, at depths of 4 to 6."""
+    """Make one mask twice as wide as the others, whose hull is 1 to 1.2 half a side wide at depths of 4 to 6."""
     images = six()["train"].images.copy()
     images[4, :, :, 3] = 255
     _, rows, warned = changed(images=images)
@@ -162,8 +164,8 @@ def test_masks_that_disagree():
 def test_poses_that_disagree():
     c2w = six()["train"].c2w.copy()
     c2w[:, :3, 3] += np.roll(AXES, 1, axis=1)  # each half a square aside
-    found, _, warned = changed(c2w=c2w)
-    assert found["uncovered"]["median"] > 0.1 and "the poses are inexact, or the masks unlike" in warned
+    numbers, _, warned = changed(c2w=c2w)
+    assert numbers["uncovered"]["median"] > 0.1 and "the poses are inexact, or the masks unlike" in warned
 
 
 def test_photographs_to_compare_are_evenly_chosen():
@@ -214,16 +216,16 @@ FORMS = (forms.capture, forms.blender, forms.nrhints, forms.colmap, forms.nerfst
 @pytest.mark.parametrize("form", FORMS)
 def test_every_form(tmp_path, monkeypatch, form, capsys):
     monkeypatch.chdir(tmp_path)
-    found = inspect(form(tmp_path / "set"))
+    numbers = inspect(form(tmp_path / "set"))
     page = (tmp_path / "set-inspect.html").read_text(encoding="utf-8")
-    assert found["page"] == "set-inspect.html" and capsys.readouterr().out == ""  # --json prints JSON alone
-    assert sum(found["photographs"].values()) == forms.VIEWS == len(found["views"])
-    assert found["distance"]["median"] == pytest.approx(3.2 / found["sphere"]["radius"], rel=0.1)
-    assert found["uncovered"]["most"] < 0.02
+    assert numbers["page"] == "set-inspect.html" and capsys.readouterr().out == ""  # --json prints JSON alone
+    assert sum(numbers["photographs"].values()) == forms.VIEWS == len(numbers["views"])
+    assert numbers["distance"]["median"] == pytest.approx(3.2 / numbers["sphere"]["radius"], rel=0.1)
+    assert numbers["uncovered"]["most"] < 0.02
     assert len(pictures(page)) == 2 + 12 + 1
-    for text in [*found["said"], *found["warnings"]]:
+    for text in [*numbers["said"], *numbers["warnings"]]:
         assert text.split("'")[0][:40] in page
-    print_table(json.loads(json.dumps(found)))
+    print_table(json.loads(json.dumps(numbers)))
     printed = capsys.readouterr().out
     assert "warning: 13 photographs" in printed or "warning: 14 photographs" in printed
     assert printed.endswith("set-inspect.html\n")

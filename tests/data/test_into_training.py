@@ -15,16 +15,16 @@ from mi_ntf.train.config import FastConfig  # noqa: E402
 
 
 def test_rays_of_all_forms_are_the_same_lines(tmp_path):
-    """In world coordinates: forms without a sphere choose their own. 1e-5: float32, lengths up to 4."""
+    """Lines are compared in world coordinates, within 1e-5 for float32 and lengths up to 4."""
     expected = None
     for form in (forms.capture, forms.blender, forms.nrhints, forms.nerfstudio):
         split = load_dataset(form(tmp_path / form.__name__), lambda _: None)["train"]
-        found = rays.Photographs(split)[:]
-        np.testing.assert_array_equal(found.target.numpy(), images.linear(split.images).reshape(-1, 4))
-        world = found.o.numpy() * split.radius + split.center
-        expected = (world, found.d.numpy()) if expected is None else expected
+        result = rays.Photographs(split)[:]
+        np.testing.assert_array_equal(result.target.numpy(), images.linear(split.images).reshape(-1, 4))
+        world = result.o.numpy() * split.radius + split.center
+        expected = (world, result.d.numpy()) if expected is None else expected
         np.testing.assert_allclose(world, expected[0], atol=1e-5)
-        np.testing.assert_allclose(found.d.numpy(), expected[1], atol=1e-5)
+        np.testing.assert_allclose(result.d.numpy(), expected[1], atol=1e-5)
 
 
 def test_principal_point_and_focal_lengths_reach_rays_and_hull():
@@ -52,14 +52,16 @@ def test_a_light_away_from_one_camera_is_seen(tmp_path):
     split = load_dataset(forms.nrhints(tmp_path), lambda _: None)["train"]
     assert rays.Photographs(split).on_lens
     split.light_pos[3] += 0.5
-    found = rays.Photographs(split)
-    assert not found.on_lens
-    np.testing.assert_allclose(found.flash[3].numpy() * split.radius + split.center, split.light_pos[3], rtol=1e-6)
+    result = rays.Photographs(split)
+    assert not result.on_lens
+    np.testing.assert_allclose(result.flash[3].numpy() * split.radius + split.center, split.light_pos[3], rtol=1e-6)
 
 
 def test_finer_photographs_are_learned_on_finer_grids():
-    """Pixels of 1/128 (a camera 4 radii away, focal length 512): steps and cells shrink by √2, by a third at 1/144
-    and beyond, and stay as they are for coarser ones."""
+    """Steps and cells shrink by √2 for pixels of 1/128, by a third at 1/144 and beyond.
+
+    The camera is 4 radii away with a focal length of 512. Coarser pixels change nothing.
+    """
     n = len(forms.PICTURES)
     split = Split(forms.PICTURES.astype(np.float32), forms.C2W[:n].copy(), np.tile([512.0, 256.0], (n, 1)),
                   np.zeros((n, 2)), np.zeros((n, 3)), np.ones((n, 3)), np.array([0.5, 0, 0]), 2.0)
@@ -67,7 +69,7 @@ def test_finer_photographs_are_learned_on_finer_grids():
     pixel = rays.pixel_width(split)
     assert pixel == pytest.approx(1 / 128)
     recipe = FastConfig(step=0.01, cells=96, bake=128)
-    found = [(c.step, c.cells, c.bake) for c in (recipe.sharpened(pixel * s) for s in (4, 2, 1, 0.5, 0.1))]
+    result = [(c.step, c.cells, c.bake) for c in (recipe.sharpened(pixel * s) for s in (4, 2, 1, 0.5, 0.1))]
     finest = (0.01 / 1.5, 144, 192)
-    for (step, *cells), wanted in zip(found, [(0.01, 96, 128)] * 2 + [(0.00707, 136, 181)] + [finest] * 2, strict=True):
-        assert (step, *cells) == pytest.approx(wanted, rel=1e-3)
+    for (step, *cells), row in zip(result, [(0.01, 96, 128)] * 2 + [(0.00707, 136, 181)] + [finest] * 2, strict=True):
+        assert (step, *cells) == pytest.approx(row, rel=1e-3)

@@ -31,39 +31,44 @@ MODELS = {
 
 
 def bend(x, y, k1=0.0, k2=0.0, p1=0.0, p2=0.0, k3=0.0, k4=0.0, k5=0.0, k6=0.0):
-    """Where the lens puts the direction (x, y, 1): COLMAP's `models.h`, the same as OpenCV's documentation."""
+    """Return the place of the direction (x, y, 1) by COLMAP's `models.h`, the same as OpenCV's documentation."""
     r = x * x + y * y
     radial = (1 + k1 * r + k2 * r**2 + k3 * r**3) / (1 + k4 * r + k5 * r**2 + k6 * r**3)
     return (x * radial + 2 * p1 * x * y + p2 * (r + 2 * x * x), y * radial + p1 * (r + 2 * y * y) + 2 * p2 * x * y)
 
 
 def spots(focal, bent) -> tuple[np.ndarray, np.ndarray]:
-    """Directions (K, 2), slopes right and down, whose images are well inside of the photograph, and that photograph:
-    linear RGB (HEIGHT, WIDTH, 3) with a Gaussian spot of 2 pixels' deviation at each."""
+    """Return directions (K, 2), slopes right and down, and a photograph of spots in them.
+
+    The images of the directions are well inside the photograph. It is linear RGB (HEIGHT, WIDTH, 3) with a Gaussian
+    spot of 2 pixels' deviation at each.
+    """
     column, row = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    found, light = [], np.zeros((HEIGHT, WIDTH))
+    result, light = [], np.zeros((HEIGHT, WIDTH))
     for x, y in np.array(np.meshgrid(np.linspace(-0.5, 0.42, 6), np.linspace(-0.3, 0.38, 5))).reshape(2, -1).T:
-        bx, by = bend(x, y, *bent)
-        u, v = CX + focal[0] * bx, CY + focal[1] * by
+        bent_x, bent_y = bend(x, y, *bent)
+        u, v = CX + focal[0] * bent_x, CY + focal[1] * bent_y
         if 16 < u < WIDTH - 16 and 16 < v < HEIGHT - 16:
-            found.append((x, y))
+            result.append((x, y))
             light += 0.8 * np.exp(-((column - u) ** 2 + (row - v) ** 2) / 8)
-    assert len(found) > 12
-    return np.array(found), np.repeat(light[..., None], 3, -1)
+    assert len(result) > 12
+    return np.array(result), np.repeat(light[..., None], 3, -1)
 
 
 def check_spots(stored, directions, focal, principal):
-    """The centroid of each spot in the 8-bit picture is where the pinhole sees its direction, to 1/25 of a
-    pixel: resampling takes positions to 1/32 of a pixel, and the lens' scale changes over a spot. The pixel's half that
-    OpenCV counts otherwise would show."""
+    """Check that the pinhole sees each direction at the centroid of its spot in the 8-bit picture.
+
+    The error is below 1/25 of a pixel: resampling takes positions to 1/32 of a pixel, and the lens's scale changes over
+    a spot. The half pixel by which OpenCV's coordinates differ would show.
+    """
     value = images.linear(stored)[..., 1].astype(np.float64)
     for place in principal + directions * focal:
         left, top = np.floor(place).astype(int) - 8
         assert left >= 0 and top >= 0
         window = value[top : top + 17, left : left + 17]
         rows, columns = np.mgrid[top : top + 17, left : left + 17] + 0.5
-        found = np.array([(columns * window).sum(), (rows * window).sum()]) / window.sum()
-        np.testing.assert_allclose(found, place, atol=1 / 25)
+        result = np.array([(columns * window).sum(), (rows * window).sum()]) / window.sum()
+        np.testing.assert_allclose(result, place, atol=1 / 25)
 
 
 def write_colmap(folder, model, params, picture):
@@ -93,9 +98,9 @@ def test_colmaps_lenses_are_undone(tmp_path, model):
     directions, light = spots(focal, bent)
     picture = images.levels(np.concatenate([light, light[..., :1]], -1))
     folder = write_colmap(tmp_path, model, params, picture)
-    said = []
-    split = load_dataset(folder, said.append, background="black")["train"]
-    assert said[0].endswith("4 photographs, 220x160 pixels, lens distortion undone, black background")
+    messages = []
+    split = load_dataset(folder, messages.append, background="black")["train"]
+    assert messages[0].endswith("4 photographs, 220x160 pixels, lens distortion undone, black background")
     np.testing.assert_allclose(split.principal[0], [CX, CY])
     assert split.focal[0, 1] / split.focal[0, 0] == pytest.approx(focal[1] / focal[0])
     for stored in split.images:
@@ -108,11 +113,11 @@ def test_masks_go_through_the_lens_alike_and_leave_no_empty_border(tmp_path):
     params, focal, bent = MODELS["SIMPLE_RADIAL"]
     picture = np.full((HEIGHT, WIDTH, 3), 188, np.uint8)
     folder = write_colmap(tmp_path, "SIMPLE_RADIAL", params, picture)
-    pictures, _, (found, *_), _ = photographs.load(colmap.read(folder).views["train"])
+    pictures, _, (result, *_), _ = photographs.load(colmap.read(folder).views["train"])
     stored = pictures[0]
     np.testing.assert_array_equal(stored[stored[..., 3] == 255][:, :3], 188)  # flat light stays what it was
-    x = (np.arange(WIDTH) + 0.5 - CX) / found[0]
-    y = (np.arange(HEIGHT) + 0.5 - CY) / found[1]
+    x = (np.arange(WIDTH) + 0.5 - CX) / result[0]
+    y = (np.arange(HEIGHT) + 0.5 - CY) / result[1]
     u, v = bend(*np.meshgrid(x, y), *bent)
     u, v = CX + focal[0] * u, CY + focal[1] * v
     assert 0.499 < u.min() and u.max() < WIDTH - 0.499 and 0.499 < v.min() and v.max() < HEIGHT - 0.499

@@ -16,7 +16,7 @@ SHARES[4, 6:18] = np.arange(12) * 20
 
 
 def labels(*colours) -> np.ndarray:
-    """The object in stripes of `colours`, the rest 0."""
+    """Return stripes of `colours` in the object's place, and 0 elsewhere."""
     picture = np.zeros((*SHOWS.shape, *np.shape(colours[0])), np.uint16 if np.max(colours) > 255 else np.uint8)
     for i, colour in enumerate(colours):
         picture[:, i::len(colours)] = colour
@@ -32,7 +32,7 @@ def palette(*colours) -> Image.Image:
 
 
 def cut_out(mode: str) -> Image.Image:
-    """The object in its own colours, black and grey among them, beside transparency."""
+    """Return the object in its own colours, with black and grey among them, before transparency."""
     rng = np.random.default_rng(0)
     rgb = rng.integers(0, 256, (24, 24, 3)).astype(np.uint8)
     return Image.fromarray(np.concatenate([rgb, SHARES[..., None]], -1)).convert(mode)
@@ -84,8 +84,8 @@ def test_a_mask_of_one_level(tmp_path, level, alpha):
 def test_a_grey_mask_with_the_colours_noise_of_jpeg_is_no_coloured_one(tmp_path):
     noise = np.random.default_rng(0).integers(-7, 8, (24, 24, 3))
     Image.fromarray((SHARES[..., None] + noise).clip(0, 255).astype(np.uint8)).save(tmp_path / "m.png")
-    found, note = masks.read(tmp_path / "m.png")
-    assert np.abs(found.astype(int) - SHARES).max() <= 7 and note is None
+    result, note = masks.read(tmp_path / "m.png")
+    assert np.abs(result.astype(int) - SHARES).max() <= 7 and note is None
 
 
 def test_red_masks_of_a_data_set_are_said(tmp_path):
@@ -95,8 +95,8 @@ def test_red_masks_of_a_data_set_are_said(tmp_path):
         shows = np.asarray(Image.open(path)) > 100
         expected.append(shows)
         Image.fromarray(shows[..., None] * np.array([200, 0, 0], np.uint8)).save(path)
-    said = []
-    found = load_dataset(tmp_path, said.append)["val"].images[0]
-    np.testing.assert_array_equal(found[..., 3], 255 * expected[7])
+    messages = []
+    result = load_dataset(tmp_path, messages.append)["val"].images[0]
+    np.testing.assert_array_equal(result[..., 3], 255 * expected[7])
     assert any(text.startswith("assumed: a coloured mask shows the object where it is not black (16 photographs, first")
-               for text in said)
+               for text in messages)

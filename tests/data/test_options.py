@@ -13,8 +13,8 @@ from mi_ntf.data.readers import load_dataset
 
 
 def load(folder, **options):
-    said = []
-    return load_dataset(folder, said.append, **options), "\n".join(said)
+    messages = []
+    return load_dataset(folder, messages.append, **options), "\n".join(messages)
 
 
 def edit(folder, change, name="transforms.json"):
@@ -38,9 +38,9 @@ def test_masks_of_a_folder_of_any_name(tmp_path, name):
         Image.open(path).save(tmp_path / "white is object" / name.format(path.stem), quality=100)
         if name != "{}.png":
             path.unlink()
-    found = load(folder, masks=tmp_path / "white is object")[0]["train"].images
+    result = load(folder, masks=tmp_path / "white is object")[0]["train"].images
     # JPEG of full quality moves a level or two
-    assert np.abs(found[..., 3].astype(int) - expected[..., 3]).max() <= (2 if name == "{}.jpeg" else 0)
+    assert np.abs(result[..., 3].astype(int) - expected[..., 3]).max() <= (2 if name == "{}.jpeg" else 0)
 
 
 def test_a_folder_of_masks_goes_before_alpha(tmp_path):
@@ -73,12 +73,13 @@ def test_a_folder_of_masks_that_is_not_there(tmp_path):
 
 def test_a_flash_beside_the_lens(tmp_path):
     """Right, up and forward along the camera's own axes, of every view of every split."""
-    splits, said = load(forms.blender(tmp_path), flash_offset=(0.1, 1.2, -0.3))
+    splits, messages = load(forms.blender(tmp_path), flash_offset=(0.1, 1.2, -0.3))
     for name, views in forms.splits().items():
         for light, c2w in zip(splits[name].light_pos, forms.C2W[views], strict=True):
             right, up, back, place = c2w[:3].T
             np.testing.assert_allclose(light, place + 0.1 * right + 1.2 * up + 0.3 * back, atol=1e-6)
-    assert "the flash is taken to be 0.1 right, 1.2 up, -0.3 forward of the lens" in said and "at the lens" not in said
+    assert "the flash is taken to be 0.1 right, 1.2 up, -0.3 forward of the lens" in messages
+    assert "at the lens" not in messages
     with pytest.raises(MiNtfError, match=r"flash_offset is \(1, nan, 2\), expected three numbers: right, up, forward"):
         load(tmp_path, flash_offset=(1, float("nan"), 2))
 
@@ -116,18 +117,18 @@ def check(split, views):
 
 
 def test_nerfstudio(tmp_path):
-    splits, said = load(forms.nerfstudio(tmp_path))
+    splits, messages = load(forms.nerfstudio(tmp_path))
     for name, views in forms.splits().items():
         check(splits[name], views)
-    assert said.startswith(f"nerfstudio data set (transforms.json) in {tmp_path}: 16 photographs, 24x24 pixels\n")
+    assert messages.startswith(f"nerfstudio data set (transforms.json) in {tmp_path}: 16 photographs, 24x24 pixels\n")
     assert splits["test"].names == ("images/frame_00015.png",)
 
 
 @pytest.mark.parametrize("factor", [1, 4])
 def test_llff(tmp_path, factor):
-    """Also of photographs that are smaller than those that the poses are of."""
-    splits, said = load(forms.llff(tmp_path, factor))
-    assert said.startswith(f"LLFF data set (poses_bounds.npy) in {tmp_path}: 16 photographs, 24x24 pixels\n")
+    """Photographs may be smaller than those of the poses."""
+    splits, messages = load(forms.llff(tmp_path, factor))
+    assert messages.startswith(f"LLFF data set (poses_bounds.npy) in {tmp_path}: 16 photographs, 24x24 pixels\n")
     for name, views in {"train": [*range(7), *range(9, 16)], "val": [7], "test": [8]}.items():
         check(splits[name], views)
 
@@ -136,18 +137,18 @@ def test_all_forms_have_the_same_rays(tmp_path):
     expected = None
     for form in (forms.capture, forms.blender, forms.nrhints, forms.nerfstudio):
         split = load(form(tmp_path / form.__name__))[0]["train"]
-        found = schema.pixel_rays(split.c2w, split.focal, 24, 24, split.principal)
-        expected = expected or found
-        np.testing.assert_allclose(found, expected, atol=1e-12)
+        result = schema.pixel_rays(split.c2w, split.focal, 24, 24, split.principal)
+        expected = expected or result
+        np.testing.assert_allclose(result, expected, atol=1e-12)
 
 
 def test_nerfstudio_without_lists_and_with_less_of_the_camera(tmp_path):
-    """A field of view alone, or with the principal point; frames that have their own intrinsics."""
+    """The camera is a field of view alone, or with the principal point; frames may have their own intrinsics."""
     forms.nerfstudio(tmp_path)
     edit(tmp_path, lambda d: [d.pop(k) for k in ("train_filenames", "val_filenames", "test_filenames", "fl_x", "fl_y")])
     edit(tmp_path, lambda d: d.update(camera_angle_x=forms.ANGLE))
-    splits, said = load(tmp_path)
-    assert "no test split: 1 of 16" in said
+    splits, messages = load(tmp_path)
+    assert "no test split: 1 of 16" in messages
     check(splits["train"], [*range(7), *range(9, 16)])
     edit(tmp_path, lambda d: [d.pop(k) for k in ("cx", "cy", "w", "h", "camera_model")])
     check(load(tmp_path)[0]["train"], [*range(7), *range(9, 16)])
@@ -161,19 +162,19 @@ def test_nerfstudios_lists_of_names(tmp_path):
     """Frames in no list are left out; without `train_filenames` they are trained on."""
     forms.nerfstudio(tmp_path)
     edit(tmp_path, lambda d: d.update(train_filenames=d["train_filenames"][:10]))
-    splits, said = load(tmp_path)
+    splits, messages = load(tmp_path)
     assert [len(s.images) for s in splits.values()] == [10, 1, 1]
-    assert "4 of 16 frames are not in train_filenames, val_filenames, test_filenames and are left out" in said
+    assert "4 of 16 frames are not in train_filenames, val_filenames, test_filenames and are left out" in messages
     edit(tmp_path, lambda d: d.pop("train_filenames"))
     assert [len(s.images) for s in load(tmp_path)[0].values()] == [14, 1, 1]
 
 
 def test_frames_without_a_photograph_are_left_out_unless_most_are(tmp_path):
-    """As in instant-ngp's `fox`, of whose 67 frames 17 have none."""
+    """The data set is like instant-ngp's `fox`, in which 17 of 67 frames have no file."""
     forms.nerfstudio(tmp_path)
     (tmp_path / "images/frame_00003.png").unlink()
-    splits, said = load(tmp_path)
-    assert "1 of 16 frames have no photograph and are left out\n" in said
+    splits, messages = load(tmp_path)
+    assert "1 of 16 frames have no photograph and are left out\n" in messages
     np.testing.assert_allclose(splits["train"].c2w, np.delete(forms.C2W[:-2], 3, 0), atol=1e-6)
     for i in range(4, 13):
         (tmp_path / f"images/frame_{i:05d}.png").unlink()
@@ -253,6 +254,6 @@ def test_a_folder_of_several_forms_says_so(tmp_path):
     forms.llff(forms.colmap(tmp_path))
     for path in (tmp_path / "images").glob("IMG*"):
         path.unlink()
-    said = load(tmp_path)[1].split("\n")
-    assert said[0].startswith("COLMAP model in ")
-    assert said[1] == "also in the folder, and left aside: LLFF data set (poses_bounds.npy)"
+    messages = load(tmp_path)[1].split("\n")
+    assert messages[0].startswith("COLMAP model in ")
+    assert messages[1] == "also in the folder, and left aside: LLFF data set (poses_bounds.npy)"

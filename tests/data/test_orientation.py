@@ -21,23 +21,25 @@ ROLL = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 
 def write(folder: Path, tags=(1,), poses: str = "stored", masks: str = "stored", portraits=(), pictures=LANDSCAPES
           ) -> Path:
-    """A nerfstudio set of opaque PNG of the Exif orientations `tags` in turn. `poses` and `masks` are
-    "stored", as the file's pixels lie, or "upright". `portraits` are taken with the camera held upright, without a
-    tag."""
+    """Write a nerfstudio set of opaque PNG with the Exif orientations `tags` in turn.
+
+    `poses` and `masks` are "stored", as the file's pixels lie, or "upright". `portraits` are taken with the camera held
+    upright, without a tag.
+    """
     frames = []
     for kind in ("images", "masks"):
         (folder / kind).mkdir(parents=True)
     for i, c2w in enumerate(forms.C2W):
-        tag, seen = tags[i % len(tags)], forms.straight_srgb(pictures[i])
+        tag, levels = tags[i % len(tags)], forms.straight_srgb(pictures[i])
         if i in portraits:
-            seen, c2w = np.rot90(seen, -1), c2w @ ROLL
-        stored = exif.turned(seen, exif.INVERSE[tag]) if poses == "upright" else seen
+            levels, c2w = np.rot90(levels, -1), c2w @ ROLL
+        stored = exif.turned(levels, exif.INVERSE[tag]) if poses == "upright" else levels
         mask = exif.turned(stored, tag) if masks == "upright" else stored
         tag_of = Image.Exif()
         tag_of[exif.ORIENTATION] = tag
         Image.fromarray(np.ascontiguousarray(stored[..., :3])).save(folder / f"images/{i:03d}.png", exif=tag_of)
         Image.fromarray(np.ascontiguousarray(mask[..., 3])).save(folder / f"masks/{i:03d}.png")
-        height, width = seen.shape[:2]
+        height, width = levels.shape[:2]
         frames.append({"file_path": f"images/{i:03d}.png", "transform_matrix": c2w.tolist(), "w": width, "h": height,
                        "cx": width / 2, "cy": height / 2, "fl_x": forms.FOCAL})
     (folder / "transforms.json").write_text(json.dumps({"frames": frames}))
@@ -45,14 +47,14 @@ def write(folder: Path, tags=(1,), poses: str = "stored", masks: str = "stored",
 
 
 def check(splits, pictures=LANDSCAPES) -> None:
-    """Every pixel shows what its ray sees: rays and pictures are those of `pictures`, turned alike."""
+    """Check that every pixel shows what its ray sees, with rays and `pictures` turned alike."""
     for name, views in {"train": [*range(7), *range(9, 16)], "val": [7], "test": [8]}.items():
         split, (height, width) = splits[name], pictures.shape[1:3]
         for k, i in enumerate(views):
             h, w = split.images.shape[1:3]
             rays = schema.pixel_rays(split.c2w[k], split.focal[k], w, h, split.principal[k])[1]
-            seen = schema.pixel_rays(forms.C2W[i], forms.FOCAL, width, height)[1]
-            turns = [t for t in range(4) if (again := np.rot90(seen, t)).shape == rays.shape
+            directions = schema.pixel_rays(forms.C2W[i], forms.FOCAL, width, height)[1]
+            turns = [t for t in range(4) if (again := np.rot90(directions, t)).shape == rays.shape
                      and np.abs(again - rays).max() < 1e-6]
             assert len(turns) == 1
             # the file's 8 bits, and those over black: `test_readers.check_8_bit_pixels`
@@ -83,14 +85,14 @@ def test_pixels_are_turned_as_pillow_turns_them(tmp_path, tag):
 @pytest.mark.parametrize("tags", [(6,), (8,), (5, 7), (6, 3), (8, 1, 2, 4)])
 def test_sizes_tell_what_is_turned(tmp_path, tags, poses, masks):
     """Half turns, which no size tells, are as the quarter turns among them."""
-    said = []
-    splits = load_dataset(write(tmp_path, tags, poses, masks), said.append)
+    messages = []
+    splits = load_dataset(write(tmp_path, tags, poses, masks), messages.append)
     check(splits)
     count = sum(tags[i % len(tags)] > 1 for i in range(forms.VIEWS))
-    told = {"stored": "as stored, not turned as", "upright": "turned as"}
-    for text in (f"poses belong to the photographs {told[poses]} their Exif orientation says ({count} photographs, ",
-                 f"masks are {told[masks]} the Exif orientation of their photographs says ({count} photographs, "):
-        assert sum(line.startswith(f"assumed: {text}") for line in said) == 1
+    phrases = {"stored": "as stored, not turned as", "upright": "turned as"}
+    for text in (f"poses belong to the photographs {phrases[poses]} their Exif orientation says ({count} photographs, ",
+                 f"masks are {phrases[masks]} the Exif orientation of their photographs says ({count} photographs, "):
+        assert sum(line.startswith(f"assumed: {text}") for line in messages) == 1
 
 
 @pytest.mark.parametrize(("tag", "pictures"), [(3, LANDSCAPES), (6, forms.PICTURES)], ids=["half turn", "square"])
@@ -122,9 +124,9 @@ def test_scaled_copies_of_turned_photographs(tmp_path):
     for frame in data["frames"]:
         frame.update({key: 4 * frame[key] for key in ("w", "h", "cx", "cy", "fl_x")})
     (tmp_path / "transforms.json").write_text(json.dumps(data))
-    said = []
-    check(load_dataset(tmp_path, said.append))
-    assert any(line.startswith("assumed: photographs are copies scaled by 0.25, ") for line in said)
+    messages = []
+    check(load_dataset(tmp_path, messages.append))
+    assert any(line.startswith("assumed: photographs are copies scaled by 0.25, ") for line in messages)
 
 
 @pytest.mark.parametrize("sized", [True, False])
@@ -136,21 +138,21 @@ def test_portraits_among_landscapes(tmp_path, portraits, sized):
         frame.pop("h"), frame.pop("cx"), frame.pop("cy")
         frame["camera_angle_x"] = 2 * np.arctan(frame.pop("w") / 2 / frame.pop("fl_x"))
     (tmp_path / "transforms.json").write_text(json.dumps(data))
-    said = []
-    check(load_dataset(tmp_path, said.append))
+    messages = []
+    check(load_dataset(tmp_path, messages.append))
     kind = "landscapes" if 0 in portraits else "portraits"
     assert any(line.startswith(f"assumed: {kind} are turned to the left with their cameras, to lie as the first "
-                               "photograph does (3 photographs, first") for line in said)
+                               "photograph does (3 photographs, first") for line in messages)
 
 
 @pytest.mark.parametrize("more", [{"tags": (6,), "poses": "upright"}, {"portraits": (3, 9)}])
 def test_inspect_shows_the_photographs_as_they_were_turned(tmp_path, monkeypatch, more):
     monkeypatch.chdir(tmp_path)
-    seen = []
-    monkeypatch.setattr("mi_ntf.data.page.Page.pictures", lambda self, pictures, width: seen.extend(pictures))
-    found = inspect(write(tmp_path / "set", **more))
-    assert len(found["assumed"]) > 0 and set(found["assumed"]) < set(found["said"])
-    for caption, picture in seen:
+    shown_pictures = []
+    monkeypatch.setattr("mi_ntf.data.page.Page.pictures", lambda self, pairs, width: shown_pictures.extend(pairs))
+    result = inspect(write(tmp_path / "set", **more))
+    assert len(result["assumed"]) > 0 and set(result["assumed"]) < set(result["said"])
+    for caption, picture in shown_pictures:
         name = caption.split()[1]
         i = int(Path(name).stem)
         inside = LANDSCAPES[i, ..., 3] > 0.99

@@ -16,12 +16,12 @@ URI = re.compile(r"data:image/([\w+]+);base64,([A-Za-z0-9+/=]+)")
 
 
 def pictures(html: str) -> list[np.ndarray]:
-    """The pictures in a page, in their order."""
+    """Return the pictures in a page, in their order."""
     return [np.asarray(Image.open(io.BytesIO(base64.b64decode(content)))) for _, content in URI.findall(html)]
 
 
 def full() -> Page:
-    """A page with everything that there is."""
+    """Return a page with every kind of content."""
     page = Page("Skull")
     page.section("Numbers")
     page.text("All is well.")

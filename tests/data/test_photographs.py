@@ -78,10 +78,10 @@ def test_exr_without_alpha_is_opaque_or_masked(tmp_path):
 def test_alpha_goes_before_a_mask_that_was_not_asked_for(tmp_path):
     Image.fromarray(np.full((1, 1, 4), (200, 100, 50, 51), np.uint8)).save(tmp_path / "a.png")
     Image.fromarray(np.full((1, 1), 102, np.uint8)).save(tmp_path / "m.png")
-    for first, share in ((False, 51), (True, 102)):
+    for first, level in ((False, 51), (True, 102)):
         pixel = images.linear(read(tmp_path / "a.png", [tmp_path / "m.png"], mask_first=first))[0, 0]
-        assert pixel[3] == pytest.approx(share / 255)
-        np.testing.assert_allclose(pixel[:3], light([200, 100, 50]) * share / 255, atol=0.5 * 2.3 / 255)
+        assert pixel[3] == pytest.approx(level / 255)
+        np.testing.assert_allclose(pixel[:3], light([200, 100, 50]) * level / 255, atol=0.5 * 2.3 / 255)
 
 
 @pytest.mark.parametrize(("values", "dtype"), [
@@ -120,8 +120,11 @@ def test_bytes_among_floating_point_are_light_all_the_same(tmp_path):
     (60, 40, 30, (30, 20)), (61, 40, 30, (30, 20)), (41, 60, 16, (11, 16)), (60, 40, 60, (60, 40)),
     (60, 40, 99, (60, 40))])
 def test_scaled_photographs_have_the_same_mean_light(tmp_path, width, height, size, expected):
-    """Linear light over black is averaged by area, so it and alpha are conserved; the camera is scaled by what really
-    became of each side. Neither the means of levels nor of straight colour are conserved."""
+    """Scaling conserves the mean of linear light over black and of alpha.
+
+    The camera is scaled by the real factor of each side. Neither the means of levels nor of straight colour are
+    conserved.
+    """
     rng = np.random.default_rng(3)
     alpha = np.maximum(rng.integers(-255, 256, (height, width)), 0)
     png = np.concatenate([rng.integers(0, 256, (height, width, 3)), alpha[..., None]], -1).astype(np.uint8)
@@ -154,17 +157,18 @@ def test_what_stands_at_the_principal_point_still_does(tmp_path):
 
 
 def test_size_of_a_data_set(tmp_path):
-    said = []
-    split = load_dataset(forms.blender(tmp_path), said.append, size=12)["train"]
-    assert said[0].endswith("16 photographs, 24x24 pixels, scaled to 12x12") and split.images.shape[1:] == (12, 12, 4)
+    messages = []
+    split = load_dataset(forms.blender(tmp_path), messages.append, size=12)["train"]
+    assert messages[0].endswith("16 photographs, 24x24 pixels, scaled to 12x12")
+    assert split.images.shape[1:] == (12, 12, 4)
     np.testing.assert_allclose(split.focal, forms.FOCAL / 2)
     expected = forms.PICTURES[forms.splits()["train"]].reshape(14, 12, 2, 12, 2, 4).mean((2, 4))
     np.testing.assert_allclose(images.linear(split.images), expected, atol=(2 * 2.3 + 1) * 0.5 / 255)  # 8 bits, twice
-    said = []
-    assert load_dataset(tmp_path, said.append, size=48)["train"].images.shape[1:] == (24, 24, 4)
-    assert "size 48 is more than the photographs have (24x24): they are left as they are" in said
+    messages = []
+    assert load_dataset(tmp_path, messages.append, size=48)["train"].images.shape[1:] == (24, 24, 4)
+    assert "size 48 is more than the photographs have (24x24): they are left as they are" in messages
     with pytest.raises(MiNtfError, match=r"size is 7, must be 8 or more: the pixels of the photographs' longer side"):
-        load_dataset(tmp_path, said.append, size=7)
+        load_dataset(tmp_path, messages.append, size=7)
 
 
 # --- memory ----------------------------------------------------------------------------------------------------------
@@ -196,7 +200,7 @@ def peak(folder: Path, size: int) -> tuple[int, int]:
 
 
 def many(folder: Path, name: str, count: int, width: int, height: int, **camera) -> Path:
-    """A nerfstudio data set of `count` views, all of the photograph `name` of a white disc."""
+    """Write a nerfstudio data set of `count` views, all of the photograph `name` of a white disc."""
     frames = [{"file_path": name, "transform_matrix": forms.C2W[i % len(forms.C2W)].tolist()} for i in range(count)]
     text = {"w": width, "h": height, "fl_x": 1.5 * width, "cx": width / 2, "cy": height / 2, "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(text | camera))
@@ -210,16 +214,22 @@ def many(folder: Path, name: str, count: int, width: int, height: int, **camera)
 
 
 def test_many_photographs_take_little_more_than_their_bytes(tmp_path):
-    """60 of 800² are 154 MB of bytes; as float32 they would be 614. 80 MB: a photograph's pixels in several types, a
-    table of its sums, the hull's cells, what was sampled for the flash (58 measured)."""
-    taken, stored = peak(many(tmp_path, "a.png", 60, 800, 800), 0)
+    """Reading 60 photographs of 800² takes their 154 MB of bytes (614 as float32) and 80 MB more.
+
+    The 80 MB (58 measured) hold a photograph's pixels in several types, a table of its sums, the hull's cells, and
+    samples for the flash.
+    """
+    memory, stored = peak(many(tmp_path, "a.png", 60, 800, 800), 0)
     assert stored == 60 * 800 * 800 * 4
-    assert taken < stored + (80 << 20), f"{taken / 2**20:.0f} MiB for {stored / 2**20:.0f}"
+    assert memory < stored + (80 << 20), f"{memory / 2**20:.0f} MiB for {stored / 2**20:.0f}"
 
 
 def test_large_photographs_are_read_one_at_a_time(tmp_path):
-    """Of 12 megapixels, with lens distortion: linear light, its straight copy and two maps are 16, 16 and 8 bytes a
-    pixel, 480 MB, the file's pixels and the mask 50; how many there are does not matter."""
-    taken, stored = peak(many(tmp_path, "a.jpg", 5, 4000, 3000, k1=0.04, k2=-0.01), 768)
+    """Memory does not depend on the number of photographs, here of 12 megapixels with lens distortion.
+
+    Linear light, its straight copy and two maps take 16, 16 and 8 bytes a pixel, 480 MB; the file's pixels and the mask
+    take 50 MB.
+    """
+    memory, stored = peak(many(tmp_path, "a.jpg", 5, 4000, 3000, k1=0.04, k2=-0.01), 768)
     assert stored == 5 * 768 * 576 * 4
-    assert taken < 650e6, f"{taken / 1e6:.0f} MB"
+    assert memory < 650e6, f"{memory / 1e6:.0f} MB"

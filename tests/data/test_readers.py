@@ -15,8 +15,8 @@ from mi_ntf.data.readers import load_dataset
 
 
 def load(folder):
-    said = []
-    return load_dataset(folder, said.append), "\n".join(said)
+    messages = []
+    return load_dataset(folder, messages.append), "\n".join(messages)
 
 
 def check_cameras(split, views, rtol=1e-6):
@@ -28,8 +28,11 @@ def check_cameras(split, views, rtol=1e-6):
 
 
 def check_8_bit_pixels(stored, views):
-    """Within the rounding to 8 bits: half a level of alpha; of colour half a level times sRGB's slope, at most 2.3, in
-    the file and once more over black, and half a level that premultiplication adds."""
+    """Check pixels within the rounding to 8 bits.
+
+    Alpha has half a level. Colour has half a level times sRGB's slope, at most 2.3, in the file and once more over
+    black, and half a level of premultiplication.
+    """
     assert stored.dtype == np.uint8
     pixels, expected = images.linear(stored), forms.PICTURES[views]
     np.testing.assert_allclose(pixels[..., 3], expected[..., 3], atol=0.501 / 255)
@@ -37,7 +40,7 @@ def check_8_bit_pixels(stored, views):
 
 
 def check_sphere(split):
-    """The sphere holds both spheres, and is at most a fifth larger than the smallest: 24 pixels, 14 views."""
+    """Check that the sphere holds both spheres and is at most a fifth larger than the smallest."""
     for center, radius in forms.SPHERES:
         assert np.linalg.norm(center - split.center) + radius <= split.radius
     center, radius = forms.true_bounds()
@@ -45,13 +48,15 @@ def check_sphere(split):
 
 
 def check_estimate(split):
-    """Photographs are explained by intensity x albedo alone; the brightest albedo is 0.7, taken for 0.8, and the
-    distance of the surface to the flash is known to a quarter."""
+    """Check the estimated intensity: photographs determine intensity times albedo alone.
+
+    The brightest albedo is 0.7, assumed to be 0.8, and the surface's distance to the flash is known to a quarter.
+    """
     np.testing.assert_allclose(split.light_intensity, forms.INTENSITY * 0.7 / 0.8, rtol=0.5)
 
 
 def test_capture(tmp_path):
-    splits, said = load(forms.capture(tmp_path))
+    splits, messages = load(forms.capture(tmp_path))
     for name, views in forms.splits().items():
         check_cameras(splits[name], views)
         assert splits[name].images.dtype == np.float16
@@ -60,31 +65,31 @@ def test_capture(tmp_path):
         assert splits[name].radius == 1 and (splits[name].center == 0).all()
         assert splits[name].calibrated and splits[name].masked
         assert splits[name].names == tuple(f"{name}/{i:04d}.exr" for i in views)
-    assert said == f"photographs of `mi-ntf capture` in {tmp_path}: 16 photographs, 24x24 pixels", "nothing left open"
+    assert messages == f"photographs of `mi-ntf capture` in {tmp_path}: 16 photographs, 24x24 pixels"
 
 
 def test_nerf_synthetic(tmp_path):
-    splits, said = load(forms.blender(tmp_path))
+    splits, messages = load(forms.blender(tmp_path))
     for name, views in forms.splits().items():
         check_cameras(splits[name], views)
         check_8_bit_pixels(splits[name].images, views)
         check_sphere(splits[name])
         check_estimate(splits[name])
         assert not splits[name].calibrated
-    assert said.startswith(f"NeRF-synthetic (Blender) data set in {tmp_path}: 16 photographs, 24x24 pixels\n")
-    assert "sphere is found from the masks' visual hull" in said
-    assert "a flash at the lens is assumed" in said and "W/sr estimated" in said
+    assert messages.startswith(f"NeRF-synthetic (Blender) data set in {tmp_path}: 16 photographs, 24x24 pixels\n")
+    assert "sphere is found from the masks' visual hull" in messages
+    assert "a flash at the lens is assumed" in messages and "W/sr estimated" in messages
 
 
 def test_nrhints(tmp_path):
-    splits, said = load(forms.nrhints(tmp_path))
+    splits, messages = load(forms.nrhints(tmp_path))
     for name, views in forms.splits().items():
         check_cameras(splits[name], views)
         assert splits[name].images.dtype == np.float16
         np.testing.assert_array_equal(splits[name].images, forms.PICTURES[views].astype(np.float16))
         check_estimate(splits[name])
-    assert said.startswith(f"NRHints data set in {tmp_path}: 16 photographs, 24x24 pixels\n")
-    assert "flash at the lens" not in said and "W/sr estimated" in said
+    assert messages.startswith(f"NRHints data set in {tmp_path}: 16 photographs, 24x24 pixels\n")
+    assert "flash at the lens" not in messages and "W/sr estimated" in messages
 
 
 def test_light_positions_and_one_number_of_intensity_are_kept(tmp_path):
@@ -109,10 +114,10 @@ def test_colmap(tmp_path, model, binary, place):
             file.unlink()
     for file in list(stored.iterdir()):
         file.rename(tmp_path / place / file.name)
-    splits, said = load(tmp_path)
+    splits, messages = load(tmp_path)
     assert [len(splits[name].images) for name in schema.SPLITS] == [14, 1, 1]
-    assert said.startswith(f"COLMAP model in {tmp_path}: 16 photographs, 24x24 pixels\n")
-    assert "no test split: 1 of 16" in said and "no val split: 1 of 15" in said
+    assert messages.startswith(f"COLMAP model in {tmp_path}: 16 photographs, 24x24 pixels\n")
+    assert "no test split: 1 of 16" in messages and "no val split: 1 of 15" in messages
     # the middle one of 16, then of the 15 that are left
     views = {"train": [*range(7), *range(9, 16)], "val": [7], "test": [8]}
     for name, chosen in views.items():
@@ -249,8 +254,8 @@ def test_faults_of_whole_splits(tmp_path):
     with pytest.raises(MiNtfError, match=r"transforms_val.json: not valid JSON"):
         load(tmp_path)
     (tmp_path / "transforms_val.json").unlink()
-    splits, said = load(tmp_path)
-    assert said.split("\n")[1:] == ["no val split: 1 of 14 photographs for training are held back for it"]
+    splits, messages = load(tmp_path)
+    assert messages.split("\n")[1:] == ["no val split: 1 of 14 photographs for training are held back for it"]
     check_cameras(splits["val"], [7])
     edit(tmp_path, lambda d: d.update(frames=d["frames"][:1]))
     with pytest.raises(MiNtfError, match=r"frame 0: there is no val split and 1 photograph for training, too few"):

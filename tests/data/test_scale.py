@@ -12,7 +12,7 @@ from mi_ntf.data.readers import load_dataset
 
 
 def enlarged(folder, factor: int, count: int = forms.VIEWS):
-    """The first `count` photographs and masks of `folder` become `factor` times as large."""
+    """Enlarge the first `count` photographs and masks of `folder` by `factor`."""
     for kind in ("images", "masks"):
         for path in sorted((folder / kind).glob("*.png"))[:count]:
             image = Image.open(path)
@@ -22,13 +22,13 @@ def enlarged(folder, factor: int, count: int = forms.VIEWS):
 
 @pytest.mark.parametrize("form", [forms.colmap, forms.nerfstudio])
 def test_cameras_are_scaled_with_the_photographs(tmp_path, form):
-    said = []
-    split = load_dataset(enlarged(form(tmp_path), 3), said.append)["train"]
+    messages = []
+    split = load_dataset(enlarged(form(tmp_path), 3), messages.append)["train"]
     np.testing.assert_allclose(split.focal, 3 * forms.FOCAL)
     np.testing.assert_allclose(split.principal, 3 * forms.SIZE / 2)
     assert split.images.shape[1:3] == (72, 72)
     assert sum(text.startswith("assumed: photographs are copies scaled by 3, and so the cameras are scaled by that "
-                               "(72x72, ") for text in said) == 1
+                               "(72x72, ") for text in messages) == 1
 
 
 def test_a_pixel_of_rounding(tmp_path):

@@ -66,29 +66,29 @@ def test_fingerprints_of_every_kind_of_pixels(dtype):
     """One level more, another type of the same numbers, and another meaning of alpha are other photographs."""
     one, other = split(dtype), split(dtype)
     other.images[1, 2, 3, 0] += 1
-    found = [schema.fingerprint({"train": s}) for s in (one, split(dtype), other, split(np.float64),
+    hashes = [schema.fingerprint({"train": s}) for s in (one, split(dtype), other, split(np.float64),
                                                         dataclasses.replace(one, masked=False),
                                                         dataclasses.replace(one, names=("a", "b")))]
-    assert found[1] == found[0] == found[5]
-    for changed in found[2:5]:
-        assert {k for k in changed if changed[k] != found[0][k]} == {"photographs or masks"}
+    assert hashes[1] == hashes[0] == hashes[5]
+    for changed in hashes[2:5]:
+        assert {k for k in changed if changed[k] != hashes[0][k]} == {"photographs or masks"}
 
 
-@pytest.mark.parametrize(("name", "place", "what"), [
+@pytest.mark.parametrize(("name", "place", "kind"), [
     ("images", (1, 2, 3, 0), "photographs or masks"), ("images", (0, 0, 0, 3), "photographs or masks"),
     ("c2w", (1, 0, 3), "cameras"), ("focal", (0, 1), "cameras"), ("principal", (1, 0), "cameras"),
     ("light_pos", (0, 2), "lights"), ("light_intensity", (1, 1), "lights"), ("center", (1,), "the object's sphere"),
     ("radius", (), "the object's sphere")])
-@pytest.mark.parametrize("which", ["train", "val"])
-def test_fingerprints_tell_what_changed(which, name, place, what):
+@pytest.mark.parametrize("split_name", ["train", "val"])
+def test_fingerprints_tell_what_changed(split_name, name, place, kind):
     """The last bit of any number of any split changes the hash of its kind and no other."""
     one, other = ({"train": split(), "val": split()} for _ in range(2))
     before = schema.fingerprint(one)
     assert schema.fingerprint(other) == before
-    values = np.array(getattr(other[which], name))
+    values = np.array(getattr(other[split_name], name))
     values[place] = np.nextafter(values[place], 2)
-    object.__setattr__(other[which], name, values)
+    object.__setattr__(other[split_name], name, values)
     after = schema.fingerprint(other)
-    assert {k for k in before if before[k] != after[k]} == {what}
+    assert {k for k in before if before[k] != after[k]} == {kind}
     moved = {"train": one["val"], "val": one["train"], "test": one["val"]}
     assert not set(schema.fingerprint(moved).values()) & set(before.values())

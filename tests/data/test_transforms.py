@@ -15,8 +15,8 @@ from mi_ntf.data.readers import load_dataset
 
 
 def load(folder: Path):
-    said = []
-    return load_dataset(folder, said.append), "\n".join(said)
+    messages = []
+    return load_dataset(folder, messages.append), "\n".join(messages)
 
 
 def edit(folder: Path, change, *splits: str) -> None:
@@ -120,14 +120,14 @@ def test_half_a_character_is_no_json(tmp_path):
 def test_lights_of_the_training_split_alone(tmp_path, form, key):
     """The other splits' lights are not known: they are left out, and photographs are held back instead."""
     edit(form(tmp_path), lambda frame: frame.pop(key), "val", "test")
-    splits, said = load(tmp_path)
+    splits, messages = load(tmp_path)
     assert [len(split.images) for split in splits.values()] == [12, 1, 1]
-    kept = [i for i in range(14) if i not in (6, 7)]
-    np.testing.assert_allclose(splits["train"].c2w, forms.C2W[kept], atol=1e-6)
+    remaining = [i for i in range(14) if i not in (6, 7)]
+    np.testing.assert_allclose(splits["train"].c2w, forms.C2W[remaining], atol=1e-6)
     for split in ("val", "test"):
         assert (f"assumed: the {split} split is left out: none of its 1 frames has '{key}', which the frames for "
-                "training have; write it there to use them") in said
-        assert f"no {split} split: 1 of" in said
+                "training have; write it there to use them") in messages
+        assert f"no {split} split: 1 of" in messages
 
 
 @pytest.mark.parametrize("form", [forms.blender, forms.capture])

@@ -18,8 +18,10 @@ QUICK = {"field": 400, "dataset": 200, "colmap": 200, "properties": 200, "maps":
 
 
 def batch(kind: str, seed: int, first: int, last: int, folder: Path) -> list[dict]:
-    """What became of the cases `first` to `last`. A process that dies is a failure of its last case, and another one
-    goes on behind it."""
+    """Return the outcomes of the cases `first` to `last`.
+
+    A process that dies is a failure of its last case, and another process continues after it.
+    """
     command = [sys.executable, str(TESTS / "hard_cases" / "fuzz.py"), kind, *map(str, (seed, first, last)), str(folder)]
     environment = {**os.environ, "PYTHONPATH": str(TESTS), "MI_NTF_CACHE": "off", "XDG_CACHE_HOME": str(folder)}
     try:
@@ -29,16 +31,16 @@ def batch(kind: str, seed: int, first: int, last: int, folder: Path) -> list[dic
     except subprocess.TimeoutExpired as late:
         end, lines = "hangs", (late.stdout or b"").decode().splitlines()
     rows = [json.loads(line) for line in lines if line.startswith("{")]
-    found = [a | b for a, b in zip(rows[::2], rows[1::2], strict=False)]
+    cases = [a | b for a, b in zip(rows[::2], rows[1::2], strict=False)]
     if len(rows) % 2:
-        found.append(rows[-1] | {"outcome": "no end", "text": end, "seconds": 0})
-    assert found, end
-    reached = first + len(found)
-    return found if reached >= last else found + batch(kind, seed, reached, last, folder)
+        cases.append(rows[-1] | {"outcome": "no end", "text": end, "seconds": 0})
+    assert cases, end
+    reached = first + len(cases)
+    return cases if reached >= last else cases + batch(kind, seed, reached, last, folder)
 
 
 def faults(row: dict) -> str:
-    """What is wrong with the outcome of a case, or nothing."""
+    """Return the fault in the outcome of a case, or an empty text."""
     if row["outcome"] not in ("read", "refused"):
         return row["outcome"]
     if row["outcome"] == "refused" and ("\n" in row["text"] or not 20 < len(row["text"]) < 2000):

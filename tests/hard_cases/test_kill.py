@@ -55,14 +55,14 @@ def field(tmp_path_factory):
 
 
 def lit(folder, field, resolution=16):
-    """A scene file to bake."""
+    """Return a scene file to bake."""
     path = folder / "lit.xml"
     path.write_text(LIT.replace("FIELD", str(field)).replace("RESOLUTION", str(resolution)))
     return path
 
 
 def photographed(folder):
-    """A scene file to photograph."""
+    """Return a scene file to photograph."""
     path = folder / "object.xml"
     path.write_text(OBJECT)
     return path
@@ -74,19 +74,19 @@ def files_in(folder):
 
 def pictures(folder):
     """Name → pixels, of every EXR file by its final name: all are whole."""
-    found = {}
+    result = {}
     for path in sorted(folder.rglob("*.exr")):
         for k, part in enumerate(OpenEXR.File(str(path), separate_channels=True).parts):
             for name, channel in part.channels.items():
                 assert channel.pixels.shape == (part.height(), part.width())
-                found[f"{path.relative_to(folder)} {k} {name}"] = channel.pixels.copy()
-    return found
+                result[f"{path.relative_to(folder)} {k} {name}"] = channel.pixels.copy()
+    return result
 
 
-def assert_same(found, expected):
-    assert found.keys() == expected.keys()
+def assert_same(result, expected):
+    assert result.keys() == expected.keys()
     for name, pixels in expected.items():
-        np.testing.assert_array_equal(found[name], pixels, err_msg=name)
+        np.testing.assert_array_equal(result[name], pixels, err_msg=name)
 
 
 # --- every writer, on a disk that fills up ---------------------------------------------------------------------------
@@ -106,8 +106,8 @@ def save_checkpoint(path, field):
 
 def write_maps(path, field):
     medium = maps.find_medium(field)
-    made = maps.build(medium)
-    return lambda: map_file.write(path, medium, maps.table(), maps.OPTIONS, [made])
+    built = maps.build(medium)
+    return lambda: map_file.write(path, medium, maps.table(), maps.OPTIONS, [built])
 
 
 def write_photograph(path, field):
@@ -207,8 +207,11 @@ def finish(process, code=0):
 
 
 def kill_at_random(words, check, seed, program=("-m", "mi_ntf")):
-    """Run the second of two commands whole; kill the first KILLS times, ``check()`` after each; then let it finish. The
-    moments are drawn from the time that the whole run took, so that they fall into imports, work and writing."""
+    """Kill the first of two commands KILLS times, with ``check()`` after each, and let it finish in the end.
+
+    The second command runs whole, before. The moments are random within its time, so that they fall into imports, work
+    and writing.
+    """
     begin = time.monotonic()
     finish(start(*words[1], program=program))
     span, killed, rng = time.monotonic() - begin, 0, np.random.default_rng(seed)
@@ -243,9 +246,9 @@ def test_killed_between_writing_and_naming(field, tmp_path):
              start("fsync", "1", "bake", baked, "-o", out / "maps.exr", program=("-c", SUICIDE))]
     for process in dying:
         finish(process, -signal.SIGKILL)
-    left = files_in(out)
-    assert {n for n in left if not n.endswith(".part")} == {"capture.json", "train/0000.exr", "train/0001.exr"}
-    assert sorted(n.split(".")[0] for n in left if n.endswith(".part")) == ["maps", "train/0002"]
+    remaining = files_in(out)
+    assert {n for n in remaining if not n.endswith(".part")} == {"capture.json", "train/0000.exr", "train/0001.exr"}
+    assert sorted(n.split(".")[0] for n in remaining if n.endswith(".part")) == ["maps", "train/0002"]
     assert cli.main(["capture", str(scene), str(out), *CAPTURE]) == 0
     assert cli.main(["bake", str(baked), "-o", str(out / "maps.exr")]) == 0
     assert files_in(out) == files_in(undisturbed), "leftovers of the killed are gone"
@@ -297,9 +300,9 @@ def test_training_killed_at_random_ends_where_an_undisturbed_run_ends(tmp_path):
 
     kill_at_random([[data, folder / "f", 40] for folder in (out, undisturbed)], whole, 3, (program,))
     assert files_in(out) == files_in(undisturbed) == {"f", "f.npz", "f.json"}
-    with np.load(out / "f.npz") as found, np.load(undisturbed / "f.npz") as expected:
+    with np.load(out / "f.npz") as result, np.load(undisturbed / "f.npz") as expected:
         for name in expected:
-            assert found[name].tobytes() == expected[name].tobytes(), name
+            assert result[name].tobytes() == expected[name].tobytes(), name
 
 
 # --- a real disk that is full ----------------------------------------------------------------------------------------
@@ -318,7 +321,7 @@ def disk(tmp_path):
 
 
 def refused(words):
-    """The one sentence of a command that fails."""
+    """Return the one sentence of a command that fails."""
     text = finish(start(*words), 1)
     errors = [line for line in text.splitlines() if line.startswith("mi-ntf: error:")]
     assert len(errors) == 1 and "No space left on device" in errors[0] and "Traceback" not in text, text

@@ -14,7 +14,7 @@ def square(task: int) -> int:
 
 
 def place(task) -> tuple[int, dict]:
-    """The process, and what it was started with."""
+    """Return the process, and the settings with which it was started."""
     import drjit
 
     names = ("OMP_NUM_THREADS", "CUDA_VISIBLE_DEVICES")
@@ -22,7 +22,7 @@ def place(task) -> tuple[int, dict]:
 
 
 def write(task: tuple[Path, int]) -> int:
-    """A file for each attempt; 3 fails always, 5 once, 7 kills its process once, 9 always."""
+    """Make a file for each attempt; 3 fails always, 5 once, 7 kills its process once, 9 always."""
     folder, number = task
     attempts = len(list(folder.glob(f"{number}-*")))
     (folder / f"{number}-{attempts}").touch()
@@ -56,7 +56,7 @@ def read(task: Path) -> tuple[int, ...]:
 
 
 def photograph(task) -> None:
-    """A view of a capture; the first process that comes to frame 5 is killed as by `kill -9` before it."""
+    """Make a view of a capture; the first process that comes to frame 5 is killed as by `kill -9` before it."""
     request, index = task
     mark = request.out.parent / "killed"
     if index == 5 and not mark.exists():

@@ -50,10 +50,10 @@ def test_a_capture_on_dask_with_a_killed_worker_is_the_serial_one_bit_for_bit(tm
 def test_failing_tasks_are_tried_again_and_told_after_the_others(engine, tmp_path):
     (tmp_path / "out").mkdir()
     tasks = [(tmp_path / "out", number) for number in range(12)]
-    found, failed = {}, {}
+    results, failed = {}, {}
     for done in jobs.each(chores.write, tasks, jobs.Workers(engine, 2), folder=tmp_path / "jobs", quiet=True):
-        (failed if done.error else found)[done.index] = done.error or done.value
-    assert found == {number: number**2 for number in range(12) if number not in (3, 9)}
+        (failed if done.error else results)[done.index] = done.error or done.value
+    assert results == {number: number**2 for number in range(12) if number not in (3, 9)}
     assert failed[3] == "this is none of mine; give another"
     assert "ended" in failed[9] and "memory" in failed[9]
     attempts = {n: len(list((tmp_path / "out").glob(f"{n}-*"))) for n in range(12)}
@@ -71,8 +71,8 @@ def test_one_error_names_what_failed(tmp_path):
 def test_files_of_submitit_are_open_to_this_user_alone(tmp_path):
     """They are pickles, which run what they say."""
     list(jobs.each(chores.write, [(tmp_path, 3)], jobs.Workers("submitit", 1), folder=tmp_path / "jobs", quiet=True))
-    (kept,) = (tmp_path / "jobs").iterdir()  # since the task fails
-    assert kept.stat().st_mode & 0o777 == 0o700
+    (folder_left,) = (tmp_path / "jobs").iterdir()  # since the task fails
+    assert folder_left.stat().st_mode & 0o777 == 0o700
 
 
 def test_submitit_leaves_nothing_where_all_went_well(tmp_path):
@@ -83,10 +83,10 @@ def test_submitit_leaves_nothing_where_all_went_well(tmp_path):
 
 def test_workers_are_processes_with_their_threads_and_a_gpu_each(monkeypatch):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5")
-    found = jobs.run(chores.place, range(8), jobs.Workers("local", 2, threads=3), quiet=True)
-    gpus = {pid: about.pop("CUDA_VISIBLE_DEVICES") for pid, about in found}
+    results = jobs.run(chores.place, range(8), jobs.Workers("local", 2, threads=3), quiet=True)
+    gpus = {pid: about.pop("CUDA_VISIBLE_DEVICES") for pid, about in results}
     assert sorted(gpus.values()) == ["3", "5"] and os.getpid() not in gpus
-    assert all(about == {"OMP_NUM_THREADS": "3", "drjit": 3} for _, about in found)
+    assert all(about == {"OMP_NUM_THREADS": "3", "drjit": 3} for _, about in results)
     assert os.environ.get("OMP_NUM_THREADS") is None
 
 
