@@ -1,11 +1,12 @@
-"""What the entry point group ``mitsuba`` names: Mitsuba 3.10 and newer import this module when the first variant is set
-and reload it after every change of variant; importing it registers the plugins.
+"""Registration of the plugins by Mitsuba 3.10 and newer.
 
-Older versions do not look for entry points; there the bridge serves the stock program, and
-:func:`mi_ntf.render.register` Python. Variants in which the plugins cannot run are left alone, since Mitsuba
-announces every exception of a plugin's module, whatever scene is rendered.
+The entry point group ``mitsuba`` names this module. Mitsuba imports it when the first variant is set, and reloads it
+after every change of the variant. Older versions do not look for entry points: there the bridge serves the stock
+program, and Python programs call :func:`mi_ntf.register`.
 
-Source: Mitsuba 3, "Distributing Python plugins" in its documentation, and ``load_plugins`` of its ``detail`` module.
+Variants in which the plugins cannot run are left alone, since Mitsuba reports every exception of this module, whatever
+scene is rendered. Source: Mitsuba 3, "Distributing Python plugins" in its documentation, and ``load_plugins`` of its
+module ``detail``.
 """
 
 import mitsuba as mi

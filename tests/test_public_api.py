@@ -53,7 +53,7 @@ def test_density_is_that_of_the_medium(field):
     expected = np.array(medium.extinction(mi.Point3f(points.T.astype(np.float32))))
     np.testing.assert_allclose(field.density(points), expected, rtol=1e-5)
     assert (expected > 1).sum() > 5
-    assert field.density(field.center + [2 * field.radius, 0, 0]) == 0
+    assert field.density(field.center + np.array([2 * field.radius, 0, 0])) == 0
 
 
 def test_transmittance_is_the_integral_of_the_density(field):
@@ -89,11 +89,11 @@ def test_reflectance_has_its_shapes_and_ranges(field):
 def test_relight_equals_the_scene_written_out(field):
     light = {"type": "point", "position": [1.5, 2.6, 2.7], "intensity": 40.0}
     image = mi_ntf.relight(field, light, size=24, spp=2, seed=3, visibility="raymarch")
-    distance = 4 * field.radius
+    eye = field.center + np.array([0, 0, 4 * field.radius])
     scene = mi.load_dict({
         "type": "scene", "integrator": {"type": "nrf", "visibility": "raymarch"}, "light": light, "ball": field.shape(),
         "sensor": {"type": "perspective", "fov": 30.0,
-                   "to_world": mi.ScalarTransform4f().look_at(field.center + [0, 0, distance], field.center, [0, 1, 0]),
+                   "to_world": mi.ScalarTransform4f().look_at(eye, field.center, [0, 1, 0]),
                    "film": {"type": "hdrfilm", "width": 24, "height": 24, "pixel_format": "rgb"}}})
     np.testing.assert_array_equal(image, np.array(mi.render(scene, spp=2, seed=3)))
     assert image.shape == (24, 24, 3) and math.isfinite(image.sum()) and image.max() > 0.1

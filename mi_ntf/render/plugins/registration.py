@@ -1,7 +1,9 @@
-"""Makes the plugins known to Mitsuba, in every variant that they can run in."""
+"""Registration of the plugins, in every variant that they can run in."""
 
 import functools
+from collections.abc import Callable
 from pathlib import Path
+from typing import ParamSpec
 
 import drjit as dr
 import mitsuba as mi
@@ -18,16 +20,22 @@ from .medium import medium_class
 from .phase import phase_class
 from .properties import is_medium
 
-_classes: dict[str, dict] = {}
+P = ParamSpec("P")
+
+_classes: dict[str, dict[str, Callable[[mi.Properties], mi.Object]]] = {}
 _watching = False
 
 
 def register() -> None:
-    """Make the plugins known to the current variant, and to every variant that is set later, and let ``mi.render`` tell
-    their errors (:mod:`mi_ntf.render.plugins.render_errors`). May be called again.
-    Dr.Jit gets a second thread where it has one (:data:`mi_ntf.core.variants.LEAST_THREADS`).
+    """Register the plugins for the current variant and for every variant that is set later. May be called again.
 
-    Raises MiNtfError in a variant that they cannot run in (none set, scalar, spectral, …).
+    ``mi.render`` raises the plugins' own errors from then on (:mod:`mi_ntf.render.plugins.render_errors`). Dr.Jit gets
+    a second thread if it has one only (:data:`mi_ntf.core.variants.LEAST_THREADS`).
+
+    Raises
+    ------
+    MiNtfError
+        If no variant is set, or one in which the plugins cannot run (scalar, spectral).
     """
     global _watching
     variant = mi.variant() or "(none set)"
@@ -50,10 +58,28 @@ def register() -> None:
         mi.detail.add_variant_callback(_on_variant)
 
 
-def load_scene(path: Path, parameters: dict[str, str], environment: Environment | None = None):
-    """The scene of an XML file, `parameters` for its $names, whose integrator is ``nrf``; where no variant is set, in
-    the first of `VARIANTS` that this machine can run. `environment` is laid over the scene's own. Raises MiNtfError if
-    the integrator is another, or the environment does not fit."""
+def load_scene(path: Path, parameters: dict[str, str], environment: Environment | None = None) -> "mi.Scene":
+    """Load a scene whose integrator is ``nrf``.
+
+    Parameters
+    ----------
+    path
+        The XML file.
+    parameters
+        Values of the scene's $names.
+    environment
+        Environment map in place of the scene's own.
+
+    Returns
+    -------
+    mi.Scene
+        In the current variant; if none is set, in the first of ``VARIANTS`` that this machine can run.
+
+    Raises
+    ------
+    MiNtfError
+        If the scene has another integrator, or the environment does not fit.
+    """
     if mi.variant() is None:
         mi.set_variant(*VARIANTS)
     register()
@@ -64,12 +90,15 @@ def load_scene(path: Path, parameters: dict[str, str], environment: Environment 
     return scene
 
 
-def _with_types(parse_dict):
-    """Wrap `mi.parser.parse_dict`: each ``nrf`` gets the type medium or integrator. Mitsuba has one type for a name and
-    leaves that of ``nrf`` open, and `mi.parser.write_file` refuses nodes without a type."""
+def _with_types(parse_dict: Callable[P, "mi.parser.ParserState"]) -> Callable[P, "mi.parser.ParserState"]:
+    """Wrap `mi.parser.parse_dict` so that each ``nrf`` has the type medium or integrator.
+
+    Mitsuba has one type for a name and leaves that of ``nrf`` open, but `mi.parser.write_file` refuses nodes without a
+    type.
+    """
 
     @functools.wraps(parse_dict)
-    def parse(*args, **kwargs):
+    def parse(*args: P.args, **kwargs: P.kwargs) -> "mi.parser.ParserState":
         state = parse_dict(*args, **kwargs)
         for node in state.nodes:
             if node.type == mi.ObjectType.Unknown and node.props.plugin_name() == "nrf":
@@ -80,6 +109,6 @@ def _with_types(parse_dict):
 
 
 def _on_variant(_old: str, new: str) -> None:
-    """Registrations hold for one variant: repeat them for the new one, where the plugins can run in it."""
+    """Register the plugins for the new variant if they can run in it."""
     if new in VARIANTS:
         register()
