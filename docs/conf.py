@@ -13,6 +13,8 @@ highlight_language = "none"
 html_theme = "furo"
 html_title = f"mi_ntf {release}"
 html_show_sphinx = False
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
 html_theme_options = {"footer_icons": []}
 
 myst_heading_anchors = 3

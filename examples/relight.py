@@ -1,4 +1,4 @@
-"""Relight a captured field from Python: move the point light around it and save one PNG a step.
+"""Relight a field from Python: move a point light around it and save a PNG for each step.
 
     python examples/relight.py [--out out/relight] [--frames 8] [--size 256] [--spp 16]
 """
@@ -11,9 +11,9 @@ import tyro
 
 mi.set_variant("llvm_ad_rgb")
 
-import mi_ntf.render  # noqa: E402  (Mitsuba's types exist only after the variant is set)
+import mi_ntf  # noqa: E402  (Mitsuba's types exist only after the variant is set)
 
-mi_ntf.render.register()
+mi_ntf.register()
 
 SCENE = Path(__file__).parents[1] / "scenes" / "statue" / "scene.xml"
 

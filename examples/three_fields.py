@@ -1,4 +1,4 @@
-"""Three captured fields, a floor, a metal ball, a lamp and a sky in one picture: all shade and light each other.
+"""Render three fields with a floor, a metal ball, a lamp and a sky, which shade and light each other.
 
     python examples/three_fields.py [--out out/three_fields.png] [--size 320] [--spp 16] [--max-depth 4]
 """
@@ -10,17 +10,17 @@ import tyro
 
 mi.set_variant("llvm_ad_rgb")
 
-import mi_ntf.render  # noqa: E402  (Mitsuba's types exist only after the variant is set)
+import mi_ntf  # noqa: E402  (Mitsuba's types exist only after the variant is set)
 from mi_ntf.core import field_file  # noqa: E402
 
-mi_ntf.render.register()
+mi_ntf.register()
 
 SCENES = Path(__file__).parents[1] / "scenes"
 PLACE = mi.ScalarTransform4f
 
 
 def field(name: str, to_world, scale: float = 1.0) -> dict:
-    """A shipped field inside its bounding sphere; shape and medium stand at the same place."""
+    """Return a shipped field inside its bounding sphere. Shape and medium have the same transform."""
     path = SCENES / name / "field.safetensors"
     captured = field_file.load_header(path).similarity
     ball = to_world @ PLACE().scale(scale).translate(list(captured.center)).scale(captured.radius)
@@ -29,7 +29,7 @@ def field(name: str, to_world, scale: float = 1.0) -> dict:
 
 
 def load(size: int, spp: int, max_depth: int, visibility: str = "raymarch") -> mi.Scene:
-    """The scene; three bounces by a `max_depth` of 4."""
+    """Return the scene. A `max_depth` of 4 allows three bounces."""
     tiles = {"type": "checkerboard", "color0": 0.25, "color1": 0.6, "to_uv": PLACE().scale([8, 8, 1])}
     view = PLACE().look_at([-1.2, 1.9, 4.6], [0.1, 0.6, 0], [0, 1, 0])
     above = PLACE().look_at([-2.2, 3.2, 1.5], [0, 0.5, 0], [0, 1, 0]).scale(0.5)

@@ -1,9 +1,9 @@
-"""Hold the `nrf` integrator against Mitsuba's own `volpath` on the same field.
+"""Compare the `nrf` integrator with stock `volpath` on the same field.
 
     python examples/volpath_reference.py [--size 64] [--spp 64]
 
-At depth 2 both solve the single-scattering equation of the field: `volpath` by unbiased tracking, `nrf` by marching.
-Means of 8×8 blocks are compared, since `volpath` leaves noise in single pixels.
+At `max_depth` 2 both compute single scattering: `volpath` by unbiased tracking, `nrf` by marching.
+Means of 8×8 blocks are compared, since single pixels of `volpath` are noisy.
 """
 
 import time
@@ -17,16 +17,16 @@ from mi_ntf.evaluate.metrics import relative_rmse
 
 mi.set_variant("llvm_ad_rgb")
 
-import mi_ntf.render  # noqa: E402  (Mitsuba's types exist only after the variant is set)
+import mi_ntf  # noqa: E402  (Mitsuba's types exist only after the variant is set)
 
-mi_ntf.render.register()
+mi_ntf.register()
 
 SCENE = Path(__file__).parents[1] / "scenes" / "statue" / "scene.xml"
 
 
 def main(size: int = 64, spp: int = 64, light: str = "point", visibility: str = "raymarch",
          scene: Path = SCENE) -> None:
-    """Render twice, print seconds and the relative RMSE of the block means."""
+    """Render with both integrators, and print seconds and the relative RMSE of the block means."""
     loaded = mi.load_file(str(scene), light=light, visibility=visibility, res=str(size), spp=str(spp))
     stock = mi.load_dict({"type": "volpath", "max_depth": 2, "hide_emitters": True})
     images = []

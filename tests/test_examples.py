@@ -25,7 +25,7 @@ def _run(script, *words):
 
 
 def _blob() -> tuple[Header, dict[str, np.ndarray]]:
-    """A soft ball: every plane holds a Gaussian, whose product over the three planes is a Gaussian of |x|."""
+    """Return a soft ball: every plane holds a Gaussian, and the product over the three planes is a Gaussian of |x|."""
     planes, small = Encoding("planes", (32,), 1), Encoding("frequency", octaves=0)
     arch = Architecture(Network(planes, (2,)), Network(small, (2,)), Network(small, (2,)))
     tensors = {k: np.zeros(s, np.float32) for k, s in arch.skeleton().items()}
@@ -84,7 +84,7 @@ def test_own_mesh_from_photographs_to_a_lit_image(tmp_path):
 
 
 def test_three_fields_stand_in_one_picture(tmp_path):
-    """All three, of which one is turned, on a floor that they shade."""
+    """The picture shows all three fields on the floor."""
     _run("three_fields.py", "--out", tmp_path / "a.png", "--size", 32, "--spp", 4, "--max-depth", 2)
     image = io.imread(tmp_path / "a.png").astype(float)
     assert image.shape == (32, 48, 3)
