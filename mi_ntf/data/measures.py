@@ -180,11 +180,11 @@ def _ratios(values: np.ndarray) -> list[float | None]:
 
 def warnings(data: Numbers, rows: list[Photograph]) -> list[str]:
     """Return one sentence, with the remedy, for each of the :func:`numbers` that will harm training."""
-    return [*_of_views(data), *_of_pixels(data), *_of_drift(data, rows), *_of_masks(data, rows)]
+    return [*_of_pixels(data), *_of_drift(data, rows), *_of_masks(data, rows)]
 
 
-def _of_views(data: Numbers) -> Iterator[str]:
-    gap, far = data["gap"], data["distance"]
+def _of_pixels(data: Numbers) -> Iterator[str]:
+    gap, far, coverage, width = data["gap"], data["distance"], data["coverage"]["median"], 2 / data["pixel"]["median"]
     if gap["degrees"] > 60:
         direction = ", ".join(f"{v:.2f}" for v in gap["direction"])
         yield (f"No camera for training is within {gap['degrees']:.0f}° of the direction ({direction}) from the "
@@ -195,10 +195,6 @@ def _of_views(data: Numbers) -> Iterator[str]:
     if far["most"] > 2 * far["least"]:
         yield (f"The cameras are between {far['least']:.3g} and {far['most']:.3g} radii from the object; the far ones "
                "blur what the near ones show: keep one distance, or check the poses.")
-
-
-def _of_pixels(data: Numbers) -> Iterator[str]:
-    coverage, width = data["coverage"]["median"], 2 / data["pixel"]["median"]
     if coverage < 0.1:
         yield (f"The object covers {percent(coverage)} of a photograph (median); go closer or crop, so that its pixels "
                "are spent on it.")

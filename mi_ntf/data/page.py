@@ -1,13 +1,5 @@
 """HTML pages for reports. A page contains everything that it shows: it needs no network and no other file.
 
-    page = Page("skull")
-    page.section("Photographs")
-    page.text("66 photographs."), page.warning("1 % is saturated.")
-    page.table(["what", "value"], [["gain", 0.34]])
-    page.pictures([("photograph 1", array)], width=240)
-    page.curves("Loss", {"colour": (xs, ys)}, xlabel="step", ylabel="loss", log=True)
-    page.write(Path("report.html"))
-
 Every text is escaped. Arrays are (H, W, 3) RGB, linear light as floats or sRGB levels as uint8. Pillow and matplotlib
 (extra `train`) are imported where they are needed.
 """

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mi_ntf.core.errors import MiNtfError
-from mi_ntf.data import background, exif, images, lens, masks
+from mi_ntf.data import exif, images, lens, masks
 from mi_ntf.data.assumptions import Assumptions
 from mi_ntf.data.file_names import first
 from mi_ntf.data.schema import Camera, View, focal_length
@@ -30,7 +30,7 @@ def load(views: list[View], size: int | None = None, black: bool = False, assume
          ) -> Photographs:
     """Read the photographs of a split, scaled down to a longer side of `size` pixels.
 
-    With `black`, alpha comes from the black background (`background`) instead of masks. All photographs have one size
+    With `black`, alpha comes from the black background instead of masks. All photographs have one size
     in the end: those that lie otherwise than the first are turned by 90 degrees. `assumed` receives the assumptions.
     Raises MiNtfError.
     """
@@ -104,7 +104,7 @@ def read(view: View, size: int | None, black: bool, straighten: lens.Straightene
                 stored[rows] = images.levels(pixels[rows])
             pixels = stored
     if black:
-        pixels[..., 3] = background.alpha(pixels, str(view.image)) * (1 if whole else 1 / 255)
+        pixels[..., 3] = masks.from_background(pixels, str(view.image)) * (1 if whole else 1 / 255)
     return pixels, camera
 
 

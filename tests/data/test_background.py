@@ -10,7 +10,7 @@ from scipy import ndimage
 from train import two_spheres
 
 from mi_ntf.core.errors import MiNtfError
-from mi_ntf.data import background, images, schema
+from mi_ntf.data import images, masks, schema
 from mi_ntf.data.readers import load_dataset
 
 pytest.importorskip("cv2", reason="a black background needs OpenCV: pip install 'mi-ntf[train]'")
@@ -36,14 +36,14 @@ def photograph(c2w, room=0.002, noise=0.0015, rng=None) -> tuple[np.ndarray, np.
 def test_matter_lies_in_the_silhouette_and_emptiness_outside_of_it(view, dtype):
     levels, alpha = photograph(forms.C2W[view])
     stored = np.concatenate([levels, np.full((SIZE, SIZE, 1), 255, np.uint8)], -1)
-    result = background.alpha(stored if dtype == np.uint8 else images.linear(stored), "here")
-    assert set(np.unique(result)) == {background.EMPTY, background.UNKNOWN, background.MATTER}
-    assert (result[alpha < 0.5] != background.MATTER).all() and (result[alpha > 0] != background.EMPTY).all()
+    result = masks.from_background(stored if dtype == np.uint8 else images.linear(stored), "here")
+    assert set(np.unique(result)) == {masks.EMPTY, masks.UNKNOWN, masks.MATTER}
+    assert (result[alpha < 0.5] != masks.MATTER).all() and (result[alpha > 0] != masks.EMPTY).all()
     core = ndimage.binary_erosion(alpha == 1, iterations=4) & (np.abs(np.arange(SIZE) - 74.5) > 8)[:, None]
     bright = core & (images.LINEAR[levels].max(-1) > 0.25 * images.LINEAR[levels].max())
-    assert (result[bright] == background.MATTER).mean() > 0.99
-    far = ndimage.distance_transform_edt(alpha == 0) > (2 * background.CLOSE + background.AROUND) * SIZE
-    assert (result[far] == background.EMPTY).all() and far.mean() > 0.2
+    assert (result[bright] == masks.MATTER).mean() > 0.99
+    far = ndimage.distance_transform_edt(alpha == 0) > (2 * masks.CLOSE + masks.AROUND) * SIZE
+    assert (result[far] == masks.EMPTY).all() and far.mean() > 0.2
 
 
 def test_dust_is_dropped_and_parts_of_the_object_are_kept():
@@ -53,18 +53,18 @@ def test_dust_is_dropped_and_parts_of_the_object_are_kept():
     light[60:140, 184:200, :3] = 0.4   # a part beyond a narrow shadow
     light[90:110, 120:140, :3] = 0     # a hole
     light[20:22, 20:22, :3] = 0.6      # dust
-    result = background.alpha(light, "here")
-    assert (result[10:32, 10:32] == background.EMPTY).all()
-    assert (result[92:108, 122:138] == background.UNKNOWN).all()
-    assert (result[62:138, 181:183] == background.UNKNOWN).all()
-    assert (result[64:84, 104:176] == background.MATTER).all() and (result[64:136, 188:196] == background.MATTER).all()
+    result = masks.from_background(light, "here")
+    assert (result[10:32, 10:32] == masks.EMPTY).all()
+    assert (result[92:108, 122:138] == masks.UNKNOWN).all()
+    assert (result[62:138, 181:183] == masks.UNKNOWN).all()
+    assert (result[64:84, 104:176] == masks.MATTER).all() and (result[64:136, 188:196] == masks.MATTER).all()
 
 
 def test_an_object_that_leaves_the_picture():
     light = np.full((100, 150, 4), 1e-4, np.float32)
     light[60:, 50:100, :3] = 0.3
-    result = background.alpha(light, "here")
-    assert (result[63:, 53:97] == background.MATTER).all() and (result[:40] == background.EMPTY).all()
+    result = masks.from_background(light, "here")
+    assert (result[63:, 53:97] == masks.MATTER).all() and (result[:40] == masks.EMPTY).all()
 
 
 @pytest.mark.parametrize(("room", "text"), [
@@ -74,7 +74,7 @@ def test_an_object_that_leaves_the_picture():
 def test_what_is_not_dark_is_refused_with_what_to_do(room, text):
     pixels = np.zeros((SIZE, SIZE, 3), np.uint8) if room is None else photograph(forms.C2W[0], room=room)[0]
     with pytest.raises(MiNtfError, match=text):
-        background.alpha(np.concatenate([pixels, pixels[..., :1]], -1), "a.png")
+        masks.from_background(np.concatenate([pixels, pixels[..., :1]], -1), "a.png")
 
 
 def write(folder, **room):
