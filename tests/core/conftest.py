@@ -1,4 +1,4 @@
-"""Property tests here are deterministic and have no deadline: the machine may be busy."""
+"""Settings of property tests: deterministic, without a deadline, since the machine may be busy."""
 
 from hypothesis import settings
 

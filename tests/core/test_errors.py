@@ -1,4 +1,4 @@
-"""How errors are told: one sentence, whoever wrapped them on the way."""
+"""Text of errors for users: one sentence, whatever wrapped the error."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Field files: what is written comes back, and every fault is named with its remedy."""
+"""Field files: round trip, and errors that name the fault and its remedy."""
 
 import dataclasses
 import json
@@ -81,8 +81,8 @@ def test_fields_with_a_visibility_network_and_fresnel_effect_and_old_ones_withou
     assert both.skeleton()["visibility.layers.0.weight"] == (3, 18)  # 6 + 1 octave · (sin, cos) · 6
     tensors = make_tensors(both)
     field_file.save(tmp_path / "f", Header(both), tensors)
-    header, found = field_file.load(tmp_path / "f")
-    assert header.architecture == both and set(found) == set(tensors)
+    header, actual = field_file.load(tmp_path / "f")
+    assert header.architecture == both and set(actual) == set(tensors)
     old = Header(SMALL).to_json()
     del old["architecture"]["visibility"], old["architecture"]["fresnel"]
     assert header_from_json(json.loads(json.dumps(old)), "old").architecture == SMALL
@@ -126,14 +126,14 @@ def test_planes_beyond_half_precision_are_stored_in_single(tmp_path):
     tensors = make_tensors(SMALL)
     tensors["density.planes.0"][0, 0, 0, 0] = 1e5
     field_file.save(tmp_path / "f", Header(SMALL), tensors)
-    _, found = field_file.load(tmp_path / "f")
-    np.testing.assert_array_equal(found["density.planes.0"], tensors["density.planes.0"])
+    _, actual = field_file.load(tmp_path / "f")
+    np.testing.assert_array_equal(actual["density.planes.0"], tensors["density.planes.0"])
     halved = tensors["density.planes.1"].astype(np.float16).astype(np.float32)
-    np.testing.assert_array_equal(found["density.planes.1"], halved)
+    np.testing.assert_array_equal(actual["density.planes.1"], halved)
 
 
 def test_networks_that_leave_single_precision_are_refused(tmp_path):
-    """Finite weights, products that are not: NaN in a picture, far from its cause."""
+    """Finite weights whose products overflow would show as NaN in a picture."""
     tensors = make_tensors(SMALL)
     tensors["reflectance.layers.1.weight"][0, 0] = 1e37
     with pytest.raises(MiNtfError, match=r"reflectance: its weights lead to values of .*e\+3., more than 1e\+36"):
@@ -142,7 +142,7 @@ def test_networks_that_leave_single_precision_are_refused(tmp_path):
 
 @pytest.mark.parametrize("kind", ["BF16", "F8_E4M3", "F64", "C64", "BOOL"])
 def test_types_of_tensors_that_are_not_read(tmp_path, kind):
-    """One sentence also for types that NumPy lacks; float64 beyond single precision is infinite."""
+    """Types that NumPy lacks give a one-sentence error; float64 beyond single precision is infinite."""
     size = {"BF16": 2, "F64": 8, "C64": 8}.get(kind, 1)
     shapes = SMALL.skeleton()
     head, at, body = {"__metadata__": {"mi_ntf": json.dumps(Header(SMALL).to_json())}}, 0, b""

@@ -1,4 +1,4 @@
-"""Files are whole or not there: on errors, on full disks, after killed writers, with several writers at a time."""
+"""Atomic writing: on errors, on full disks, after killed writers, with several writers at a time."""
 
 import os
 import platform
@@ -28,7 +28,7 @@ def test_content_is_written_in_order_and_replaces_what_was_there(tmp_path):
 @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), RuntimeError("disk. full."), ValueError("x"),
                                    KeyboardInterrupt()], ids=lambda e: type(e).__name__)
 def test_a_failed_block_leaves_what_was_there(tmp_path, error):
-    """Errors of the system and of libraries become one that names the file; others pass."""
+    """Errors of the system and of libraries become one that names the file; other errors pass."""
     path = tmp_path / "f"
     path.write_text("before")
     expected = MiNtfError if isinstance(error, OSError | RuntimeError) else type(error)
@@ -44,7 +44,7 @@ def test_a_failed_block_leaves_what_was_there(tmp_path, error):
 
 @pytest.mark.parametrize("room", [0, 1, 4095, 9999])
 def test_a_disk_that_fills_up_midway(tmp_path, room):
-    """The system's own refusal, at the first byte, midway and at the last."""
+    """The system refuses the first byte, one midway or the last."""
     path = tmp_path / "f"
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (room, hard))
@@ -77,11 +77,11 @@ def test_what_a_killed_writer_left_is_removed_and_a_living_ones_is_not(tmp_path)
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()
     mine, other = f"f.{platform.node()}-", "f.elsewhere-"
-    kept = {f"{mine}{os.getppid()}.part", f"{other}{dead.pid}.part", f"{mine}x.part", f"g{mine[1:]}{dead.pid}.part"}
-    for name in kept | {f"{mine}{dead.pid}.part", f"{mine}{'9' * 30}.part"}:
+    others = {f"{mine}{os.getppid()}.part", f"{other}{dead.pid}.part", f"{mine}x.part", f"g{mine[1:]}{dead.pid}.part"}
+    for name in others | {f"{mine}{dead.pid}.part", f"{mine}{'9' * 30}.part"}:
         (tmp_path / name).write_text("half")
     files.write(tmp_path / "f", "whole")
-    assert set(names(tmp_path)) == kept | {"f"}
+    assert set(names(tmp_path)) == others | {"f"}
 
 
 def test_two_threads_write_one_file_at_a_time_each_its_own(tmp_path):

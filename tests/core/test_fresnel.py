@@ -31,7 +31,7 @@ def _rho(wi, wo, k, s, roughness):
 
 @cache
 def _reflected(cos, roughness, n=400):
-    """``(A, R)``: what a GGX lobe of weight 1 and one of (1 − ⟨ω_o,h⟩)⁵ make of light from everywhere, by half vectors
+    """``(A, R)``: what a GGX lobe of weight 1 and one of (1 − ⟨ω_o,h⟩)⁵ reflect of uniform light, by half vectors
     drawn from D; no formula of :mod:`mi_ntf.core.fresnel` enters."""
     alpha, u, phi = roughness**2, (np.arange(n) + 0.5) / n, np.pi * (np.arange(n) + 0.5) / n
     c = np.sqrt((1 - u) / (1 + (alpha**2 - 1) * u))[:, None]
@@ -48,7 +48,7 @@ def _reflected(cos, roughness, n=400):
 
 @pytest.mark.parametrize("roughness", ROUGHNESS)
 def test_the_rims_share_is_what_it_reflects(roughness):
-    """R, and R̄ as its mean."""
+    """The fits of R and of its mean R̄ agree with quadrature."""
     grazing, mean = fresnel._rim(ops, roughness)
     for cos in (0.02, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0):
         error = 0.02 if roughness > 0.45 else 0.06 if cos > 0.04 else 0.1  # as the docstring says of the fit
@@ -60,7 +60,7 @@ def test_the_rims_share_is_what_it_reflects(roughness):
 @pytest.mark.parametrize("s", [0.04, 0.3, 1.0])
 @pytest.mark.parametrize("roughness", ROUGHNESS)
 def test_a_white_surface_never_sends_out_more_than_comes_in(roughness, s):
-    """Directional albedo with k = 1: by quadrature of both lobes. 0.012: what the fit of R may be too low by, at
+    """Directional albedo with k = 1: by quadrature of both lobes. 0.012: largest error of the fit of R at
     cosines of 0.1 and more."""
     t, w = np.polynomial.legendre.leggauss(48)
     cos_i, phi = (t + 1) / 2, np.pi * (t + 1)
@@ -100,7 +100,7 @@ def test_diffuse_albedo_reflects_as_much_of_light_from_everywhere(roughness, k, 
 
 
 def test_schlick_is_close_to_a_dielectric():
-    """Of index 1.5, reflectance DIELECTRIC: Fresnel's equations within 0.04 at all angles (Schlick 1994, figure 3)."""
+    """Index 1.5, reflectance DIELECTRIC: Fresnel's equations within 0.04 at all angles (Schlick 1994, figure 3)."""
     for cos_h in np.linspace(0.05, 1, 20):
         wo, wi = _direction(cos_h, 0.0), _direction(cos_h, np.pi)
         half = normalize(ops, tuple(a + b for a, b in zip(wi, wo, strict=True)))

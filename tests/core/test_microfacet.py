@@ -182,15 +182,15 @@ def test_phase_function_scatters_from_above_to_above_alone_and_is_reciprocal(wi,
 
 @given(sphere, sphere, st.floats(0.15, 1), st.floats(0, 5))
 def test_soft_skins_are_reciprocal_and_send_no_more_than_flat_ones(wi, wo, roughness, softness):
-    found = microfacet.scattering(ops, wi, wo, N, roughness, softness)
-    assert microfacet.scattering(ops, wo, wi, N, roughness, softness) == pytest.approx(found, rel=1e-11)
+    actual = microfacet.scattering(ops, wi, wo, N, roughness, softness)
+    assert microfacet.scattering(ops, wo, wi, N, roughness, softness) == pytest.approx(actual, rel=1e-11)
     flat = microfacet.scattering(ops, wi, wo, N, roughness)
-    assert all(0 <= a <= b * (1 + 1e-12) for a, b in zip(found, flat, strict=True))
+    assert all(0 <= a <= b * (1 + 1e-12) for a, b in zip(actual, flat, strict=True))
 
 
 @pytest.mark.parametrize("softness", [0.0, 0.01, 0.1, 1.0])
 def test_white_soft_skin_never_shines(softness):
-    """∫ f c_i/(c_i + c_o) dω_i, what a skin of softness k sends to ω_o in a white furnace: at most 1, 1 to above."""
+    """∫ f c_i/(c_i + c_o) dω_i, the light of a soft skin towards ω_o in a white furnace: at most 1, 1 from above."""
     mu, weights = _nodes(2000)
     mu, weights = (mu + 1) / 2, weights / 2
     c_i = microfacet.soft_cosine(ops, mu, softness)
@@ -211,9 +211,9 @@ def test_an_opaque_skin_looks_like_the_surface(cosines):
     profiles = [(lambda z: np.expm1(z), lambda z: np.exp(z)), (lambda z: 40 * z * z, lambda z: 80 * z),
                 (lambda z: 90 * z, lambda z: 90)]  # optical depth below the top, and its derivative
     for depth, sigma in profiles:
-        seen = quad(lambda z, d=depth, s=sigma: np.exp(-d(z) * (1 / wi[2] + 1 / wo[2])) * s(z) / wo[2], 0, 9,
+        radiance = quad(lambda z, d=depth, s=sigma: np.exp(-d(z) * (1 / wi[2] + 1 / wo[2])) * s(z) / wo[2], 0, 9,
                     points=[1e-3, 0.01, 0.1, 0.5, 2], limit=400)[0]
-        assert seen * diffuse == pytest.approx(wi[2] / np.pi, rel=1e-6)
+        assert radiance * diffuse == pytest.approx(wi[2] / np.pi, rel=1e-6)
 
 
 def test_opposite_directions_have_no_half_vector_and_no_nan():

@@ -39,10 +39,10 @@ def test_rays_begin_above_their_own_patch(rng):
 def test_a_table_knows_its_patches_and_both_sides_of_a_sheet(rng):
     points = np.concatenate([rng.uniform(-0.5, 0.5, (2000, 2)).T, rng.uniform(-0.002, 0.002, (1, 2000)) + 0.01]).T
     normals = np.where(np.arange(2000)[:, None] % 2, [0, 0.1, 1], [0.1, 0, -1.0])
-    kept = radiosity.thin(points, normals)
-    points, normals = points[kept], normals[kept]
+    remaining = radiosity.thin(points, normals)
+    points, normals = points[remaining], normals[remaining]
     table = radiosity.table(points, normals)
-    np.testing.assert_array_equal(table[radiosity.place(points, normals)], np.arange(len(kept)))
+    np.testing.assert_array_equal(table[radiosity.place(points, normals)], np.arange(len(remaining)))
     inside = (np.abs(points[:, :2]) < 0.45).all(1)
     above = table[radiosity.place(points[inside] + [0, 0, 0.04], np.tile([0, 0, 1.0], (inside.sum(), 1)))]
     assert (normals[above][:, 2] > 0).all()
@@ -52,27 +52,27 @@ def test_a_table_knows_its_patches_and_both_sides_of_a_sheet(rng):
 
 
 def test_solve_is_the_linear_system(rng):
-    """(1 − F K) E = F K D for what the patches send each other, F the rays' shares."""
+    """The light between patches solves (1 − F K) E = F K D, F the fractions of rays."""
     n, rays = 40, 30
     hits = rng.integers(-1, n, (n, rays))
     shares = np.stack([(hits == j).mean(1) for j in range(n)], 1)
     albedo, direct = rng.uniform(0, 0.9, (n, 3)), rng.uniform(0, 5, (n, 3))
-    found = radiosity.solve(hits, albedo, direct, -1)
+    actual = radiosity.solve(hits, albedo, direct, -1)
     for c in range(3):
         exact = np.linalg.solve(np.eye(n) - shares * albedo[:, c], shares @ (albedo[:, c] * direct[:, c]))
         # The last change was below 1e-3, and what follows is a geometric series of ratio 0.9 at most.
-        np.testing.assert_allclose(found[:, c], exact, atol=1e-2 * exact.max())
+        np.testing.assert_allclose(actual[:, c], exact, atol=1e-2 * exact.max())
     once = radiosity.solve(hits, albedo, direct, 1)
     np.testing.assert_allclose(once, shares @ (albedo * direct), rtol=1e-12)
     assert not radiosity.solve(hits, albedo, direct, 0).any()
 
 
 def test_a_closed_box_gathers_the_geometric_series():
-    """Where every ray meets a patch of the same light, E = D/(1 − k)."""
+    """E = D/(1 − k) if every ray meets a patch of the same light."""
     hits = np.zeros((5, 4), int)
     direct = np.ones((5, 3))
-    found = radiosity.solve(hits, np.full((5, 3), 0.5), direct, -1)
-    np.testing.assert_allclose(direct + found, 2, rtol=2e-3)  # ends when a bounce adds less than 1e-3
+    actual = radiosity.solve(hits, np.full((5, 3), 0.5), direct, -1)
+    np.testing.assert_allclose(direct + actual, 2, rtol=2e-3)  # ends when a bounce adds less than 1e-3
 
 
 def test_no_patches_send_no_light():

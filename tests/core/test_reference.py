@@ -73,7 +73,7 @@ def test_density_is_clipped(tensors, points):
 
 def test_reflectance(tensors, points):
     result = reference.reflectance(ARCH, tensors, points)
-    for x, found in zip(points, result, strict=True):
+    for x, actual in zip(points, result, strict=True):
         features = list(x)
         for k in range(3):
             features += [f(2**k * math.pi * c) for f in (math.sin, math.cos) for c in x]
@@ -81,7 +81,7 @@ def test_reflectance(tensors, points):
         length = math.sqrt(sum(v * v for v in raw[:3]))
         rest = [1 / (1 + math.exp(-v)) for v in raw[3:]]
         rest[3] = MIN_ROUGHNESS + (1 - MIN_ROUGHNESS) * rest[3]
-        np.testing.assert_allclose(found, [v / length for v in raw[:3]] + rest, rtol=1e-11)
+        np.testing.assert_allclose(actual, [v / length for v in raw[:3]] + rest, rtol=1e-11)
 
 
 def test_ray_mixture(tensors):
@@ -89,7 +89,7 @@ def test_ray_mixture(tensors):
     o, d = rng.uniform(-0.5, 0.5, (12, 3)), rng.normal(size=(12, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     o[0] = 5 * np.cross(d[0], [1, 0, 0])  # a miss
-    hit, found = reference.ray_mixture(ARCH, tensors, o, d)
+    hit, actual = reference.ray_mixture(ARCH, tensors, o, d)
     assert hit.tolist() == [False] + [True] * 11
     for i in range(1, 12):
         m = o[i] - (o[i] @ d[i]) * d[i]
@@ -104,8 +104,8 @@ def test_ray_mixture(tensors):
         w = [1, math.exp(6 * math.tanh(logit / 6))]
         top = sum(wk / (1 + math.exp(-ak * (h - bk))) for wk, ak, bk in zip(w, a, b, strict=True))
         for k in range(2):
-            np.testing.assert_allclose([v[i] for v in found[k]], [w[k] / top, a[k], b[k]], rtol=1e-10, atol=1e-14)
-        own = tuple(tuple(v[i] for v in part) for part in found)
-        assert mixture.transmittance(ops, h, own) == pytest.approx(1)
-    assert np.isfinite([v[0] for part in found for v in part]).all()
-    assert abs(found[0][2][0]) <= logistic.MAX_CENTRE * spheres.MIN_HALF_CHORD
+            np.testing.assert_allclose([v[i] for v in actual[k]], [w[k] / top, a[k], b[k]], rtol=1e-10, atol=1e-14)
+        single = tuple(tuple(v[i] for v in part) for part in actual)
+        assert mixture.transmittance(ops, h, single) == pytest.approx(1)
+    assert np.isfinite([v[0] for part in actual for v in part]).all()
+    assert abs(actual[0][2][0]) <= logistic.MAX_CENTRE * spheres.MIN_HALF_CHORD

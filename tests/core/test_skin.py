@@ -1,4 +1,4 @@
-"""Softness: the phase function's cosine against Chapman's function, and the measures that marches are turned into."""
+"""Softness: the phase function's cosine against Chapman's function, and its measure by marches."""
 
 import numpy as np
 import pytest
@@ -35,11 +35,11 @@ def test_directions_along_the_skin(rng):
 
 
 def test_shares_and_softness():
-    """c₀² is the squared ratio of the depths, less what a flat skin would seem to have."""
+    """c₀² is the squared ratio of the depths, less the bias of a flat skin."""
     out, along, sigma = np.ones(3), np.array([5.0, 1e9, 0.5]), np.full(3, 100.0)
     flat = np.maximum(out / (skin.LENGTH * np.maximum(sigma, 1e-6)), 1 / skin.FLATTEST) ** 2
-    found = skin.squared_horizon(ops, out, along, sigma)
-    np.testing.assert_allclose(found, [0.04 - flat[0], 0, 1 - flat[2]])
+    actual = skin.squared_horizon(ops, out, along, sigma)
+    np.testing.assert_allclose(actual, [0.04 - flat[0], 0, 1 - flat[2]])
     depths = np.array([0.5, 3.5, 5.0, 20.0])
     np.testing.assert_allclose(
         skin.softness(ops, 0.1, 1.0, depths), 0.1 * skin.CHAPMAN * np.array([0, 0.5, 1, 1]), rtol=1e-12

@@ -1,4 +1,4 @@
-"""Numbers that go from NumPy to Dr.Jit."""
+"""Copies of NumPy arrays for Dr.Jit."""
 
 import drjit as dr
 import numpy as np
@@ -18,8 +18,8 @@ def test_kernels_do_not_depend_on_where_numpy_put_its_numbers(variant, shift):
             dr.kernel_history_clear()
             row = dr.gather(dj.Array4f, array, dr.opaque(dj.UInt32, 3, 5))
             dr.eval(row)
-            found = [k["hash"] for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+            actual = [k["hash"] for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
         np.testing.assert_array_equal(row.numpy()[:, 0], values.ravel()[12:16])
-        return found
+        return actual
 
     assert kernel(floats(values, dj)) == kernel(floats(np.repeat(values, 2, 1)[:, ::2], dj)) != []

@@ -1,4 +1,4 @@
-"""Sparse volumes against dense ones: lookups, empty space, and what a bake finds."""
+"""Sparse volumes against dense ones: lookups, empty space, and bakes."""
 
 import mitsuba as mi
 import numpy as np
@@ -26,15 +26,15 @@ def random_volume(rng, n: int, filled: float, channels: int = 1) -> tuple[np.nda
 
 @pytest.mark.parametrize("n", [16, 17, 24, 41])
 def test_lookups_are_trilinear(n, rng):
-    """Also beyond the outer voxels' centres, and of several channels; to half a level of each channel."""
+    """Lookups of several channels are right to half a level, also beyond the outer voxels' centres."""
     values, volume = random_volume(rng, n, 0.3, 2)
     p = rng.uniform(-1.1, 1.1, (50_000, 3))
     places = ((p[:, ::-1] + 1) * n / 2 - 0.5).T
-    for channel, found in enumerate(volume.at(volume.place(arrays(p)))):
+    for channel, actual in enumerate(volume.at(volume.place(arrays(p)))):
         truth = map_coordinates(values[..., channel].astype(np.float64), places, order=1, mode="nearest")
         level = np.ptp(values[..., channel]) / 0xFFFF
         # Coordinates are float32, and neighbours differ by up to 16.
-        np.testing.assert_allclose(np.array(found), truth, atol=0.51 * level + 2e-6 * n * 16)
+        np.testing.assert_allclose(np.array(actual), truth, atol=0.51 * level + 2e-6 * n * 16)
     np.testing.assert_allclose(volumes.voxels(volume), values, atol=0.51 * level + 2e-6 * n * 16)
     unknown = np.array(volume.at(volume.place(arrays(np.array([[np.nan, 0, 0], [0, np.inf, 0], [0, 0, -np.inf]]))))[0])
     assert np.isfinite(unknown[1:]).all()
@@ -50,7 +50,7 @@ def test_no_brick_and_all_bricks(rng):
 
 
 def test_more_bricks_than_the_index_numbers(monkeypatch):
-    """A field full of fog at the finest resolution: refused, where numbers would run into the octants' bits."""
+    """A field full of fog at the finest resolution is refused: brick numbers would overflow into the octants' bits."""
     monkeypatch.setattr(bricks, "_OCTANTS", 3)
     fog = np.ones((24, 24, 24, 1), np.float32)
     with pytest.raises(MiNtfError, match=r"of 24³ voxels takes 27 bricks, more than the 7 .* a lower resolution"):
@@ -58,7 +58,7 @@ def test_more_bricks_than_the_index_numbers(monkeypatch):
 
 
 def test_empty_space_is_empty(rng):
-    """A ray from anywhere inside the sphere meets nothing as far as its clear distance, and not much less is told: it
+    """A ray from anywhere inside the sphere meets nothing within its clear distance, which is as long as possible: it
     ends at a face of an empty octant, or of the largest empty cube of bricks around."""
     values, volume = random_volume(rng, 120, 0.02)
     occupied = volume.distances() == 0
@@ -68,8 +68,8 @@ def test_empty_space_is_empty(rng):
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     clear = np.array(volume.clear_distance(volume.place(arrays(x)), safe_inverse(arrays(d))), np.float64)
     assert (clear > 0).any() and (clear == 0).any()
-    for share in np.linspace(0.02, 0.999, 40):
-        p = (x + share * clear[:, None] * d)[clear > 0]
+    for fraction in np.linspace(0.02, 0.999, 40):
+        p = (x + fraction * clear[:, None] * d)[clear > 0]
         value = map_coordinates(values[..., 0], ((p[:, ::-1] + 1) * 60 - 0.5).T, order=1, mode="nearest")
         assert np.abs(value).max() < 1e-3
     # In units of bricks: where the ray leaves the cube, it is at a face, so many bricks away as the distance says.
@@ -80,8 +80,8 @@ def test_empty_space_is_empty(rng):
     octant = np.floor(((x + 1) * 60 - 0.5) / (SIDE // 2)) / 2
     low, high = (np.where(n[:, None] > 0, a, b) for a, b in (
         (brick - n[:, None] + 1, octant), (brick + n[:, None], octant + 0.5)))
-    off = np.abs(place - np.where(d > 0, high, low)).min(1)
-    assert off[clear > 0].max() < 1e-3
+    error = np.abs(place - np.where(d > 0, high, low)).min(1)
+    assert error[clear > 0].max() < 1e-3
     # Octants are told apart: some of a brick with matter are empty, and none of those that hold any.
     assert ((n == 0) & (clear > 0)).any()
     dense = np.abs(map_coordinates(values[..., 0], ((x[:, ::-1] + 1) * 60 - 0.5).T, order=1, mode="nearest")) > 1e-3
@@ -89,8 +89,7 @@ def test_empty_space_is_empty(rng):
 
 
 def test_bake_finds_all_density(rng, monkeypatch):
-    """Thin and small blobs, voxels finer than the survey: nothing is missed that a full survey finds, and it looks at
-    a part of the voxels."""
+    """A survey with coarser voxels finds all that a full survey does, also small blobs, and evaluates fewer."""
     network = NetworkField(*fields.blobs([(-0.2, 0.1, 0.0), (0.3, -0.2, 0.1)], [0.4, 0.06]), mi)
     evaluate, looked = bake.at_voxels, []
 
@@ -100,13 +99,13 @@ def test_bake_finds_all_density(rng, monkeypatch):
 
     monkeypatch.setattr(bake, "at_voxels", counted)
     monkeypatch.setattr(bake, "SURVEY", 48)
-    some = bake.bake(network, 112, mi)
+    surveyed = bake.bake(network, 112, mi)
     assert looked[0] == (48, 48**3) and looked[1][0] == 112 and looked[1][1] < 112**3 / 2
     monkeypatch.setattr(bake, "SURVEY", 112)
     whole = bake.bake(network, 112, mi)
-    assert set(some) == set(whole)
-    for name in some:
-        np.testing.assert_array_equal(some[name], whole[name], err_msg=name)
+    assert set(surveyed) == set(whole)
+    for name in surveyed:
+        np.testing.assert_array_equal(surveyed[name], whole[name], err_msg=name)
 
 
 def test_parts_of_a_bake_do_not_show(monkeypatch):
@@ -140,15 +139,15 @@ def test_empty_field():
 
 
 def test_networks_have_the_empty_space_of_their_bricks(rng):
-    """Their own density in bricks, nothing elsewhere."""
+    """Network volumes have the networks' density in bricks, and none elsewhere."""
     network = NetworkField(*fields.blobs([(-0.3, 0.1, 0.0)], [0.25]), mi)
     grid = baked(network, 96, mi)
     volume = NetworkVolume(network, grid, 700.0)
     x = arrays(rng.uniform(-0.57, 0.57, (20000, 3)))
     place = volume.place(x)
     clear = np.array(volume.clear_distance(place, safe_inverse(arrays(np.ones((20000, 3))))))
-    found, truth = np.array(volume.log_density(place)), np.array(network.density(x))
-    assert (found[clear > 0] == NOTHING).all() and (clear > 0).any()
+    actual, truth = np.array(volume.log_density(place)), np.array(network.density(x))
+    assert (actual[clear > 0] == NOTHING).all() and (clear > 0).any()
     inside = (clear == 0) & (truth > 0)
-    np.testing.assert_allclose(np.exp(found[inside]), truth[inside], rtol=1e-5)
-    assert (found[(clear == 0) & (truth == 0)] == NOTHING).all()
+    np.testing.assert_allclose(np.exp(actual[inside]), truth[inside], rtol=1e-5)
+    assert (actual[(clear == 0) & (truth == 0)] == NOTHING).all()

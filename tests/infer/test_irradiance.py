@@ -1,4 +1,4 @@
-"""The light of patches at any point: what is constant stays so, each face has its own, cells blend into each other."""
+"""Irradiance at any point: constants stay constant, faces are separate, cells are interpolated."""
 
 import mitsuba as mi
 import numpy as np
@@ -16,13 +16,13 @@ def test_faces_are_weighted_by_the_squares_of_the_normal():
     rng = np.random.default_rng(0)
     p, n = rng.uniform(-1, 1, (2, 500, 3))
     n /= np.linalg.norm(n, axis=1, keepdims=True)
-    found = np.stack([c.numpy() for c in Irradiance(table, values, mi)(arrays(p), arrays(n))], 1)
+    actual = np.stack([c.numpy() for c in Irradiance(table, values, mi)(arrays(p), arrays(n))], 1)
     exact = sum((n[:, k] ** 2)[:, None] * np.where(n[:, [k]] < 0, values[2 * k + 1], values[2 * k]) for k in range(3))
-    np.testing.assert_allclose(found, exact, rtol=1e-5)
+    np.testing.assert_allclose(actual, exact, rtol=1e-5)
 
 
 def test_cells_are_trilinear_and_nothing_is_seen_of_other_faces():
-    """Values that grow along z, of one face: linear between the cells' middles, held at the ends."""
+    """The values of one face grow along z: linear between the cells' middles, constant beyond the ends."""
     column = np.full((6, CELLS), -1)
     column[4] = np.arange(CELLS)  # +z
     table = np.broadcast_to(column[:, :, None, None], (6, CELLS, CELLS, CELLS))

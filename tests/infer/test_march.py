@@ -108,7 +108,7 @@ def test_optical_depth(grid, rng):
 
 
 def test_optical_depth_of_a_uniform_sphere(slab):
-    """Closed form: σ × length, whether the light lies outside, inside, or the point outside."""
+    """σ × length for lights outside and inside, and for points outside."""
     x = np.array([[0, 0, 0], [0.5, 0, 0], [0, 0, 0], [-3.0, 0, 0], [3.0, 0, 0]])
     d = np.array([[1.0, 0, 0]] * 5)
     length = np.array([np.inf, np.inf, 0.25, np.inf, np.inf])
@@ -127,8 +127,9 @@ def test_optical_depth_of_a_uniform_sphere(slab):
 
 @pytest.mark.parametrize("far", [np.inf, 0.3])
 def test_derivatives_of_optical_depth(grid, rng, far):
-    """By the point, the direction and, of lights in matter, the distance, within a branch, as plugins ask: central
-    differences of fine marches."""
+    """Derivatives by point, direction and distance agree with central differences of fine marches.
+
+    They are taken within a branch, as in plugins."""
     n = 4000
     x, d, way = rng.uniform(-0.3, 0.3, (n, 3)), rng.normal(size=(n, 3)), rng.normal(size=(7, n))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
@@ -157,7 +158,7 @@ def test_derivatives_of_optical_depth(grid, rng, far):
 
 
 def test_transmittance_from_outside_ends_at_the_light(slab):
-    """From points outside of the uniform sphere, to lights before, in and behind it, past it and away from it."""
+    """Points outside of the uniform sphere; lights before, in and behind it, past it and in the other direction."""
     march = raymarch.RayMarch(slab, tuple(mi.Float(s) for s in raymarch.default_steps(2 / 384)))
     x = np.array([[-3.0, 0, 0]] * 4 + [[-3.0, 1.5, 0], [3.0, 0, 0], [-0.5, 0, 0], [-0.5, 0, 0]])
     distance = mi.Float([1.5, 2.5, 3.5, np.inf, np.inf, np.inf, 0.75, 1.0])
@@ -168,7 +169,7 @@ def test_transmittance_from_outside_ends_at_the_light(slab):
 
 
 def test_opaque_matter_lets_nothing_through(rng):
-    """The transmittance of rays that end in matter is 0, not what remains where they ended; that of others is whole."""
+    """Rays that end in matter have transmittance 0; other rays keep theirs."""
     for sigma, truth in ((1000.0, 0.0), (1.0, np.exp(-2.0))):
         ball = baked(NetworkField(*fields.uniform(sigma), mi), 64, mi)
         strand = Strand(ball, arrays(np.tile([[0, 0, 3.0]], (64, 1))),
@@ -180,13 +181,12 @@ def test_opaque_matter_lets_nothing_through(rng):
 
 @pytest.mark.parametrize("scale", [0.008, 0.012, 0.02])
 def test_light_out_of_a_skin_that_thins_out(scale, rng):
-    """Density exp(−z/scale)/scale, light from above: of points at which light from there is stopped, transmittances are
-    uniform in [0, 1], so their mean is ½, found within 0.07 %."""
+    """The mean transmittance of free flight into a skin of density exp(−z/scale)/scale is ½, within 0.07 %."""
     u = (np.arange(4096) + 0.5) / 4096
     x = np.stack([rng.uniform(-0.3, 0.3, 4096), rng.uniform(-0.3, 0.3, 4096), -scale * np.log(-np.log(u) * 0.8)], 1)
-    found = raymarch.RayMarch(Formula(lambda p: dr.exp(-p[2] / scale) / scale),
+    actual = raymarch.RayMarch(Formula(lambda p: dr.exp(-p[2] / scale) / scale),
                               tuple(mi.Float(s) for s in raymarch.default_steps(2 / 384)))
-    tau = found.tau(arrays(x), arrays(np.tile([0.6, 0.0, 0.8], (4096, 1))), mi.Float(np.inf), mi.UInt32(0),
+    tau = actual.tau(arrays(x), arrays(np.tile([0.6, 0.0, 0.8], (4096, 1))), mi.Float(np.inf), mi.UInt32(0),
                     dr.full(mi.Bool, True, 4096))
     assert np.array(tau, np.float64).mean() == pytest.approx(0.5, rel=0.001)
 
@@ -198,7 +198,7 @@ def means(log_density) -> np.ndarray:
 
 
 def test_means_of_pieces(slab):
-    """Exponentials, exactly; parabolas nearly; half of what sets in at once; nothing of nothing."""
+    """Means are exact for exponentials, close for parabolas, half where density sets in at once, and 0 without any."""
     u = (np.arange(6000) + 0.5) / 6000
     for slope in (-4.0, -0.5, 0.0, 2.0, 4.0):
         truth = np.exp(0.3 + slope * u).reshape(bundle.PIECES, -1).mean(1)
@@ -214,16 +214,16 @@ def test_means_of_pieces(slab):
 
 @pytest.mark.parametrize("bend", [-1.5, -0.021, -0.019, 0.0, 0.019, 0.021, 1.5])
 def test_places_in_a_cell(variant, bend):
-    """The inverse of the optical depth of densities that are exponential across each piece, by the formula for small
-    slopes and the one for others: 1e-5 of a piece, float32's grain and the third power of a small slope."""
-    share = (np.arange(60) + 0.5) / 60 * bundle.PIECES
-    piece, u = np.floor(share), share % 1
+    """The inverse of the optical depth of densities that are exponential across each piece, by the formulas
+    for small and for other slopes: 1e-5 of a piece, float32's grain and the third power of a small slope."""
+    fraction = (np.arange(60) + 0.5) / 60 * bundle.PIECES
+    piece, u = np.floor(fraction), fraction % 1
     part, sigmas = 0.1, 2.0 + np.arange(bundle.PIECES)
     rise = np.expm1(bend * u) / np.expm1(bend) if bend else u
     depth = part * (np.concatenate([[0], np.cumsum(sigmas)])[piece.astype(int)] + sigmas[piece.astype(int)] * rise)
     cell = bundle.Cell(mi.Float(0.3), mi.Float(part), tuple((mi.Float(s),) for s in sigmas),
                        (mi.Float(bend),) * bundle.PIECES, None, ())
-    np.testing.assert_allclose(np.array(cell.place(mi.Float(depth))), 0.3 + share * part, atol=1e-5 * part + 1e-7)
+    np.testing.assert_allclose(np.array(cell.place(mi.Float(depth))), 0.3 + fraction * part, atol=1e-5 * part + 1e-7)
 
 
 def test_skipping_changes_nothing(grid, rng):
@@ -242,7 +242,7 @@ def test_skipping_changes_nothing(grid, rng):
 
 
 def test_skipping_changes_no_flight(grid, rng):
-    """Rays end where those do that never skip, to float32's grain, in cells so long that a lost one shows."""
+    """Rays end where rays that never skip do, within float32, with cells so long that a lost one would show."""
     o, d = (arrays(v) for v in rays(rng, 2000))
     offset, depth = (mi.Float(rng.random(2000)) for _ in range(2))
     strands = (Strand(g, o, d, mi.Float(1 / 16)) for g in (grid, Unskipped(grid)))
@@ -254,24 +254,25 @@ def test_skipping_changes_no_flight(grid, rng):
 
 
 def test_shared_samples_are_fair(grid, rng, monkeypatch):
-    """Cells that share a sample are met as often as they weigh: over many numbers, sums over samples of any function of
-    the place are those of finer shares; and there are as few samples as there are shares."""
+    """The mean over many random numbers of sums over samples is that of finer portions.
+
+    A ray has no more samples than portions of light."""
     lines, numbers = 20, 16384
     o, d = (np.repeat(v, numbers, axis=0) for v in rays(rng, lines))
     offset, u = np.repeat(rng.random(lines), numbers), rng.random(lines * numbers)
-    found, noise = [], []
-    for share in (tuning.SAMPLE_FRACTION, 1e-2):
-        monkeypatch.setattr(tuning, "SAMPLE_FRACTION", share)
+    actual, noise = [], []
+    for fraction in (tuning.SAMPLE_FRACTION, 1e-2):
+        monkeypatch.setattr(tuning, "SAMPLE_FRACTION", fraction)
         samples = march.camera_samples([Strand(grid, arrays(o), arrays(d), mi.Float(2 / 200))],
                                        mi.Float(np.inf), mi.Float(offset), mi.Float(u))
-        assert np.array(samples.count).max() <= 1 / share + 1
+        assert np.array(samples.count).max() <= 1 / fraction + 1
         ray, t, w = (np.array(a, np.float64) for a in (samples.ray, samples.t, samples.weights[0]))
         sums = np.stack([np.bincount(ray.astype(int), w * f, lines * numbers).reshape(lines, numbers)
                          for f in (np.ones_like(t), t, np.cos(20 * t))])
-        found.append(sums.mean(2))
+        actual.append(sums.mean(2))
         noise.append(sums.var(2) / numbers)
-    np.testing.assert_allclose(found[0][0], found[1][0], atol=march.MIN_LOSS)
-    z = (found[0] - found[1])[1:, found[0][0] > 0] / np.sqrt(noise[0] + noise[1])[1:, found[0][0] > 0]
+    np.testing.assert_allclose(actual[0][0], actual[1][0], atol=march.MIN_LOSS)
+    z = (actual[0] - actual[1])[1:, actual[0][0] > 0] / np.sqrt(noise[0] + noise[1])[1:, actual[0][0] > 0]
     assert np.abs(z).max() < 4.5  # of 40 numbers, by chance one time in 4000
 
 
@@ -290,7 +291,7 @@ def test_rays_that_miss():
 
 
 def test_overlapping_fields_add(rng):
-    """Two uniform balls that overlap, along one line: weights, shares and free flight in closed form."""
+    """Two uniform balls that overlap, along one line: weights and free flight in closed form."""
     dense, thin = (baked(NetworkField(*fields.uniform(s), mi), 128, mi) for s in (0.5, 0.6))
     n = 4000
     axis = np.tile([[0.0, 0.0, -1.0]], (n, 1))
@@ -331,8 +332,8 @@ def test_rays_have_the_samples_of_the_finest_field_that_they_meet():
     for shares in ((1 / 8, 1 / 64), ()):
         samples = march.camera_samples(strands, mi.Float(1e9), *u, fractions=shares)
         solid, smoke, none = np.array(samples.count).reshape(-1, 3).T
-        for count, share in zip((solid, smoke), shares or (tuning.SAMPLE_FRACTION,) * 2, strict=True):
-            assert count.min() >= np.floor(lost / share) and count.max() <= np.ceil(lost / share) + 1
+        for count, fraction in zip((solid, smoke), shares or (tuning.SAMPLE_FRACTION,) * 2, strict=True):
+            assert count.min() >= np.floor(lost / fraction) and count.max() <= np.ceil(lost / fraction) + 1
         assert not none.any()
         for weight in samples.weights:
             assert np.array(weight, np.float64).sum() / 500 == pytest.approx(lost, rel=0.01)  # voxels at the surface
@@ -340,7 +341,7 @@ def test_rays_have_the_samples_of_the_finest_field_that_they_meet():
 
 @pytest.mark.parametrize("distance", [3.0, 300.0, 2e4, 1e6])
 def test_rays_from_afar(slab, distance):
-    """Light and view keep their digits however far they start: closed form along two chords, and both marches end."""
+    """Light and view keep their digits at large distances: closed form along two chords, and both marches end."""
     across = np.array([0.0, 0.6])
     x = np.stack([across, np.zeros(2), np.full(2, distance)], 1)
     d = np.tile([[0.0, 0.0, -1.0]], (2, 1))
@@ -365,20 +366,20 @@ def test_rays_from_afar(slab, distance):
 
 @pytest.mark.parametrize(("begin", "now"), [(0.0, 1), (0.3, 1), (0.3, 2), (2.0, 5), (2.9, 7), (0.4, 0)])
 def test_shares_that_end_in_a_cell_are_represented_evenly(variant, begin, now):
-    """Mean weight, place and its square over `depth`: of the light from `begin` to the last end of a share."""
+    """Mean weight, place and squared place over `depth` are those of the light up to the last portion's end."""
     depth = (dr.arange(mi.Float, 1 << 16) + 0.5) / (1 << 16)
-    early, others, place = (np.array(v, np.float64) for v in march._closing(depth, mi.Float(begin), mi.Float(now)))
+    early, rest, place = (np.array(v, np.float64) for v in march._closing(depth, mi.Float(begin), mi.Float(now)))
     length = max(now - begin, 0)
     assert early.mean() == pytest.approx(begin % 1 if now > begin else 0, abs=1e-4)
-    assert others.mean() == pytest.approx(length, abs=1e-4)
+    assert rest.mean() == pytest.approx(length, abs=1e-4)
     for power in (1, 2) if length else ():
         truth = (now ** (power + 1) - begin ** (power + 1)) / (power + 1)
-        assert (others * place**power).mean() == pytest.approx(truth, rel=1e-3)
-    assert (place[others > 0] >= begin - 1e-6).all() and (place[others > 0] <= now + 1e-6).all()
+        assert (rest * place**power).mean() == pytest.approx(truth, rel=1e-3)
+    assert (place[rest > 0] >= begin - 1e-6).all() and (place[rest > 0] <= now + 1e-6).all()
 
 
 def test_no_ray_has_more_samples_than_shares(rng):
-    """Where rounding ends the first cell before the ray begins: a sample too many of one ray would be another's."""
+    """Rounding may end the first cell before the ray begins; one sample too many would overwrite another ray's."""
     dense = baked(NetworkField(*fields.uniform(60.0), mi), 32, mi)
     o, d = rays(rng, 50_000)
     offset = mi.Float(np.full(len(o), np.nextafter(np.float32(1), np.float32(0))))

@@ -48,9 +48,11 @@ def case(request, rng):
 
 
 def assert_close(ours, truth, tolerance=3e-5, half=HALF):
-    """Within `tolerance` of the output's range: float32 through two layers of sums of some dozen products, and exp. An
-    output that is the same everywhere is rounded all the same. On CUDA layers are float16 (`half`), 2^−11: ten times
-    that in the mean (measured 1.9e-3), a hundred times where exp or a normalisation amplifies it (0.040)."""
+    """Compare within `tolerance` of the output's range, and of its size if it is constant.
+
+    float32 goes through two layers of sums of some dozen products, and exp. On CUDA layers are float16 (`half`), 2^−11:
+    ten times that in the mean (measured 1.9e-3), a hundred times where exp or a normalisation amplifies it (0.040).
+    """
     truth = np.asarray(truth)
     span = max(np.ptp(truth), 1e-3)
     if half:
@@ -71,7 +73,7 @@ def test_density(case, rng):
 
 
 def test_float16_of_cuda(case, rng, monkeypatch):
-    """Which LLVM computes, too. Weights beyond its end are as large as it has, where NaN would spread."""
+    """LLVM computes float16, too. Weights beyond its range are clipped, since infinities would become NaN."""
     monkeypatch.setattr(network_module, "_half", lambda dj: True)
     header, tensors = case
     x = rng.uniform(-0.57, 0.57, (20000, 3))
@@ -86,8 +88,8 @@ def test_float16_of_cuda(case, rng, monkeypatch):
     header, tensors = fields.blobs([(0, 0, 0)], [0.5])
     for raw, sigma in ((1e30, np.exp(6.5)), (-1e30, np.exp(-12.0))):
         fields.constant(tensors, "density", [raw])
-        found = np.exp(np.array(NetworkField(header, tensors, mi).log_density(arrays(x))))
-        np.testing.assert_allclose(found, sigma, rtol=1e-5)
+        actual = np.exp(np.array(NetworkField(header, tensors, mi).log_density(arrays(x))))
+        np.testing.assert_allclose(actual, sigma, rtol=1e-5)
 
 
 def test_reflectance(case, rng):
@@ -102,7 +104,7 @@ def test_reflectance(case, rng):
 
 @pytest.mark.parametrize("name", ["statue", "globe", "knot"])
 def test_torch_and_drjit_agree_on_the_shipped_fields(name, rng):
-    """Raw network outputs, float32 on both sides: 1e-5 of their range."""
+    """Raw outputs of both networks, float32, agree within 1e-5 of their range."""
     torch = pytest.importorskip("torch")
     from mi_ntf.train import networks
 
@@ -120,7 +122,7 @@ def test_torch_and_drjit_agree_on_the_shipped_fields(name, rng):
 
 
 def test_ray_mixture(case, rng):
-    """The network's mixture, on made-up profiles where it reads them."""
+    """Mixtures agree on random profiles, for networks that read them."""
     header, tensors = case
     o, d = rng.uniform(-0.5, 0.5, (5000, 3)), rng.normal(size=(5000, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)

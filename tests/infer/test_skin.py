@@ -1,4 +1,4 @@
-"""Softness measured in fields whose skins are known."""
+"""Softness measured in fields with known skins."""
 
 import mitsuba as mi
 import numpy as np
@@ -36,27 +36,27 @@ def test_sphere(voxels):
     holds for δ ≪ R and a horizon infinitely far off."""
     skin = fields.skin("sphere", 5.0, 0.01 * voxels)
     x = at_depths("sphere", (0, 0.03 * voxels))
-    found = softness(skin.header, skin.tensors, x)
+    actual = softness(skin.header, skin.tensors, x)
     normal = x / np.linalg.norm(x, axis=1, keepdims=True)
     along = np.cross(normal, [0.6, 0.8, 0.0])
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     out, side = (skin.depth(x, d, np.full(len(x), formulas.LENGTH)) for d in (normal, along))
     expected = formulas.CHAPMAN * formulas.squared_horizon(ops, out, side, skin.density(x))
     # Voxels of 1/64: two of them are less than the thinner skin's three scale heights.
-    np.testing.assert_allclose(found, expected, rtol=0.25)
-    assert found.mean() == pytest.approx(expected.mean(), rel=0.05)
-    assert found.mean() == pytest.approx(formulas.CHAPMAN * 2 * skin.scale / (np.pi * 0.5), rel=0.25)
+    np.testing.assert_allclose(actual, expected, rtol=0.25)
+    assert actual.mean() == pytest.approx(expected.mean(), rel=0.05)
+    assert actual.mean() == pytest.approx(formulas.CHAPMAN * 2 * skin.scale / (np.pi * 0.5), rel=0.25)
 
 
 def test_plane_is_flat():
     skin = fields.skin("plane", 5.0, 0.02)
-    found = softness(skin.header, skin.tensors, at_depths("plane", (0, 0.06)))
-    assert np.median(found) < 2e-3 and found.max() < 0.02
+    actual = softness(skin.header, skin.tensors, at_depths("plane", (0, 0.06)))
+    assert np.median(actual) < 2e-3 and actual.max() < 0.02
 
 
 @pytest.mark.parametrize("sigma", [0.0, 1.0, 2.5])
 def test_smoke_has_no_skin(sigma):
-    """Fog that lets light through scatters as it does."""
+    """Thin fog has softness 0."""
     header, tensors = fields.uniform(sigma) if sigma else fields.empty()
     assert not softness(header, tensors, np.random.default_rng(0).uniform(-0.5, 0.5, (500, 3))).any()
 
@@ -64,5 +64,5 @@ def test_smoke_has_no_skin(sigma):
 def test_values_reach_their_neighbours():
     values, known = np.zeros((7, 7, 7), np.float32), np.zeros((7, 7, 7), bool)
     values[3, 3, 3], known[3, 3, 3] = 0.5, True
-    found = spread(values, known)
-    assert (found[1:6, 1:6, 1:6] == 0.5).all() and found.sum() == 0.5 * 125
+    actual = spread(values, known)
+    assert (actual[1:6, 1:6, 1:6] == 0.5).all() and actual.sum() == 0.5 * 125

@@ -1,4 +1,4 @@
-"""Transmittance maps against the rays that they hold."""
+"""Transmittance maps against their rays."""
 
 import subprocess
 import sys
@@ -60,7 +60,7 @@ def marched(grid, x, name):
 
 
 def analytic_source(a, b_of):
-    """Rays whose (a, b) are a known smooth function of the ray, to test the map without any fit."""
+    """Return a source whose (a, b) are a known smooth function of the ray, to test the map without any fit."""
 
     def fit(o, d, end):
         return ((1.0, dr.full(mi.Float, a, dr.width(d[0])), b_of(o, d)),)
@@ -69,7 +69,7 @@ def analytic_source(a, b_of):
 
 
 def random_rays(rays, index, rng, count=300):
-    """``(o, d, end)`` of rays through random texel centres, NumPy; not those at the table's edges."""
+    """Return ``(o, d, end)`` of rays through random texel centres away from the table's edges, NumPy."""
     light = rays.light(mi.UInt32(index), True)
     cells = [np.floor(rng.uniform(2, float(np.array(n).ravel()[0]) - 2, count)) for n in (light.columns,
                                                                                          rays.lines(light))]
@@ -82,13 +82,13 @@ def random_rays(rays, index, rng, count=300):
 @pytest.mark.parametrize("name", LIGHTS)
 def test_texel_centre_returns_its_own_ray(grid, network, reader, name, source, rng):
     """A point on a texel's ray sees that ray's own mixture, exactly."""
-    made = {"network": lambda: network_source(network, reader), "field": lambda: field_source(grid, reader),
-            "mixture": lambda: field_source(grid, reader, 2)}[source]()
-    tmap = TransmittanceMap(table(name), 32, grid.hull, made, mi)
+    fitted = {"network": lambda: network_source(network, reader), "field": lambda: field_source(grid, reader),
+              "mixture": lambda: field_source(grid, reader, 2)}[source]()
+    tmap = TransmittanceMap(table(name), 32, grid.hull, fitted, mi)
     o, d, end = random_rays(tmap.rays, 0, rng)
     where = np.minimum(rng.uniform(-0.4, 0.4, 300), end - 0.02)
     x = (o + (where - (o * d).sum(0)) * d).T
-    mix = made.fit(arrays(o.T), arrays(d.T), mi.Float(np.minimum(end, 1e30)))
+    mix = fitted.fit(arrays(o.T), arrays(d.T), mi.Float(np.minimum(end, 1e30)))
     mix = [[np.array(v, np.float64) for v in part] for part in mix]
     truth = np.minimum(mixture.transmittance(ops, where, mix), 1)
     # float32 texel coordinates: 1e-5 of a texel, times neighbours that differ by at most 1; slopes of a·1e-6.
@@ -101,11 +101,11 @@ def test_places_on_the_rays_around_a_point(grid, name, rng):
     rays = LightRays(table(name), grid.hull, 12, mi)
     x = rng.uniform(-0.25, 0.25, (500, 3))
     wi, distance = towards(x, name)
-    inside, _, found = rays.nearest(mi.UInt32(0), arrays(x), arrays(wi), mi.Float(distance), True)
+    inside, _, actual = rays.nearest(mi.UInt32(0), arrays(x), arrays(wi), mi.Float(distance), True)
     assert np.array(inside).all()
     o, d = (np.array([np.broadcast_to(np.array(c, np.float64), 144) for c in v]).T for v in rays.all_rays(0, 1)[1:3])
-    np.testing.assert_allclose(sum(np.array(weight) for weight, _, _ in found), 1, atol=1e-5)
-    for _, texel, t in found:
+    np.testing.assert_allclose(sum(np.array(weight) for weight, _, _ in actual), 1, atol=1e-5)
+    for _, texel, t in actual:
         start, along = o[np.array(texel)], d[np.array(texel)]
         truth = (start * along).sum(1) + ((x - start) * wi).sum(1) / (along * wi).sum(1)
         np.testing.assert_allclose(np.array(t), truth, atol=1e-5)
@@ -138,17 +138,17 @@ def test_field_source_matches_the_march(grid, reader, name, components, rng):
     truth = marched(grid, x, name)
     error = np.abs(look(tmap, x, name) - truth)
     # Grazing rays keep a plateau that no single logistic has; they are a few per cent.
-    share, rms = ((0.05, 0.06), (0.006, 0.02))[components - 1]
-    assert np.median(error) < 2e-3 and (error > 0.1).mean() < share and np.sqrt((error**2).mean()) < rms
+    fraction, rms = ((0.05, 0.06), (0.006, 0.02))[components - 1]
+    assert np.median(error) < 2e-3 and (error > 0.1).mean() < fraction and np.sqrt((error**2).mean()) < rms
     assert 0.05 < (truth < 0.5).mean() < 0.95
 
 
 @pytest.mark.parametrize("source", ["network", "mixture"])
 @pytest.mark.parametrize("name", LIGHTS)
 def test_transmittance_along_texel_rays(grid, network, reader, name, source, rng):
-    """In [0, 1], growing towards the light, 1 there."""
-    made = network_source(network, reader) if source == "network" else field_source(grid, reader, 2)
-    tmap = TransmittanceMap(table(name), 32, grid.hull, made, mi)
+    """τ lies in [0, 1], grows towards the light and is 1 there."""
+    fitted = network_source(network, reader) if source == "network" else field_source(grid, reader, 2)
+    tmap = TransmittanceMap(table(name), 32, grid.hull, fitted, mi)
     o, d, end = random_rays(tmap.rays, 0, rng, 100)
     far = np.minimum(end - 1e-3, 1.0)
     steps = np.linspace(-1, 1, 40)[:, None] * (far + 1) / 2 + (far - 1) / 2
@@ -172,7 +172,7 @@ def test_map_covers_every_point_with_density(grid, rng):
 
 
 def test_texels_are_square_and_no_more_than_asked_for(grid):
-    """A map of m × m texels on an oblong object has oblong texels, which waste half of them."""
+    """Texels are square also on an oblong object, where m × m texels would be oblong and half of them wasted."""
     tall = grid.hull * [0.3, 1.0, 0.3]
     for name in ("sun", "lamp", "far"):
         (row,) = frames(table(name), tall, 64)
@@ -184,7 +184,7 @@ def test_texels_are_square_and_no_more_than_asked_for(grid):
 
 
 def test_which_lights_look_everywhere(grid):
-    """A frustum where it covers the object, all directions where the light is near or within."""
+    """Lights have a frustum if it covers the object, and all directions if they are near or inside."""
     kinds = frames(table(*LIGHTS), grid.hull, 32)[:, KIND]
     np.testing.assert_array_equal(kinds, [DIRECTIONAL, FRUSTUM, FRUSTUM, FRUSTUM, SPHERE])
 
@@ -197,12 +197,12 @@ def test_outside_and_clear_rays_are_lit(grid, reader):
 
 
 def test_many_lights_each_get_their_own_map(grid, network, reader, rng):
-    """Light k of a table of many equals the same light alone, whatever stands beside it."""
-    made = network_source(network, reader)
-    together = TransmittanceMap(table(*LIGHTS), 24, grid.hull, made, mi)
+    """Light k of a table of many has the map of the same light alone."""
+    fitted = network_source(network, reader)
+    together = TransmittanceMap(table(*LIGHTS), 24, grid.hull, fitted, mi)
     x = rng.uniform(-0.4, 0.4, (100, 3))
     for k, name in enumerate(LIGHTS):
-        alone = TransmittanceMap(table(name), 24, grid.hull, made, mi)
+        alone = TransmittanceMap(table(name), 24, grid.hull, fitted, mi)
         np.testing.assert_allclose(look(together, x, name, k), look(alone, x, name), atol=1e-5)
 
 
@@ -227,7 +227,7 @@ def test_slanted_skin_stays_sharp(grid, slope, rng):
 
 @pytest.mark.parametrize("components", [1, 2])
 def test_light_deep_in_opaque_matter(components, rng):
-    """Where the network's own τ at the light has long underflowed: still 1 there, e^−(difference of depths) beyond as
+    """The network's τ at the light has underflowed; the map is still 1 there and e^−(difference of depths) beyond, as
     in one query a point, and no light that leaks out of the matter."""
     header, tensors = fields.blobs([(0, 0, 0)], [0.5], log_density=5.5, components=components)
     for name, values in tensors.items():
@@ -245,10 +245,10 @@ def test_light_deep_in_opaque_matter(components, rng):
     x = (o - distance * d).T
     wi, r = (where - x) / distance[:, None], mi.Float(distance)
     truth = np.array(RayNetwork(network, whole).tau(arrays(x), arrays(wi), r, mi.UInt32(0), True))
-    found = np.array(tmap.tau(arrays(x), arrays(wi), r, mi.UInt32(0), True))
+    actual = np.array(tmap.tau(arrays(x), arrays(wi), r, mi.UInt32(0), True))
     # Slopes of some hundred times float32's 1e-6; where S = e^−8 stands for an exponential, 3e-4 of it.
-    np.testing.assert_allclose(found, truth, atol=3e-3)
-    assert found[200:].max() < 1e-5 and 0.01 < truth[100:200].mean() < 0.99
+    np.testing.assert_allclose(actual, truth, atol=3e-3)
+    assert actual[200:].max() < 1e-5 and 0.01 < truth[100:200].mean() < 0.99
 
 
 ALONE = """
@@ -263,14 +263,15 @@ table = LightTable([[0.0, 1.0, 2.0]], np.ones((1, 3)), [True], 1.0, mi)
 
 @pytest.mark.parametrize("resolution", [5, 7, 9, 31])
 def test_tables_of_any_size(grid, resolution, rng):
-    """A number of texels that is no multiple of a processor's lanes: those past the end belong to no light, and must
-    not divide by what stands in memory behind the last one. Each light's texels are those of a map of its own."""
+    """The number of texels need not be a multiple of a processor's lanes.
+
+    Lanes past the end belong to no light and must not divide by the memory behind the last one."""
     program = f"{ALONE}\ndr.eval(LightRays(table, np.eye(3), {resolution}, mi).all_rays(0, 1)); dr.sync_thread()"
     subprocess.run([sys.executable, "-c", program, VARIANT], check=True)
     names = [n for n in LIGHTS if n != "inside"]
     several = LightRays(table(*names), grid.hull, resolution, mi)
-    found = [np.array(v) for v in several.all_rays(0, len(names))[2]]
+    actual = [np.array(v) for v in several.all_rays(0, len(names))[2]]
     for k, name in enumerate(names):
         alone = [np.array(v) for v in LightRays(table(name), grid.hull, resolution, mi).all_rays(0, 1)[2]]
         part = slice(k * resolution**2, (k + 1) * resolution**2)
-        np.testing.assert_allclose([v[part] for v in found], alone, atol=1e-6)
+        np.testing.assert_allclose([v[part] for v in actual], alone, atol=1e-6)

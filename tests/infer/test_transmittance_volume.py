@@ -72,7 +72,7 @@ def test_matter_that_reaches_the_hull(rng):
 
 
 def test_entries_fall_along_every_ray(lights):
-    """τ in [0, 1], from 1 at the light downwards."""
+    """τ lies in [0, 1] and falls from 1 at the light."""
     volume = TransmittanceVolume(lights, 32, DEPTHS, BALL, mi)
     values = np.array(volume.values).reshape(3, 32 * 32, DEPTHS)
     assert values.max() == 1 and values.min() > 0
@@ -83,7 +83,7 @@ def test_entries_fall_along_every_ray(lights):
 
 
 def test_volume_follows_the_march(lights, rng):
-    """Opaque blobs, points in the skin and in shadow."""
+    """Lookups at points in the skin and in the shadow of opaque blobs agree with marches."""
     grid = baked(NetworkField(*fields.blobs([(-0.3, 0, 0), (0.35, 0.2, 0.1)], [0.4, 0.25], log_density=4.5), mi),
                      96, mi)
     volume = TransmittanceVolume(lights, 128, 384, grid, mi)
@@ -98,7 +98,7 @@ def test_volume_follows_the_march(lights, rng):
 
 
 def test_culling_changes_no_entry(lights):
-    """Beyond e^−12, where the march of a ray ends."""
+    """Culling may change entries only beyond e^−12, where the march of a ray ends."""
     grid = baked(NetworkField(*fields.blobs([(-0.3, 0, 0), (0.35, 0.2, 0.1)], [0.4, 0.25], log_density=4.5), mi),
                      96, mi)
     culled, unculled = (np.array(TransmittanceVolume(lights, 32, DEPTHS, volume, mi).values)

@@ -1,4 +1,4 @@
-"""Two logistics through rays whose τ is known in closed form."""
+"""Two logistics through rays with τ in closed form."""
 
 import drjit as dr
 import mitsuba as mi
@@ -16,7 +16,7 @@ def even(t, depth):
 
 
 def fitted(depth, effort, far):
-    """As a function of t."""
+    """Return the fitted τ as a function of t."""
     places = [mi.Float(ENTER - d / depth * (ENTER - LEAVE)) for d in effort.depths]
     n, end = len(depth), mi.Float(depth)
     last, far = (dr.full(mi.Float, t, n) for t in (LEAVE, far))
@@ -31,15 +31,15 @@ def fitted(depth, effort, far):
 
 @pytest.mark.parametrize("far", [-0.32, -0.9])
 def test_even_smoke_and_what_it_keeps(variant, far):
-    """Its beginning and its end are corners, which no logistic has. The second start serves where it ends at the
-    sphere, and nothing is lost where it does not."""
+    """The smoke begins and ends at corners, which no logistic has. The second start helps if it ends at the
+    sphere, and does no harm if it does not."""
     depth, rms = np.linspace(0.3, 2.5, 23), []
     for effort in (two_logistics.FINE, two_logistics.SMOKE):
         tau = fitted(depth, effort, far)
-        off = np.stack([tau(t) - even(t, depth) for t in np.linspace(ENTER, LEAVE, 81)])
+        error = np.stack([tau(t) - even(t, depth) for t in np.linspace(ENTER, LEAVE, 81)])
         after = np.stack([tau(t) - np.exp(-depth) for t in np.linspace(LEAVE, far, 31)])
-        rms.append(np.sqrt((off**2).mean()))
-        print(f"inside mean {off.mean():+.4f}, RMS {rms[-1]:.4f}, behind {np.sqrt((after**2).mean()):.4f}")
-        assert abs(off.mean()) < 0.01 and rms[-1] < 0.035
+        rms.append(np.sqrt((error**2).mean()))
+        print(f"inside mean {error.mean():+.4f}, RMS {rms[-1]:.4f}, behind {np.sqrt((after**2).mean()):.4f}")
+        assert abs(error.mean()) < 0.01 and rms[-1] < 0.035
         assert np.sqrt((after**2).mean()) < 0.025
     assert rms[1] < (0.8 if far > -0.5 else 1.0) * rms[0]

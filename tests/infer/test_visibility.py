@@ -14,7 +14,7 @@ from mi_ntf.infer.visibility.visibility_mlp import VisibilityMLP
 
 
 def test_ray_network_is_a_transmittance(network, reader, rng):
-    """In [0, 1], growing towards the light; for a light inside the sphere 1 at the light."""
+    """τ lies in [0, 1], grows towards the light, and is 1 at a light inside the sphere."""
     visibility = RayNetwork(network, reader)
     o, d = rng.uniform(-0.3, 0.3, (200, 3)), rng.normal(size=(200, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
@@ -31,7 +31,7 @@ def test_ray_network_is_a_transmittance(network, reader, rng):
 
 
 def test_light_table_units():
-    """Irradiance I/r² in scene units; directional lights know no distance."""
+    """Irradiance is I/r² in scene units; directional lights have no distance."""
     lights = LightTable([[0, 0, 2.0], [0, 1, 0]], [[8, 4, 2], [1, 2, 3]], [True, False], 3.0, mi)
     light = lights.sample(mi.UInt32([0, 1]), arrays([[0, 0, 0.5], [0.1, 0.2, 0.3]]), True)
     np.testing.assert_allclose(np.array(light.wi).T, [[0, 0, 1], [0, 1, 0]], atol=1e-6)
@@ -53,7 +53,7 @@ def test_baseline_without_its_network_is_refused(network):
 
 
 class Slab:
-    """Stands in for a field: τ falls with the place along x and knows no distance."""
+    """Stand-in for a field: τ falls with the place along x, independently of the distance."""
 
     has_visibility = True
 
@@ -62,7 +62,7 @@ class Slab:
 
 
 def test_baseline_asks_where_the_ray_is_inside_the_sphere():
-    """From inside at the point itself, from before the sphere where the ray enters, from behind it not at all."""
+    """Points inside are queried in place, points before the sphere where the ray enters, points behind not at all."""
     visibility = VisibilityMLP(Slab())
     x = arrays([[0.2, 0.0, 0.0], [-3.0, 0.0, 0.0], [3.0, 0.0, 0.0], [0.0, 0.0, 2.0], [-3.0, 0.0, 0.0]])
     distance = mi.Float([np.inf, np.inf, np.inf, np.inf, 1.5])
@@ -71,13 +71,13 @@ def test_baseline_asks_where_the_ray_is_inside_the_sphere():
 
 
 def test_baseline_between_points_and_lights_that_touch_the_sphere(rng):
-    """Nothing is in the way, whatever rounding says."""
+    """Nothing is in the way, whatever the rounding."""
     on = rng.normal(size=(500, 3))
     on /= np.linalg.norm(on, axis=1, keepdims=True)
-    away = on + 0.3 * rng.normal(size=on.shape)
-    away /= np.linalg.norm(away, axis=1, keepdims=True)
-    below = VisibilityMLP(Slab()).tau(arrays(on), arrays(-away), mi.Float(np.inf), mi.UInt32(0), True)
+    outward = on + 0.3 * rng.normal(size=on.shape)
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    below = VisibilityMLP(Slab()).tau(arrays(on), arrays(-outward), mi.Float(np.inf), mi.UInt32(0), True)
     assert (np.array(below) < 1).all()
-    for x, d, distance in ((on, away, np.inf), (on + 0.5 * away, -away, 0.5)):
+    for x, d, distance in ((on, outward, np.inf), (on + 0.5 * outward, -outward, 0.5)):
         tau = VisibilityMLP(Slab()).tau(arrays(x), arrays(d), mi.Float(np.float32(distance)), mi.UInt32(0), True)
         np.testing.assert_array_equal(np.array(tau), 1)
