@@ -234,8 +234,8 @@ class Composition:
         """
         visibility = part.visibility(sampled)
         far = far and (sampled or REGISTRY[self.effects.visibility].per_field)  # a light's map needs its position
-        others = [FieldVisibility(p.frame, method) for p in self.parts
-                  if p is not part and (method := p.visibility(sampled))]
-        if visibility and (others or self.surfaces or far):
-            return Shadow(FieldVisibility(part.frame, visibility), others, self.surfaces, far)
+        other_fields = [FieldVisibility(p.frame, method) for p in self.parts
+                        if p is not part and (method := p.visibility(sampled))]
+        if visibility and (other_fields or self.surfaces or far):
+            return Shadow(FieldVisibility(part.frame, visibility), other_fields, self.surfaces, far)
         return visibility

@@ -215,7 +215,9 @@ def _eye(sensor: mi.Sensor) -> np.ndarray:
 
 
 def check_gradients(scene: mi.Scene, lights: Lights) -> bool:
-    """Return True if a parameter of `scene` carries gradients. Raises MiNtfError if its derivatives are not supported.
+    """Return True if a parameter of `scene` carries gradients.
+
+    Raises MiNtfError if derivatives by this parameter are not supported.
     """
     parameters = mi.traverse(scene)
     attached = [key for key, value in parameters if dr.grad_enabled(value)]

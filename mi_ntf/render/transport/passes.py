@@ -87,10 +87,10 @@ class Passes:
         elif self.limits.noise > 0:
             samples = min(samples, self.count)  # the other half
         if self.limits.seconds > 0:
-            left = self.limits.seconds - self.seconds
-            if left < max(self._each, REST * self.limits.seconds):
+            remaining = self.limits.seconds - self.seconds
+            if remaining < max(self._each, REST * self.limits.seconds):
                 return self._end("time")
-            samples = min(samples, max(1, int(PASS_FRACTION * left / self._each)))
+            samples = min(samples, max(1, int(PASS_FRACTION * remaining / self._each)))
         return samples if samples > 0 else self._end("samples")
 
     def _end(self, limit: str) -> int:

@@ -63,9 +63,9 @@ class Shadow:
     far  the light lies outside of the field's sphere, where the field needs no distance to it
     """
 
-    def __init__(self, field: FieldVisibility, others: Sequence[FieldVisibility], surfaces: Surfaces | None,
+    def __init__(self, field: FieldVisibility, other_fields: Sequence[FieldVisibility], surfaces: Surfaces | None,
                  far: bool = False) -> None:
-        self.field, self.others, self.surfaces, self.far = field, others, surfaces, far
+        self.field, self.other_fields, self.surfaces, self.far = field, other_fields, surfaces, far
 
     def tau(self, x: Vector, wi: Vector, distance: Float, index: UInt32, active: Mask,
             sun: Mask | None = None) -> Array:
@@ -74,7 +74,7 @@ class Shadow:
         tau = method.tau(x, wi, type(distance)(dr.inf) if self.far else distance, index, active, sun)
         p, d = frame.point_to_world(x), frame.direction_to_world(wi)
         length = distance * frame.length
-        for other in self.others:
+        for other in self.other_fields:
             tau = tau * transmittance_between(other, p, d, length, index, active & (tau != 0), sun)
         if self.surfaces:
             tau = tau * self.surfaces.transmission(p, d, length, active & (tau != 0))

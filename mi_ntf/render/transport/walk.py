@@ -57,11 +57,11 @@ def join(parts: Sequence[Paths]) -> Paths:
     if len(parts) == 1:
         return parts[0]
     ends = list(itertools.accumulate(dr.width(paths.pixel) for paths in parts))
-    whole = next(p for p in parts if dr.width(p.pixel)).take(dr.zeros(mi.UInt32, ends[-1]))
+    joined = next(p for p in parts if dr.width(p.pixel)).take(dr.zeros(mi.UInt32, ends[-1]))
     for paths, end in zip(parts, ends, strict=True):
         count = dr.width(paths.pixel)
-        whole.put(paths, dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, end - count))
-    return whole
+        joined.put(paths, dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, end - count))
+    return joined
 
 
 class Walk:
