@@ -163,9 +163,8 @@ def _oriented(photograph: _Turned, pose: bool, mask: bool | None, assumed: Assum
         return replace(photograph.view, orientation=photograph.orientation, upright=upright)
     if mask_upright is None:
         raise MiNtfError(f"{photograph.mask}: its photograph {image} has Exif orientation {photograph.orientation}, "
-                         "and nothing tells whether the mask is turned by that or lies as the pixels are stored; make "
-                         "it so that it lies as they are stored, and take the tag out with "
-                         f"`exiftool -Orientation= {image}`")
+                         "and nothing tells whether the mask is turned by that; turn it as the pixels are stored, "
+                         f"and take the tag out with `exiftool -Orientation= {image}`")
     assumed.add(f"masks are {'turned as' if mask_upright else 'as stored, not turned as'} the Exif orientation of "
                 "their photographs says", image)
     return replace(photograph.view, orientation=photograph.orientation, upright=upright, mask_upright=mask_upright)

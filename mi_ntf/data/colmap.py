@@ -78,7 +78,7 @@ def read(folder: Path) -> DataSet:
         points = _whole(place, read_points, assumed)
     else:
         points = None
-        assumed.append(f"{model} has no points3D, so points tell nothing of the object's place")
+        assumed.append(f"{model} has no points3D, so the object's place is not known from points")
     root = next((p for p in (folder, folder / "colmap", *list(folder.absolute().parents)[:3]) if (p / "images").is_dir()
                  ), None)
     if root is None:

@@ -81,20 +81,20 @@ def _page(folder: Path, described: DataSet, splits: Splits, rows: list[measures.
         page.warning(text)
     page.table(["", ""], summary(data))
     if data["said"]:
-        page.section("What was found and assumed")
+        page.section("Findings and assumptions")
         page.table([""], [[text] for text in data["said"]])
     page.section("Cameras")
     points = described.points
     points = None if points is None or not len(points) else points[:: -(-len(points) // POINTS)]
-    page.figure(inspect_figures.cameras(splits, points), "Cameras and where they look, around the object's "
+    page.figure(inspect_figures.cameras(splits, points), "Cameras and their view directions around the object's "
                 "sphere; lengths in its radii.")
     page.figure(inspect_figures.directions(splits, np.array(data["gap"]["direction"])),
-                "The sides the object was seen from. Dark: no camera for training is near.")
+                "Directions from the object. Dark: no camera for training is near.")
     turned, _ = assumptions.turn(described.views, False)
     page.section("Masks")
-    page.text("The line is the mask's outline; what is outside is dimmed and bluish"
-              + ("." if data["masked"] else ", what is not known is orange.")
-              + " The whole object should be inside and nothing else.")
+    page.text("The line is the mask's outline. Pixels outside it are dimmed and bluish"
+              + ("." if data["masked"] else ", unknown pixels are orange.")
+              + " The whole object should be inside, and nothing else.")
     page.pictures(_thumbnails(folder, {view.image: view for view in assumptions.every(turned)}, splits, rows), 250)
     page.section("Brightness")
     page.text("Mean of the object's pixels as apparent albedo, π L d²/I. Slow changes are the object's sides; jumps "

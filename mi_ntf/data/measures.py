@@ -235,12 +235,11 @@ def _of_masks(data: Numbers, rows: list[Photograph]) -> Iterator[str]:
     worst = max((row for row in rows if np.isfinite(row.uncovered)), key=lambda row: row.uncovered)
     if data["uncovered"]["median"] > 0.01:
         yield (f"{percent(data['uncovered']['median'])} of a silhouette (median; {worst.name}: "
-               f"{percent(worst.uncovered)}) lie outside of what the other photographs leave for the object; the "
-               "poses are inexact, or the masks unlike.")
+               f"{percent(worst.uncovered)}) lie outside the hull of the other photographs; the poses are inexact, or "
+               "the masks unlike.")
     elif worst.uncovered > 0.02:
-        yield (f"{percent(worst.uncovered)} of the silhouette in {worst.name} lies outside of what the other "
-               "photographs leave for the object; one of their masks is too small, this one too large, or a pose is "
-               "wrong.")
+        yield (f"{percent(worst.uncovered)} of the silhouette in {worst.name} lies outside the hull of the other "
+               "photographs; one of their masks is too small, this one too large, or a pose is wrong.")
 
 
 def percent(fraction: float | None) -> str:

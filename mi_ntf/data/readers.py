@@ -168,7 +168,7 @@ def find_form(folder: Path) -> tuple[Form, list[str]]:
                          "NRHints) nor transforms.json (nerfstudio) nor a COLMAP model (cameras and images, .bin or "
                          ".txt, in sparse/0, sparse or the folder itself) nor poses_bounds.npy (LLFF); "
                          f"make one with `mi-ntf capture SCENE.xml {folder}`")
-    return forms[0], [f"also in the folder, and left aside: {form.name}" for form in forms[1:]]
+    return forms[0], [f"also in the folder, and ignored: {form.name}" for form in forms[1:]]
 
 
 def _with_options(views: Views, masks: Path | None, flash_offset: Offset | None) -> Views:
@@ -213,8 +213,8 @@ def _say_pixels(stored: np.ndarray, size: int | None, black: bool, say: Say) -> 
     if black:
         empty, matter = (np.mean([np.mean(image[..., 3] == v) for image in stored])
                          for v in (0, stored.dtype.type(255 if stored.dtype == np.uint8 else 1)))
-        say(f"black background: of a photograph for training {empty:.0%} is known to be empty, {matter:.0%} lit; what "
-            "is between is learned. Everything that the flash lights is taken for the object")
+        say(f"black background: {empty:.0%} of the pixels for training are known to be empty, {matter:.0%} are lit; "
+            "training resolves the rest. Everything that the flash lights counts as the object")
 
 
 def _check_lights(views: list[View]) -> None:

@@ -96,7 +96,7 @@ def test_a_data_set_without_masks(tmp_path):
     split = splits["train"]
     assert not any(s.masked for s in splits.values()) and split.images.dtype == np.uint8
     assert messages[0].endswith("16 photographs, 160x160 pixels, black background")
-    assert any("is known to be empty" in s for s in messages)
+    assert any("are known to be empty" in s for s in messages)
     assert any("sphere is found from the lit regions' visual hull" in s for s in messages)
     for center, radius in forms.SPHERES:
         assert np.linalg.norm(center - split.center) + radius <= split.radius

@@ -85,7 +85,7 @@ def test_every_photograph_is_read(tmp_path, edit):
 
 
 @pytest.mark.parametrize(("edit", "text"), [
-    (lambda f: (f / "sparse/0/points3D.txt").unlink(), "assumed: .*sparse/0 has no points3D, so points tell nothing"),
+    (lambda f: (f / "sparse/0/points3D.txt").unlink(), "assumed: .*sparse/0 has no points3D, so the object's place"),
     (renamed("Größe.png", "latin-1"), "assumed: .*images.txt: is no UTF-8 and is read as Latin-1"),
     (lambda f: [Image.open(p).save(p.with_suffix(".tif")) or p.unlink() for p in (f / "images").iterdir()],
      r"assumed: a photograph that the data set calls .png is the .tif of the same name \(16 photographs, first"),

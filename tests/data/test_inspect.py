@@ -158,7 +158,7 @@ def test_masks_that_disagree():
     _, rows, warned = changed(images=images)
     assert 1 - (32 / 40) ** 2 < rows[4].uncovered < 1 - (20 / 40) ** 2
     assert max(row.uncovered for i, row in enumerate(rows) if i != 4) == 0
-    assert "% of the silhouette in 4.png lies outside of what the other photographs leave" in warned
+    assert "% of the silhouette in 4.png lies outside the hull of the other photographs" in warned
 
 
 def test_poses_that_disagree():

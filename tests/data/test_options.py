@@ -256,4 +256,4 @@ def test_a_folder_of_several_forms_says_so(tmp_path):
         path.unlink()
     messages = load(tmp_path)[1].split("\n")
     assert messages[0].startswith("COLMAP model in ")
-    assert messages[1] == "also in the folder, and left aside: LLFF data set (poses_bounds.npy)"
+    assert messages[1] == "also in the folder, and ignored: LLFF data set (poses_bounds.npy)"
