@@ -37,7 +37,7 @@ def test_one_sentence(error, text):
     assert sentence(error) == text
 
 
-def test_a_fault_that_names_its_cause_is_told_itself():
+def test_a_fault_that_names_its_cause_is_shown_itself():
     error = MiNtfError("a.exr: cannot be read")
     error.__cause__ = OSError("bad magic")
     assert root(wrapped(error)) is error

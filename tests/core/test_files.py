@@ -17,7 +17,7 @@ def names(folder):
     return sorted(p.name for p in folder.iterdir())
 
 
-def test_content_is_written_in_order_and_replaces_what_was_there(tmp_path):
+def test_content_is_written_in_order_and_replaces_the_old_file(tmp_path):
     path = tmp_path / "a[1] b.bin"
     path.write_text("before")
     files.write(path, "τ", b"\x00", memoryview(b"ab"))
@@ -27,7 +27,7 @@ def test_content_is_written_in_order_and_replaces_what_was_there(tmp_path):
 
 @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), RuntimeError("disk. full."), ValueError("x"),
                                    KeyboardInterrupt()], ids=lambda e: type(e).__name__)
-def test_a_failed_block_leaves_what_was_there(tmp_path, error):
+def test_a_failed_block_leaves_the_old_file(tmp_path, error):
     """Errors of the system and of libraries become one that names the file; other errors pass."""
     path = tmp_path / "f"
     path.write_text("before")
@@ -73,7 +73,7 @@ def test_places_that_cannot_be_written_to(tmp_path):
     assert names(tmp_path) == ["file"]
 
 
-def test_what_a_killed_writer_left_is_removed_and_a_living_ones_is_not(tmp_path):
+def test_only_files_of_killed_writers_are_removed(tmp_path):
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()
     mine, other = f"f.{platform.node()}-", "f.elsewhere-"

@@ -47,7 +47,7 @@ def _reflected(cos, roughness, n=400):
 
 
 @pytest.mark.parametrize("roughness", ROUGHNESS)
-def test_the_rims_share_is_what_it_reflects(roughness):
+def test_rim_reflectance_agrees_with_quadrature(roughness):
     """The fits of R and of its mean R̄ agree with quadrature."""
     grazing, mean = fresnel._rim(ops, roughness)
     for cos in (0.02, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0):

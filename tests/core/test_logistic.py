@@ -64,7 +64,7 @@ def test_through_quantiles_inverts_the_logistic(b, a):
 
 @pytest.mark.parametrize("cos", [1, 0.7, 0.5, 0.3, 0.2, 0.1, 0.05])
 @pytest.mark.parametrize("place", [lambda tau: -np.log(-np.log(tau)), np.log], ids=["rising skin", "constant skin"])
-def test_through_quantiles_is_right_on_the_mean_of_what_is_seen(place, cos):
+def test_through_quantiles_is_right_on_average_for_a_camera(place, cos):
     """Skin of a plane, seen at a cosine of 2/3: the optical depth towards the camera is drawn as free flight draws it,
     that towards the light is 2/(3 cos) times as much. One logistic is off by 0.03 where it passes its quartiles."""
     depth = -np.log((np.arange(20000) + 0.5) / 20000) * 2 / (3 * cos)

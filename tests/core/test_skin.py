@@ -34,7 +34,7 @@ def test_directions_along_the_skin(rng):
     np.testing.assert_allclose((d[0] * d[2]).sum(0), 0, atol=1e-14)  # a quarter turn
 
 
-def test_shares_and_softness():
+def test_squared_horizon_and_softness():
     """c₀² is the squared ratio of the depths, less the bias of a flat skin."""
     out, along, sigma = np.ones(3), np.array([5.0, 1e9, 0.5]), np.full(3, 100.0)
     flat = np.maximum(out / (skin.LENGTH * np.maximum(sigma, 1e-6)), 1 / skin.FLATTEST) ** 2

@@ -21,7 +21,7 @@ def test_faces_are_weighted_by_the_squares_of_the_normal():
     np.testing.assert_allclose(actual, exact, rtol=1e-5)
 
 
-def test_cells_are_trilinear_and_nothing_is_seen_of_other_faces():
+def test_cells_are_trilinear_and_faces_are_separate():
     """The values of one face grow along z: linear between the cells' middles, constant beyond the ends."""
     column = np.full((6, CELLS), -1)
     column[4] = np.arange(CELLS)  # +z

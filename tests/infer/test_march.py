@@ -253,7 +253,7 @@ def test_skipping_changes_no_flight(grid, rng):
     np.testing.assert_allclose(t[hit], all_t[hit], atol=1e-4)
 
 
-def test_shared_samples_are_fair(grid, rng, monkeypatch):
+def test_samples_of_several_portions_are_unbiased(grid, rng, monkeypatch):
     """The mean over many random numbers of sums over samples is that of finer portions.
 
     A ray has no more samples than portions of light."""
@@ -365,7 +365,7 @@ def test_rays_from_afar(slab, distance):
 
 
 @pytest.mark.parametrize(("begin", "now"), [(0.0, 1), (0.3, 1), (0.3, 2), (2.0, 5), (2.9, 7), (0.4, 0)])
-def test_shares_that_end_in_a_cell_are_represented_evenly(variant, begin, now):
+def test_portions_that_end_in_a_cell_are_represented_evenly(variant, begin, now):
     """Mean weight, place and squared place over `depth` are those of the light up to the last portion's end."""
     depth = (dr.arange(mi.Float, 1 << 16) + 0.5) / (1 << 16)
     early, rest, place = (np.array(v, np.float64) for v in march._closing(depth, mi.Float(begin), mi.Float(now)))
@@ -378,7 +378,7 @@ def test_shares_that_end_in_a_cell_are_represented_evenly(variant, begin, now):
     assert (place[rest > 0] >= begin - 1e-6).all() and (place[rest > 0] <= now + 1e-6).all()
 
 
-def test_no_ray_has_more_samples_than_shares(rng):
+def test_no_ray_has_more_samples_than_portions(rng):
     """Rounding may end the first cell before the ray begins; one sample too many would overwrite another ray's."""
     dense = baked(NetworkField(*fields.uniform(60.0), mi), 32, mi)
     o, d = rays(rng, 50_000)

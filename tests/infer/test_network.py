@@ -204,7 +204,7 @@ def test_voxels_hold_the_density_that_interpolates_it_and_the_reflectance_at_the
         np.testing.assert_allclose(np.array(a), np.array(b), atol=2e-4)
 
 
-def test_hulls_hold_what_voxels_reach(rng):
+def test_hulls_hold_all_interpolated_density(rng):
     """Along the axes exactly; along others to within what lies between the directions that are asked for, 4° apart:
     the sphere's 1 − cos 2°, a corner's more. A voxel fades out at its neighbours' centres."""
     n = 48

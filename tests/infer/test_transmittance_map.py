@@ -183,7 +183,7 @@ def test_texels_are_square_and_no_more_than_asked_for(grid):
         assert not 0.6 < columns / lines < 1.6
 
 
-def test_which_lights_look_everywhere(grid):
+def test_lights_near_the_object_look_everywhere(grid):
     """Lights have a frustum if it covers the object, and all directions if they are near or inside."""
     kinds = frames(table(*LIGHTS), grid.hull, 32)[:, KIND]
     np.testing.assert_array_equal(kinds, [DIRECTIONAL, FRUSTUM, FRUSTUM, FRUSTUM, SPHERE])

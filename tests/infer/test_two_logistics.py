@@ -30,7 +30,7 @@ def fitted(depth, effort, far):
 
 
 @pytest.mark.parametrize("far", [-0.32, -0.9])
-def test_even_smoke_and_what_it_keeps(variant, far):
+def test_even_smoke_and_its_remaining_light(variant, far):
     """The smoke begins and ends at corners, which no logistic has. The second start helps if it ends at the
     sphere, and does no harm if it does not."""
     depth, rms = np.linspace(0.3, 2.5, 23), []
