@@ -10,8 +10,8 @@ from mi_ntf.data.measures import Splits
 from mi_ntf.data.schema import Camera, Split, View
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from mpl_toolkits.mplot3d import Axes3D
 
 COLOURS = {"train": "#3b82e0", "val": "#e39b1a", "test": "#e0433a"}
 OUTLINE = (255, 0, 220)
@@ -64,14 +64,14 @@ def cameras(splits: Splits, points: np.ndarray | None) -> "Figure":
     return figure
 
 
-def _sphere(axes: "Axes3D") -> None:
+def _sphere(axes: "Axes") -> None:
     """Draw the unit sphere as a wire frame."""
-    turn, style = np.linspace(0, 2 * np.pi, 61), {"color": page.GREY, "alpha": 0.5, "linewidth": 0.5}
+    turn = np.linspace(0, 2 * np.pi, 61)
     x, y, zero = np.cos(turn), np.sin(turn), np.zeros(61)
-    for height in np.radians(np.arange(-60, 61, 30)):
-        axes.plot(np.cos(height) * x, np.cos(height) * y, zero + np.sin(height), **style)
-    for angle in np.radians(np.arange(0, 180, 30)):
-        axes.plot(x * np.cos(angle), x * np.sin(angle), y, **style)
+    circles = [(np.cos(h) * x, np.cos(h) * y, zero + np.sin(h)) for h in np.radians(np.arange(-60, 61, 30))]
+    circles += [(x * np.cos(angle), x * np.sin(angle), y) for angle in np.radians(np.arange(0, 180, 30))]
+    for circle in circles:
+        axes.plot(*circle, color=page.GREY, alpha=0.5, linewidth=0.5)
 
 
 def directions(splits: Splits, farthest: np.ndarray) -> "Figure":
