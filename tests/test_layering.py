@@ -55,18 +55,26 @@ ROOMS = ("log", "timing", "machine", "user_cache", "scene", "lights", "maps", "t
 """Of `render`: each may import those before it."""
 
 PACKAGE_OF = {"cv2": "opencv-python-headless", "drjit": "mitsuba", "flip_evaluator": "flip-evaluator",
-              "imageio_ffmpeg": "imageio-ffmpeg", "PIL": "pillow", "skimage": "scikit-image"}
+              "imageio_ffmpeg": "imageio-ffmpeg", "mpl_toolkits": "matplotlib", "PIL": "pillow", "skimage": "scikit-image"}
 """What brings a module of another name."""
 
 TOP_LEVEL_FORBIDDEN = TORCH
 """The same for the modules at the top of the package and in `commands`."""
 
 
-def imports_of(file: Path) -> set[str]:
-    """Dotted names that a file imports anywhere; relative imports made absolute."""
+class RunTime(ast.NodeTransformer):
+    """Leaves out what is imported for annotations alone."""
+
+    def visit_If(self, node: ast.If):
+        return None if ast.unparse(node.test) == "TYPE_CHECKING" else self.generic_visit(node)
+
+
+def imports_of(file: Path, annotations: bool = True) -> set[str]:
+    """Dotted names that a file imports anywhere, for annotations too; relative imports made absolute."""
     names = set()
     package = ("mi_ntf", *file.relative_to(PACKAGE).parent.parts)
-    for node in ast.walk(ast.parse(file.read_text())):
+    tree = ast.parse(file.read_text())
+    for node in ast.walk(tree if annotations else RunTime().visit(tree)):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -121,7 +129,7 @@ def test_no_module_imports_itself_by_way_of_others():
     graph = {}
     for file in FILES:
         name = ".".join(file.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__")
-        graph[name] = {module_of(other) for other in imports_of(file)} - {None, name}
+        graph[name] = {module_of(other) for other in imports_of(file, annotations=False)} - {None, name}
     try:
         graphlib.TopologicalSorter(graph).prepare()
         cycle = []
@@ -133,11 +141,11 @@ def test_no_module_imports_itself_by_way_of_others():
 def test_third_parties_are_declared_where_they_are_used_and_nowhere_else():
     project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text())["project"]
     kinds = {"": project["dependencies"], **project["optional-dependencies"]}
-    declared = {kind: {re.split("[=<>[]", name)[0].lower() for name in names} for kind, names in kinds.items()}
-    shipped = set().union(*(declared[kind] for kind in kinds if kind != "dev"))
+    declared = {kind: {re.split("[=<>[;]", name)[0].lower() for name in names} for kind, names in kinds.items()}
+    shipped = set().union(*(declared[kind] for kind in kinds if kind not in ("dev", "docs")))
     tops = {name.split(".")[0] for file in FILES for name in imports_of(file)} - {"mi_ntf"} - sys.stdlib_module_names
-    # tensorboard is used by way of torch.utils.tensorboard, bokeh by distributed.
-    assert {PACKAGE_OF.get(name, name.lower()) for name in tops} | {"tensorboard", "bokeh"} == shipped
+    # tensorboard is used by way of torch.utils.tensorboard, bokeh by distributed; the bridge includes nanobind's headers.
+    assert {PACKAGE_OF.get(name, name.lower()) for name in tops} | {"tensorboard", "bokeh", "nanobind"} == shipped
     for extra, modules in doctor.EXTRAS.items():
         assert {PACKAGE_OF.get(name, name.lower()) for name in modules} == declared[extra]
 

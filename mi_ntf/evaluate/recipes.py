@@ -1,15 +1,17 @@
 """Recipes that render a scene with other properties of its integrator: XML to paste, and a shell command."""
 
+import functools
 import re
 import shlex
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 from xml.etree import ElementTree
 from xml.sax.saxutils import quoteattr
 
 import mitsuba as mi
 
 from ..render.scene import changed
+from ..render.scene.settings import Settings
 
 Value: TypeAlias = bool | int | float | str
 Properties: TypeAlias = dict[str, Value]
@@ -20,9 +22,8 @@ _TAGS = {bool: "boolean", int: "integer", float: "float", str: "string"}
 
 def integrator_xml(plugin: str, properties: Properties) -> str:
     """Return the element ``<integrator>`` without the properties of ``nrf`` that have their default values."""
-    default = mi.load_dict({"type": plugin})
     lines = [f'    <{_TAGS[type(value)]} name="{name}" value={quoteattr(_text(value))}/>'
-             for name, value in properties.items() if plugin != "nrf" or value != getattr(default, name)]
+             for name, value in properties.items() if plugin != "nrf" or value != _default(name)]
     return "\n".join([f'<integrator type="{plugin}">', *lines, "</integrator>"]) + "\n"
 
 
@@ -46,14 +47,28 @@ def render_command(scene: Path, parameters: dict[str, str], properties: Properti
     element = ElementTree.parse(scene).getroot().find("integrator")
     texts = {} if element is None else {e.get("name", ""): e.get("value", "") for e in element}
     names = {name: text[1:] for name, text in texts.items() if re.fullmatch(r"\$\w+", text)}
-    written, default = _integrator(scene, parameters)[0], mi.load_dict({"type": "nrf"})
+    written, _ = _integrator(scene, parameters)
     known = parameters | {names[name]: _text(value) for name, value in properties.items()
-                          if name in names and written.get(name, getattr(default, name)) != value}
+                          if name in names and written.get(name, _default(name)) != value}
     for more, count in (({"spp": str(samples)}, samples), ({}, 0)):
         if _sets(scene, known | more, properties, count):
             defined = [word for name, value in (known | more).items() for word in ("-D", f"{name}={value}")]
             return shlex.join(["mi-ntf", "render", *defined, "-o", "picture.exr", str(scene)])
     return ""
+
+
+@functools.cache
+def _settings() -> Settings:
+    """Return the settings of an integrator ``nrf`` without properties."""
+    integrator: Any = mi.load_dict({"type": "nrf"})
+    settings: Settings = integrator.context.settings
+    return settings
+
+
+def _default(name: str) -> Value:
+    """Return the default value of a property of ``nrf``."""
+    value: Value = getattr(_settings(), name)
+    return value
 
 
 def _text(value: Value) -> str:
@@ -74,7 +89,6 @@ def _sets(scene: Path, parameters: dict[str, str], properties: Properties, sampl
         known, counts = _integrator(scene, parameters)
     except RuntimeError:  # the scene lacks a name
         return False
-    default = mi.load_dict({"type": "nrf"})
-    same = all(known.get(name, getattr(default, name)) == value for name, value in properties.items())
+    same = all(known.get(name, _default(name)) == value for name, value in properties.items())
     others = any(value for name, value in known.items() if name not in (*properties, "frames", "timeout"))
     return same and not others and (not samples or counts == [samples])

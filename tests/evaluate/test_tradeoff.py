@@ -191,7 +191,8 @@ def interrupting(monkeypatch, method: str):
     once, calls = measure.once, []
 
     def interrupted(*arguments):
-        calls.append(getattr(arguments[1], "visibility", ways.STOCK))
+        nrf = hasattr(arguments[1], "context")
+        calls.append(arguments[1].context.settings.visibility if nrf else ways.STOCK)
         if [method] == calls[-1:] and calls.count(method) == 1:
             try:
                 os.kill(os.getpid(), signal.SIGINT)

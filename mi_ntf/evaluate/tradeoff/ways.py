@@ -4,7 +4,7 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import mitsuba as mi
 
@@ -14,6 +14,7 @@ from ...render.lights import scene_lights
 from ...render.plugins.registration import load_scene
 from ...render.scene import changed
 from ...render.scene.media import find_media
+from ...render.scene.settings import Settings
 from ..recipes import Properties, Value
 
 if TYPE_CHECKING:
@@ -55,7 +56,8 @@ class Subject:
         if not self.path.is_file():
             raise MiNtfError(f"scene {path} does not exist; give the XML file of a scene with an nrf medium")
         scene = load_scene(self.path, self.parameters)
-        settings = scene.integrator().context.settings
+        integrator: Any = scene.integrator()
+        settings: Settings = integrator.context.settings
         self.media = find_media(scene)
         width, height = scene.sensors()[0].film().crop_size()
         self.size = int(width), int(height)
