@@ -24,25 +24,16 @@ _STEEP = 2.5
 
 
 def frame(ops: Ops, places: Sequence[Array], total: Array, h: Array) -> tuple[Array, Array, list[Array], list[Array]]:
-    """Return the ray's own frame of reference.
+    """Return ``(c, s, t, crossed)``: centre, width, places and for each level 1 if D reaches it, else 0.
 
     Parameters
     ----------
     places
-        For each level, where D passes it (arbitrary where it does not).
+        For each level, where D passes it (arbitrary where it does not); −1.2 h in `t` where it does not.
     total
         D at the far end: exact up to the last level, beyond that at least that level.
     h
         Half chord.
-
-    Returns
-    -------
-    c, s
-        Centre and width.
-    t
-        The places, −1.2 h where D does not reach the level.
-    crossed
-        For each level 1 if D reaches it, else 0.
     """
     reached = [total >= level for level in LEVELS]
     far = -logistic.MAX_CENTRE * h

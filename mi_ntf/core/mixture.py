@@ -39,13 +39,8 @@ def optical_depth(ops: Ops, t: Array, mixture: Mixture) -> Array:
 def from_outputs(ops: Ops, pairs: Sequence[tuple[Array, Array]], logits: Sequence[Array], h: Array) -> Mixture:
     """Return the mixture of network outputs, with τ(h) = 1 at the light-side end `h` of the chord.
 
-    Parameters
-    ----------
-    pairs
-        Slopes and centres of the logistics.
-    logits
-        Logits of the weights besides the first, which is 0. A single logistic has none, and stays as it is (the
-        paper's).
+    `pairs`: slopes and centres; `logits`: of the weights besides the first, which is 0. A single logistic has none, and
+    stays as it is (the paper's).
     """
     if not logits:
         return ((0 * h + 1, *pairs[0]),)

@@ -24,21 +24,11 @@ probability h² = 0.25 %."""
 
 
 def chord(ops: Ops, o: Vector, d: Vector) -> tuple[Array, tuple[Array, ...], Array]:
-    """Return the chord that the line through `o` along the unit vector `d` cuts from the unit sphere.
+    """Return ``(hit, m, h)`` of the chord that the line through `o` along the unit vector `d` cuts from the sphere.
 
-    Returns
-    -------
-    hit
-        True where the half chord is longer than ``MIN_HALF_CHORD``.
-    m
-        Midpoint of the chord.
-    h
-        Half chord, at least ``MIN_HALF_CHORD``, so that gradients are finite where `hit` is False.
-
-    Notes
-    -----
-    disc = b² − (|o|² − 1) with b = ⟨o, d⟩ loses all digits far from the sphere, so it is taken from the midpoint,
-    disc = 1 − |o − b d|².
+    `hit` is True where the half chord is longer than ``MIN_HALF_CHORD``; `h` is at least that, so that gradients are
+    finite elsewhere. disc = b² − (|o|² − 1) with b = ⟨o, d⟩ loses all digits far from the sphere, so it is taken from
+    the midpoint, disc = 1 − |o − b d|².
     """
     b = dot(o, d)
     m = tuple(oi - b * di for oi, di in zip(o, d, strict=True))

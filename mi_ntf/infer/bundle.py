@@ -61,25 +61,15 @@ def safe_inverse(d: Vector) -> tuple[Float, ...]:
 
 @dataclass(frozen=True)
 class Strand:
-    """A ray in the coordinates of one field that it may cross.
-
-    Parameters
-    ----------
-    volume
-        Density of the field.
-    o, d
-        Origin and unit direction, field coordinates.
-    step
-        Length of the march's cells, field units.
-    rate
-        Field units per unit of the ray's parameter t; None: t is in these field units (a ray of one strand).
-    """
+    """A ray of origin `o` and unit direction `d` in the coordinates of one field that it may cross."""
 
     volume: Density
     o: Vector
     d: Vector
     step: Float
+    """Length of the march's cells, field units."""
     rate: Float | None = None
+    """Field units per unit of the ray's parameter t; None: t is in these field units (a ray of one strand)."""
 
 
 class Bundle:
@@ -196,28 +186,18 @@ class Bundle:
 
 @dataclass
 class Cell:
-    """A cell of a ray in PIECES of equal length, with densities that are exponentials across each.
-
-    Parameters
-    ----------
-    begin, part
-        Place of the begin; length of a piece.
-    sigmas
-        For each piece the mean density of each field.
-    bends
-        For each piece the logarithm of the total density at its end over that at its begin.
-    skip
-        Distance from the begin that the ray is clear of all matter.
-    after
-        ln σ of each field at the end.
-    """
+    """A cell of a ray in PIECES of equal length `part`, with densities that are exponentials across each."""
 
     begin: Float
     part: Float
     sigmas: tuple[tuple[Float, ...], ...]
+    """Mean density of each field, for each piece."""
     bends: tuple[Float, ...]
+    """Logarithm of the total density at the end of each piece over that at its begin."""
     skip: Float
+    """Distance from the begin that the ray is clear of all matter."""
     after: tuple[Float, ...]
+    """ln σ of each field at the end."""
 
     @property
     def totals(self) -> list[Float]:

@@ -15,24 +15,16 @@ from .types import Float, Mask, UInt32, Vector
 
 @dataclass(frozen=True)
 class LightSample:
-    """A light seen from a point.
-
-    Parameters
-    ----------
-    wi
-        Unit vector towards the light, field coordinates.
-    irradiance
-        Irradiance of a surface that faces the light, linear RGB.
-    distance
-        Distance of the light in field units, literally infinite where all lights are directional.
-    sun
-        True for sampled lights whose shadow is marched; None for rows of a table.
-    """
+    """A light seen from a point."""
 
     wi: Vector
+    """Unit vector towards the light, field coordinates."""
     irradiance: Vector
+    """Irradiance of a surface that faces the light, linear RGB."""
     distance: Float
+    """Distance of the light in field units, literally infinite where all lights are directional."""
     sun: Mask | None = None
+    """True for sampled lights whose shadow is marched; None for rows of a table."""
 
 
 class LightSource(Protocol):

@@ -204,22 +204,18 @@ def _compact(count: UInt32, start: UInt32, total: int, samples: list[Float]) -> 
 
 @dataclass
 class _Here:
-    """A cell on a march.
+    """A cell on a march."""
 
-    t              begin of the cell in its lattice
-    number         number of the cell, counted from the begin of the lattice in cells of this length
-    transmittance  of the view up to the cell
-    alpha          fraction of it that the cell absorbs
-    weight         light that the cell absorbs
-    parts          the same for each field
-    """
-
-    t: Float
     number: UInt32
+    """Number of the cell, counted from the begin of the lattice in cells of this length."""
     transmittance: Float
+    """Transmittance of the view up to the cell."""
     alpha: Float
+    """Fraction of it that the cell absorbs."""
     weight: Float
+    """Light that the cell absorbs."""
     parts: tuple[Float, ...]
+    """The same for each field."""
     cell: Cell
 
     def quantile(self, light: Float) -> Float:
@@ -247,7 +243,7 @@ def _walk(bundle: Bundle, emit: Callable[[Mask, Mask, _Here, State], State], sta
         w = transmittance * alpha
         parts = (w,) if bundle.single else tuple(transmittance * fraction for fraction in cell.absorbed())
         number = uint((t - bundle.begin) * dr.rcp(step) + 0.5)
-        here = _Here(t, number, transmittance, alpha, w, parts, cell)
+        here = _Here(number, transmittance, alpha, w, parts, cell)
         transmittance = dr.select(active, transmittance - w, transmittance)
         t = t + onward(cell.skip, step, 0)
         onwards = active & (t < bundle.end) & (transmittance > MIN_TRANSMITTANCE)
@@ -270,25 +266,11 @@ def _absorbed(depth: Float) -> Float:
 
 def free_flight(strands: Sequence[Strand], maxt: Float, offset: Float,
                 depths: Sequence[Float]) -> tuple[Mask, Float, UInt32]:
-    """Return ``(hit, t, index)`` of the first field that stops each ray.
+    """Return ``(hit, t, index)`` of the strand that stops each ray first.
 
-    Parameters
-    ----------
-    depths
-        Optical depth at which each field stops a ray, one array a strand; for free flight −ln(1 − u) with an
-        independent u. The first of these ends is distributed as in the sum of all densities. Densities are exponential
-        across the pieces of cells.
-    strands, maxt, offset
-        As in :func:`camera_samples`.
-
-    Returns
-    -------
-    hit
-        True where the ray ends before `maxt`.
-    t
-        Distance from the ray's origin, `maxt` if it does not end.
-    index
-        Index of the strand.
+    `depths`: optical depth at which each field stops a ray, one array a strand; for free flight −ln(1 − u) with an
+    independent u. The first of these ends is distributed as in the sum of all densities. `hit`: the ray ends before
+    `maxt`; `t`: distance from its origin, `maxt` if it does not end. Other arguments as in :func:`camera_samples`.
     """
     end: Float = maxt
     hit: Mask = False

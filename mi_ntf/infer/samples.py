@@ -11,32 +11,23 @@ from .types import Array, Float, Mask, UInt32, Vector
 
 @dataclass(frozen=True)
 class Samples:
-    """Shading points of camera rays, those of one ray side by side, from the camera on.
-
-    Parameters
-    ----------
-    ray
-        Index of each point's ray.
-    t
-        Place of each point, from the begin of its `bundle`.
-    weights
-        Weight of each point in each field, one array a field; their sum is w.
-    view
-        Transmittance from the camera to each point, or None.
-    transmittance
-        Of each whole ray.
-    first, count
-        Index of the first point of each ray, and number of its points.
-    """
+    """Shading points of camera rays, those of one ray side by side, from the camera on."""
 
     bundle: Bundle
     ray: UInt32
+    """Index of each point's ray."""
     t: Float
+    """Place of each point, from the begin of its `bundle`."""
     weights: tuple[Float, ...]
+    """Weight of each point in each field, one array a field; their sum is w."""
     view: Float | None
+    """Transmittance from the camera to each point, or None."""
     transmittance: Float
+    """Transmittance of each whole ray."""
     first: UInt32
+    """Index of the first point of each ray."""
     count: UInt32
+    """Number of points of each ray."""
 
     def line(self, i: int, ray: UInt32) -> tuple[Vector, Vector]:
         """Return origins and directions of the rays `ray` in the coordinates of field `i`."""
@@ -81,14 +72,9 @@ class Samples:
         return result
 
     def draw(self, u: Float) -> tuple[Float, UInt32, Float]:
-        """Sample one point of each ray by its weight; `u`: uniform in [0, 1).
+        """Sample one point of each ray by its weight, with `u` uniform in [0, 1): return ``(t, strand, weight)``.
 
-        Returns
-        -------
-        t, strand
-            Place of the point, and index of its field.
-        weight
-            Sum of the weights of all points of the ray, 0 where there is none.
+        `weight`: sum of the weights of all points of the ray, 0 where there is none.
         """
         uint, count, n = type(self.count), self.count, dr.width(self.count)
         t, strand = dr.zeros(type(self.t), n), dr.zeros(uint, n)

@@ -23,20 +23,10 @@ DEEP = 8.0
 
 @dataclass(frozen=True)
 class Source:
-    """Source of mixtures.
-
-    Parameters
-    ----------
-    fit
-        ``(o, d, end)`` → mixtures of the rays through `o` along `d` towards a light at t' = `end`, or beyond the sphere
-        (infinity for directional lights).
-    components
-        Number of logistics.
-    weights
-        False for one logistic of weight 1.
-    """
+    """Source of mixtures of `components` logistics; `weights`: False for one logistic of weight 1."""
 
     fit: Callable[[Vector, Vector, Float], Mixture]
+    """``(o, d, end)`` → mixtures of the rays through `o` along `d` towards a light at t' = `end`, maybe infinity."""
     components: int
     weights: bool
 

@@ -33,68 +33,46 @@ def resolution_for(lights: int, voxels: int) -> int:
 
 @dataclass(frozen=True)
 class Options:
-    """Options of a visibility method.
-
-    Parameters
-    ----------
-    step
-        Length of the camera march's cells, field units.
-    map_resolution
-        Texels along a map's side.
-    map_source
-        ``field`` or ``network``.
-    map_components
-        Logistics per texel that are fitted to the field's march, 1 or 2; the network has its own number.
-    half
-        Store half precision.
-    map_memory
-        Largest size of the maps or volumes of one run of lights, MiB.
-    map_file
-        EXR of `mi-ntf bake` that holds the maps, or "".
-    cache
-        Keep maps for the next frame and on disk (:mod:`mi_ntf.render.maps.map_cache`).
-    """
+    """Options of a visibility method."""
 
     step: float
+    """Length of the camera march's cells, field units."""
     map_resolution: int = MIN_MAP_RESOLUTION
+    """Texels along a map's side."""
     map_source: str = "field"
+    """``field`` or ``network``."""
     map_components: int = 1
+    """Logistics per texel that are fitted to the field's march, 1 or 2; the network has its own number."""
     half: bool = False
+    """Store half precision."""
     map_memory: float = 1024.0
+    """Largest size of the maps or volumes of one run of lights, MiB."""
     map_file: str = ""
+    """EXR of `mi-ntf bake` that holds the maps; empty: none."""
     cache: bool = False
+    """Keep maps for the next frame and on disk (:mod:`mi_ntf.render.maps.map_cache`)."""
 
 
 class Field(Protocol):
-    """A field file in both representations, with the softness of its skins."""
+    """A field file as its networks and as voxels, with the softness of its skins."""
 
     @property
-    def header(self) -> Header:
-        """Header of the file."""
-
+    def header(self) -> Header: ...  # noqa: D102
     @property
-    def network(self) -> NetworkField:
-        """The networks."""
-
+    def network(self) -> NetworkField: ...  # noqa: D102
     @property
-    def grid(self) -> GridField:
-        """The baked voxels."""
-
+    def grid(self) -> GridField: ...  # noqa: D102
     @property
-    def softness(self) -> Softness:
-        """Softness of the skins."""
+    def softness(self) -> Softness: ...  # noqa: D102
 
 
 class Medium(Protocol):
-    """A field in a scene."""
+    """A field in a scene; `source`: its voxels or its networks, whichever the medium uses."""
 
     @property
-    def field(self) -> Field:
-        """The field."""
-
+    def field(self) -> Field: ...  # noqa: D102
     @property
-    def source(self) -> Density:
-        """Density of the voxels or of the networks, as the medium was told."""
+    def source(self) -> Density: ...  # noqa: D102
 
 
 class Keep(Protocol):
@@ -134,49 +112,31 @@ class Build(Protocol):
 
 @dataclass(frozen=True)
 class Method:
-    """A visibility method.
-
-    Parameters
-    ----------
-    name
-        Value of the property `visibility`.
-    summary
-        One sentence for users.
-    build
-        See :class:`Build`.
-    rays
-        ``(lights, resolution)`` → number of rays, each marched or queried once, that fill the tables of a field;
-        `lights` of the light table, `resolution` texels along a side of their maps.
-    numbers
-        ``(medium, table, options)`` → float32 numbers for each of the squared ``map_resolution`` rays of a light.
-    per_field
-        `rays` and `numbers` count all tables of a field, independently of the lights.
-    dials
-        Properties of the integrator that the method reads.
-    resolution
-        ``(lights, voxels)`` → default number of texels along a side.
-    sampled
-        Name of the method that serves sampled lights and all other rays; "": itself.
-    derivatives
-        Derivatives by the places of lights are supported.
-    automatic
-        ``auto`` may choose the method under a limit.
-    needs
-        ``(medium)`` → True if the method can serve the field.
-    """
+    """A visibility method."""
 
     name: str
+    """Value of the property `visibility`."""
     summary: str
+    """One sentence for users."""
     build: Build
     rays: Callable[[int, int], int] = lambda lights, resolution: 0
+    """``(lights, resolution)`` → number of rays, each marched or queried once, that fill the tables of a field."""
     numbers: Callable[[Medium, LightTable, Options], int] | None = None
+    """``(medium, table, options)`` → float32 numbers for each of the squared ``map_resolution`` rays of a light."""
     per_field: bool = False
+    """`rays` and `numbers` count all tables of a field, independently of the lights."""
     dials: tuple[str, ...] = ()
+    """Properties of the integrator that the method reads."""
     resolution: Callable[[int, int], int] = resolution_for
+    """``(lights, voxels)`` → default number of texels along a side."""
     sampled: str = ""
+    """Name of the method that serves sampled lights and all other rays; empty: itself."""
     derivatives: bool = False
+    """Derivatives by the places of lights are supported."""
     automatic: bool = False
+    """``auto`` may choose the method under a limit."""
     needs: Callable[[Medium], bool] = lambda medium: True
+    """Return True if the method can serve the field."""
 
     @property
     def for_sampled(self) -> str:
