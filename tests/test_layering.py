@@ -55,7 +55,8 @@ ROOMS = ("log", "timing", "machine", "user_cache", "scene", "lights", "maps", "t
 """Of `render`: each may import those before it."""
 
 PACKAGE_OF = {"cv2": "opencv-python-headless", "drjit": "mitsuba", "flip_evaluator": "flip-evaluator",
-              "imageio_ffmpeg": "imageio-ffmpeg", "mpl_toolkits": "matplotlib", "PIL": "pillow", "skimage": "scikit-image"}
+              "imageio_ffmpeg": "imageio-ffmpeg", "mpl_toolkits": "matplotlib", "PIL": "pillow",
+              "skimage": "scikit-image"}
 """What brings a module of another name."""
 
 TOP_LEVEL_FORBIDDEN = TORCH
@@ -144,7 +145,7 @@ def test_third_parties_are_declared_where_they_are_used_and_nowhere_else():
     declared = {kind: {re.split("[=<>[;]", name)[0].lower() for name in names} for kind, names in kinds.items()}
     shipped = set().union(*(declared[kind] for kind in kinds if kind not in ("dev", "docs")))
     tops = {name.split(".")[0] for file in FILES for name in imports_of(file)} - {"mi_ntf"} - sys.stdlib_module_names
-    # tensorboard is used by way of torch.utils.tensorboard, bokeh by distributed; the bridge includes nanobind's headers.
+    # tensorboard is used by way of torch.utils.tensorboard, bokeh by distributed, nanobind's headers by the bridge.
     assert {PACKAGE_OF.get(name, name.lower()) for name in tops} | {"tensorboard", "bokeh", "nanobind"} == shipped
     for extra, modules in doctor.EXTRAS.items():
         assert {PACKAGE_OF.get(name, name.lower()) for name in modules} == declared[extra]
