@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from .core.errors import MiNtfError
 from .core.variants import VARIANTS
-from .infer.visibility.raymarch import RayMarch, default_steps
+from .infer.visibility.raymarch import RayMarch
 from .render import register
 from .render.maps import map_cache
 from .render.scene import loaded
@@ -91,7 +91,7 @@ class Field:
         return _like(points, sigma)
 
     def transmittance(self, origins: ArrayLike, directions: ArrayLike, distance: ArrayLike = np.inf) -> Array:
-        """Return the transmittance of rays, exp(−∫ σ dt), by a march in steps of half a voxel or less.
+        """Return the transmittance of rays, exp(−∫ σ dt), by a march in steps of an eighth of a voxel.
 
         Parameters
         ----------
@@ -108,7 +108,8 @@ class Field:
         start, direction = _vectors(origins), dr.normalize(_vectors(directions))
         width = max(dr.width(start), dr.width(direction))
         length = mi.Float(distance) / self._frame.length
-        march = RayMarch(self._grid, default_steps(1 / self._grid.resolution))
+        step = 0.25 / self._grid.resolution
+        march = RayMarch(self._grid, (step, step, 0.0))
         tau = march.tau(self._frame.point_to_field(start), self._frame.direction_to_field(direction), length, None,
                         dr.full(mi.Bool, True, width))
         return _like(origins, tau)

@@ -65,9 +65,9 @@ def test_transmittance_is_the_integral_of_the_density(field):
     depth = np.array([field.density(x + t[:, None] * d).sum() * length / 4000
                       for x, d in zip(start, unit, strict=True)])
     tau = field.transmittance(start, direction, length)
-    # A march in steps of a third of a voxel and more, whose nodes lie a little before the middle.
-    np.testing.assert_allclose(tau, np.exp(-depth), atol=0.05)
-    assert np.abs(tau - np.exp(-depth)).mean() < 2e-3 and (tau < 0.5).any() and (tau > 0.99).any()
+    # The rule of the midpoint, where coarse voxels let the density rise by orders of magnitude: 0.013 was measured.
+    np.testing.assert_allclose(tau, np.exp(-depth), atol=0.02)
+    assert np.abs(tau - np.exp(-depth)).mean() < 1e-3 and (tau < 0.5).any() and (tau > 0.99).any()
 
 
 def test_arrays_of_drjit_give_arrays_of_drjit(field):
