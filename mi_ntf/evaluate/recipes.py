@@ -11,7 +11,6 @@ from xml.sax.saxutils import quoteattr
 import mitsuba as mi
 
 from ..render.scene import changed
-from ..render.scene.settings import Settings
 
 Value: TypeAlias = bool | int | float | str
 Properties: TypeAlias = dict[str, Value]
@@ -58,16 +57,10 @@ def render_command(scene: Path, parameters: dict[str, str], properties: Properti
 
 
 @functools.cache
-def _settings() -> Settings:
-    """Return the settings of an integrator ``nrf`` without properties."""
-    integrator: Any = mi.load_dict({"type": "nrf"})
-    settings: Settings = integrator.context.settings
-    return settings
-
-
 def _default(name: str) -> Value:
     """Return the default value of a property of ``nrf``."""
-    value: Value = getattr(_settings(), name)
+    integrator: Any = mi.load_dict({"type": "nrf"})
+    value: Value = getattr(integrator.context.settings, name)
     return value
 
 
