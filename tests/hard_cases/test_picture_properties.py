@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mi_ntf.core import field_file
-from mi_ntf.infer.visibility import transmittance_atlas
+from mi_ntf.infer import tuning
 
 METHODS = {name: {"visibility": method, **options} for name, (method, options) in random_fields.METHODS.items()}
 every_method = pytest.mark.parametrize("name", METHODS)
@@ -19,8 +19,8 @@ tied = pytest.mark.parametrize("name", [n for n in METHODS if n != "visibility_m
 def small_atlas():
     """Two million rays take seconds, and here each picture has its own."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(transmittance_atlas, "SIDE", 16)
-        patch.setattr(transmittance_atlas, "RESOLUTION", 24)
+        patch.setattr(tuning, "ATLAS_SIDE", 16)
+        patch.setattr(tuning, "ATLAS_RESOLUTION", 24)
         yield
 
 

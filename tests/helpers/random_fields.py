@@ -18,11 +18,11 @@ from helpers.jit import arrays
 from helpers.volumes import Formula
 from mi_ntf.core import ops
 from mi_ntf.infer import ops as infer_ops
+from mi_ntf.infer import tuning
 from mi_ntf.infer.grid import baked
 from mi_ntf.infer.lights import LightTable
 from mi_ntf.infer.network import NetworkField
 from mi_ntf.infer.skin import measured
-from mi_ntf.infer.visibility import transmittance_atlas
 from mi_ntf.render.maps import building
 
 METHODS = {
@@ -182,8 +182,8 @@ def build(name: str, medium, table: LightTable, resolution: int = RESOLUTION, st
     """The method `name` of METHODS; None for ``none``."""
     method, extra = METHODS[name]
     with pytest.MonkeyPatch.context() as patch:  # an atlas of two million rays takes seconds
-        patch.setattr(transmittance_atlas, "SIDE", 8)
-        patch.setattr(transmittance_atlas, "RESOLUTION", 16)
+        patch.setattr(tuning, "ATLAS_SIDE", 8)
+        patch.setattr(tuning, "ATLAS_RESOLUTION", 16)
         return building.build(method, medium, table, building.Options(step, map_resolution=resolution, **extra))
 
 

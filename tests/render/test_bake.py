@@ -12,8 +12,8 @@ from helpers import scenes
 
 from mi_ntf import cli
 from mi_ntf.core.errors import MiNtfError
+from mi_ntf.infer import tuning
 from mi_ntf.infer.lights import LightTable
-from mi_ntf.infer.visibility import transmittance_atlas
 from mi_ntf.render import user_cache
 from mi_ntf.render.commands.bake import bake
 from mi_ntf.render.lights import scene_lights as lights_module
@@ -69,8 +69,8 @@ def test_file_gives_the_same_map(medium, tmp_path, options):
 @pytest.mark.parametrize("method", ["transmittance_atlas", "neural_transmittance"])
 def test_an_atlas_is_baked_and_read(path, medium, tmp_path, method, monkeypatch):
     """By the command, from a scene that names the method: the same bits; not as a map of lights, nor as the other."""
-    monkeypatch.setattr(transmittance_atlas, "SIDE", 4)
-    monkeypatch.setattr(transmittance_atlas, "RESOLUTION", 12)
+    monkeypatch.setattr(tuning, "ATLAS_SIDE", 4)
+    monkeypatch.setattr(tuning, "ATLAS_RESOLUTION", 12)
     similar = scenes.SIMILARITY
     scene = tmp_path / "scene.xml"
     scene.write_text(f"""<scene version="3.9.0"><default name="visibility" value="auto"/>

@@ -26,7 +26,7 @@ def renders(field, integrator, lights, spp, shapes=None, size=16):
 
 
 @pytest.mark.parametrize("shapes", [None, {"floor": FLOOR}], ids=["alone", "floor"])
-def test_drawn_lights_under_mis_compensation(blobs, shapes):
+def test_sampled_lights_under_mis_compensation(blobs, shapes):
     """The light below the mean, which Mitsuba then leaves to BSDF samples, reaches fields all the same."""
     integrator = scenes.nrf(light_samples=4, samples=128)
     pictures = [renders(blobs, integrator, {"sky": sky(mis_compensation=on)}, 32, shapes) for on in (True, False)]

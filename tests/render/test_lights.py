@@ -94,7 +94,7 @@ SEED = 2654435769
 """As renders have it, a hash: the draws of small consecutive seeds are alike (Mitsuba's TEA has four rounds)."""
 
 
-def drawn(emitters: list, at, count: int, candidates: int = emitter_samples.CANDIDATES):
+def sampled(emitters: list, at, count: int, candidates: int = emitter_samples.CANDIDATES):
     with mock.patch.object(emitter_samples, "CANDIDATES", candidates):
         return emitter_samples.EmitterSamples(
             emitters, [1.0] * len(emitters), identity(), at, dr.opaque(mi.UInt32, SEED), count)
@@ -112,7 +112,7 @@ def test_resampled_lights_are_unbiased_and_quieter(kinds, rng):
     for candidates in (8, 2, 1):
         rng.bit_generator.state = state
         at = points(n, copies, rng)
-        values = np.array(shade.reflect(at, drawn(made, at, 2, candidates), None)).reshape(3, copies, n)
+        values = np.array(shade.reflect(at, sampled(made, at, 2, candidates), None)).reshape(3, copies, n)
         deviation = values.std(axis=1)
         z = (values.mean(axis=1) - truth) / (deviation / copies**0.5 + 2e-3 * truth.mean())  # rows are not points
         assert np.abs(z).max() < 4.5 and np.abs(z.mean()) < 0.5, candidates
@@ -122,7 +122,7 @@ def test_resampled_lights_are_unbiased_and_quieter(kinds, rng):
 
 
 @pytest.mark.parametrize("candidates", [1, 4])
-def test_drawn_suns_are_told(candidates, rng):
+def test_sampled_suns_are_marked(candidates, rng):
     """Directions on the disc of the sun are, no others; nor those of a sky without one; a directional light beside it
     is, on its own it is not."""
     plain, lamp = (mi.load_dict(emitter(kind)) for kind in ("envmap", "directional"))
@@ -130,16 +130,16 @@ def test_drawn_suns_are_told(candidates, rng):
     n, index, axis = 4096, dr.zeros(mi.UInt32, 4096), np.array([0.6, 0.5, 0.7]) / np.sqrt(1.1)
     at = points(1, n, rng)
 
-    def told(emitters):
-        light = drawn(emitters, at, 1, candidates).sample(index, at.x, mi.Bool(True))
+    def marked(emitters):
+        light = sampled(emitters, at, 1, candidates).sample(index, at.x, mi.Bool(True))
         return np.array(light.wi), np.broadcast_to(np.array(light.sun), n)
 
-    wi, sun = told([sky])
+    wi, sun = marked([sky])
     np.testing.assert_array_equal(sun, np.degrees(np.arccos(np.minimum(axis @ wi, 1))) < 0.27)
     assert 0.2 < sun.mean() < 0.99
-    assert not told([plain])[1].any() and not told([lamp])[1].any()
-    wi, sun = told([plain, lamp])
-    way = np.array(drawn([lamp], at, 1, 1).sample(index, at.x, mi.Bool(True)).wi)[:, :1]
+    assert not marked([plain])[1].any() and not marked([lamp])[1].any()
+    wi, sun = marked([plain, lamp])
+    way = np.array(sampled([lamp], at, 1, 1).sample(index, at.x, mi.Bool(True)).wi)[:, :1]
     np.testing.assert_array_equal(sun, np.abs(wi - way).max(0) < 1e-6)
 
 
@@ -148,9 +148,9 @@ def test_lamps_outside_of_a_field_are_known(where, far, rng):
     """A ball of radius 0.3 outside of the unit sphere, across it and inside: alone and beside an environment."""
     lamp = mi.load_dict({"type": "sphere", "center": where, "radius": 0.3, "light": {"type": "area"}})
     lamps, at = [lamp.emitter()], points(1, 1, rng)
-    assert drawn(lamps, at, 1).far is far
-    assert drawn([*lamps, mi.load_dict(emitter("constant"))], at, 1).far is far
-    assert not drawn([mi.load_dict(emitter("spot"))], at, 1).far  # places of others are not known
+    assert sampled(lamps, at, 1).far is far
+    assert sampled([*lamps, mi.load_dict(emitter("constant"))], at, 1).far is far
+    assert not sampled([mi.load_dict(emitter("spot"))], at, 1).far  # places of others are not known
 
 
 def test_directions_of_any_length_are_unit_vectors():

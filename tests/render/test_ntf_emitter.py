@@ -8,7 +8,8 @@ from helpers import scenes, ztest
 from helpers.derivatives import backward, differences, forward
 
 from mi_ntf.core.errors import MiNtfError, root
-from mi_ntf.infer.visibility import REGISTRY, transmittance_atlas
+from mi_ntf.infer import tuning
+from mi_ntf.infer.visibility import REGISTRY
 from mi_ntf.render.plugins import emitter
 
 SEEDS = 4
@@ -134,8 +135,8 @@ def test_maps_of_one_light(blobs, kind, visibility, tolerance):
 def test_the_shadow_of_a_sun_is_sharp_where_skies_are_looked_up(blobs, monkeypatch):
     """An atlas of few directions, by the same samples as the march: 0.5 % off, without the march to the sun 6 %."""
     monkeypatch.setitem(ABOVE, "sunsky", {**ABOVE["sunsky"], "sun_scale": 1.0})
-    monkeypatch.setattr(transmittance_atlas, "SIDE", 16)
-    monkeypatch.setattr(transmittance_atlas, "RESOLUTION", 32)
+    monkeypatch.setattr(tuning, "ATLAS_SIDE", 16)
+    monkeypatch.setattr(tuning, "ATLAS_RESOLUTION", 32)
 
     def picture(visibility):
         loaded = floor_scene({"type": "direct"}, light("sunsky", blobs, visibility), {"type": "diffuse"}, 24)
@@ -165,8 +166,8 @@ def test_shapes_far_off_hide_lights_from_afar(blobs, kind):
 
 @pytest.fixture
 def few_directions(monkeypatch):
-    monkeypatch.setattr(transmittance_atlas, "SIDE", 8)
-    monkeypatch.setattr(transmittance_atlas, "RESOLUTION", 16)
+    monkeypatch.setattr(tuning, "ATLAS_SIDE", 8)
+    monkeypatch.setattr(tuning, "ATLAS_RESOLUTION", 16)
 
 
 @pytest.mark.parametrize("kind", ["sunsky", "constant", "area"])
