@@ -22,6 +22,8 @@ BLOCKS = re.findall(r"```(\w+)\n(.*?)```", TEXT, re.S)
 COMMANDS = [line.split("#")[0] for line in TEXT.splitlines() if re.match(r"    (mi-ntf|mitsuba|make|python) ", line)]
 COMMANDS = [line.split() for line in dict.fromkeys(map(str.rstrip, COMMANDS))]
 SMALLER = {"--minutes": "0.03", "--steps": "10", "--size": "24", "--budget": "5s"}
+FEWER = '<integer name="environment_lights" value="8"/><integer name="samples" value="96"/>'
+COARSE = '<integer name="resolution" value="64"/>'
 CAPTURE = {"--views": "12", "--size": "24", "--test-views": "1", "--spp": "2"}
 
 
@@ -32,6 +34,9 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("readme")
     shutil.copytree(ROOT / "scenes", folder / "scenes")
     shutil.copytree(ROOT / "docs/gallery", folder / "docs/gallery")
+    for scene in folder.rglob("*.xml"):
+        text = re.sub('(<integrator type="nrf">)', rf"\1{FEWER}", scene.read_text())
+        scene.write_text(re.sub(r'(field\.safetensors"/>)', rf"\1{COARSE}", text))
     sys.path.insert(0, str(ROOT / "examples"))
     try:
         from own_mesh import BOXES
@@ -52,16 +57,21 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def process(folder):
-    """Start the process of all commands but `mitsuba`. Its cache is not the user's."""
-    process = CommandProcess(folder, MI_NTF_CACHE="memory", XDG_CACHE_HOME=str(folder / "cache"))
+    """Start the process of all commands but `mitsuba`."""
+    process = CommandProcess(folder, **cache(folder))
     yield process
     process.close()
+
+
+def cache(folder):
+    """Return the environment variables of a cache that all commands share, and that is not the user's."""
+    return {"MI_NTF_CACHE": "on", "XDG_CACHE_HOME": str(folder / "cache")}
 
 
 def check(process, folder, *words):
     """Run a command and return what it printed."""
     if words[0] == "mitsuba":
-        done = run_program(*words, cwd=folder)
+        done = run_program(*words, cwd=folder, **cache(folder))
         code, text = done.returncode, done.stdout + done.stderr
     else:
         code, text = process.run(*words)
@@ -125,7 +135,13 @@ NEEDS_MORE = {
 """Beginnings of commands that are not run → the reason."""
 
 
-@pytest.mark.parametrize("words", [pytest.param(words, id=" ".join(words)) for words in COMMANDS])
+def _marks(words):
+    """Mark trainings that differ from another one by their options alone: `make hard-cases` runs them."""
+    return [pytest.mark.slow] if {"mine.safetensors", "skull.safetensors", "knot.safetensors"} & set(words) else []
+
+
+@pytest.mark.parametrize(
+    "words", [pytest.param(words, id=" ".join(words), marks=_marks(words)) for words in COMMANDS])
 def test_command(folder, process, words):
     """In their order: later commands use the files of earlier ones."""
     line = " ".join(words)
