@@ -163,7 +163,7 @@ class Trainer:
         self.log = Log(tensorboard if parallel.first() else None, view and parallel.first())
         self.notes = Notes(parallel.first())
         self.data = TrainingData.load(dataset, self.notes, reading or {})
-        self.clock = Clock(minutes or math.inf, steps or math.inf)
+        self.clock = Clock(minutes or math.inf, steps or math.inf, spent=time.monotonic() - start)
         self.learner = Learner(self.clock)
         self.generator = device.generator(seed)
         if finished is not None:
@@ -186,7 +186,6 @@ class Trainer:
         self.speed = 0.0  # Pixels a second of the last validation
         self.last = math.nan  # PSNR of the last validation, dB
         self.saved = time.monotonic()  # Time of the last checkpoint
-        self.clock.spent = time.monotonic() - start
 
     def loop(self) -> None:
         """Step until the limit; show progress, validate, save checkpoints, roll back faults."""

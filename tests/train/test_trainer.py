@@ -12,7 +12,7 @@ from train import two_spheres  # noqa: E402
 from mi_ntf.core import field_file  # noqa: E402
 from mi_ntf.core.errors import MiNtfError  # noqa: E402
 from mi_ntf.data import schema  # noqa: E402
-from mi_ntf.train import config, train, trainer  # noqa: E402
+from mi_ntf.train import checkpoint, config, train, trainer  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -96,6 +96,13 @@ def test_a_checkpoint_is_not_taken_up_on_other_data(tmp_path):
     with pytest.raises(MiNtfError, match=r"f\.ckpt belongs to a run on other data: photographs or masks changed since; "
                                          "put back what the run began with, or delete the file to start anew"):
         run(data, tmp_path / "f", 20).resume()
+
+
+def test_a_checkpoint_of_another_version_is_refused(tmp_path):
+    path = tmp_path / "f.ckpt"
+    torch.save({"identity": {"data": {}}, "state": {}}, path)
+    with pytest.raises(MiNtfError, match=r"f\.ckpt was written by another version of mi_ntf; delete it to start anew"):
+        checkpoint.read(path, {"data": {}})
 
 
 def _step(run):
