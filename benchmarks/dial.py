@@ -2,17 +2,17 @@
 
     python -m benchmarks.dial [CASE …] [--scenes statue globe …] [--lights point sky …] [--size 128] [--spp 4]
 
-error    `max_error` 2 % with ``auto`` beside every fixed choice: methods, and for environments the number of lights.
-         Seconds of one picture and of twenty (the first, the second and 18 times a further one), tables made in the
-         first, kernels compiled. Errors are to `raymarch` by the same seeds; where light is sampled at random, they are
-         the part that two pictures by independent seeds have in common.
-noise    `noise_threshold` beside the noise of the picture against one of `TRUTH` samples a pixel
-time     `time_budget` beside the seconds that it took, and the error, noise included, beside that of the best fixed
-         method in the same time
-effects  `max_error` 2 % with paths of up to `DEPTH` edges: the error of all that was left out, and the seconds beside
-         those of the same method with nothing left out
-stock    the smallest number of samples with 2 % of relative RMSE, tables made anew, beside stock ``volpath`` of single
-         scattering, whose seconds are computed from its noise, which falls by 1/√N
+- ``error``: `max_error` 2 % with ``auto`` beside every fixed choice: methods, and for environments the number of
+  lights. Seconds of one picture and of twenty (the first, the second and 18 times a further one), tables made in the
+  first, kernels compiled. Errors are to `raymarch` by the same seeds; where light is sampled at random, they are the
+  part that two pictures by independent seeds have in common.
+- ``noise``: `noise_threshold` beside the noise of the picture against one of `TRUTH` samples a pixel
+- ``time``: `time_budget` beside the seconds that it took, and the error, noise included, beside that of the best fixed
+  method in the same time
+- ``effects``: `max_error` 2 % with paths of up to `DEPTH` edges: the error of all that was left out, and the seconds
+  beside those of the same method with nothing left out
+- ``stock``: the smallest number of samples with 2 % of relative RMSE, tables made anew, beside stock ``volpath`` of
+  single scattering, whose seconds are computed from its noise, which falls by 1/√N
 
 Takes about 40 minutes on two cores.
 """

@@ -2,12 +2,12 @@
 
     python -m benchmarks.fields [STUDY …] [--scenes statue globe …] [--photographs FOLDER] [--depth 2]
 
-brightness     mean brightness of the field over that of the meshes − 1, and relative RMSE, as it is and after one
-               factor a channel, under a flash at the camera, a lamp, a sun, a constant sky and one of high contrast
-photographs    PSNR and SSIM (both sRGB) of views that were not trained on, lit as the photographs were, and the mean
-               angle in degrees between shading normals of field and meshes, over pixels that both fill
-transmittance  relative RMSE of the transmittance network and of maps of 128² and 256² texels to ``raymarch`` on the
-               same field, under 50 directional lights, and nanoseconds of a query of the network
+- ``brightness``: mean brightness of the field over that of the meshes − 1, and relative RMSE, as it is and after one
+  factor a channel, under a flash at the camera, a lamp, a sun, a constant sky and one of high contrast
+- ``photographs``: PSNR and SSIM (both sRGB) of views that were not trained on, lit as the photographs were, and the
+  mean angle in degrees between shading normals of field and meshes, over pixels that both fill
+- ``transmittance``: relative RMSE of the transmittance network and of maps of 128² and 256² texels to ``raymarch`` on
+  the same field, under 50 directional lights, and nanoseconds of a query of the network
 
 A scene is the name of a folder of scenes/, or a folder with ``mesh.xml``, ``scene.xml`` and ``field.safetensors``.
 Photographs are captured anew unless ``--photographs`` names a data set. ``--depth`` is ``max_depth`` of the study of
@@ -55,9 +55,9 @@ WAYS: dict[str, dict[str, Any]] = {
 class Sizes:
     """Amounts that are measured.
 
-    brightness     pixels along a side, samples of the meshes and of the field
-    photographs    test views, pixels along a side, samples of the photographs and of the field
-    transmittance  pixels along a side, samples, lights, network queries
+    - brightness: pixels along a side, samples of the meshes and of the field
+    - photographs: test views, pixels along a side, samples of the photographs and of the field
+    - transmittance: pixels along a side, samples, lights, network queries
     """
 
     brightness: tuple[int, int, int] = (96, 256, 16)

@@ -2,11 +2,14 @@
 
     python -m benchmarks.loops [CASE …] [--scenes statue globe …]
 
-loop     time of the transmittance at a seen point, towards a direction of its own, or towards the lights of all points
-whole    a picture under the demo's environment, kernels compiled and tables made anew, and its error to ``raymarch``
-sampled  8 lights sampled at each point, of the environment and of an area light: time to equal noise, tables at hand
-floor    shadow of a field on a floor by ``ntf`` around the environment, and stock ``path``; error of mean pictures
-bounces  three bounces of ``examples/three_fields.py``, tables at hand
+- ``loop``: time of the transmittance at a seen point, towards a direction of its own, or towards the lights of all
+  points
+- ``whole``: a picture under the demo's environment, kernels compiled and tables made anew, and its error to
+  ``raymarch``
+- ``sampled``: 8 lights sampled at each point, of the environment and of an area light: time to equal noise, tables at
+  hand
+- ``floor``: shadow of a field on a floor by ``ntf`` around the environment, and stock ``path``; error of mean pictures
+- ``bounces``: three bounces of ``examples/three_fields.py``, tables at hand
 
 The methods are measured in turn. Takes about 15 minutes on two cores.
 """
@@ -39,12 +42,12 @@ SAMPLED = 8
 class Sizes:
     """Amounts that are measured.
 
-    points, lights     of the loops
-    whole              pixels along a side, and samples a pixel, of pictures under the demo's environment
-    sampled            the same of pictures by sampled lights
-    floor              the same of pictures of the floor
-    bounces            the same of the three fields
-    repeats            rounds of pictures; loops have twice as many
+    - points, lights: of the loops
+    - whole: pixels along a side, and samples a pixel, of pictures under the demo's environment
+    - sampled: the same of pictures by sampled lights
+    - floor: the same of pictures of the floor
+    - bounces: the same of the three fields
+    - repeats: rounds of pictures; loops have twice as many
     """
 
     points: int = timing.POINTS

@@ -51,13 +51,13 @@ CASES = {"unculled": (MAP, False, "network of the paper's size, unculled on both
 class Sizes:
     """Amounts that are measured.
 
-    hidden          widths of the networks' layers: the paper's
-    queries         network queries of a kernel
-    repeats         timed rounds after one that compiles
-    slow_lights     number of lights that stand for all 500
-    pixels          side of the picture that stands for 600² pixels
-    map_sides       texels along the side of maps: one for each pixel of the paper, and ours
-    tables          lights, and sides of volume and map, for shading: at full size no cache of a processor holds them
+    - hidden: widths of the networks' layers: the paper's
+    - queries: network queries of a kernel
+    - repeats: timed rounds after one that compiles
+    - slow_lights: number of lights that stand for all 500
+    - pixels: side of the picture that stands for 600² pixels
+    - map_sides: texels along the side of maps: one for each pixel of the paper, and ours
+    - tables: lights, and sides of volume and map, for shading: at full size no cache of a processor holds them
     """
 
     hidden: tuple[int, ...] = PAPER.density.hidden

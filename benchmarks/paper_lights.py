@@ -40,12 +40,12 @@ TURBIDITY, GROUND = 4.0, 0.2
 class Light:
     """The light of one picture.
 
-    name     for files
-    title    for readers
-    kind     ``point`` or ``environment``
-    emitter  Mitsuba dict
-    camera   place of a camera that moves, in scene units; None for the scene's own camera
-    about    values that tell the light from others, for JSON
+    - name: for files
+    - title: for readers
+    - kind: ``point`` or ``environment``
+    - emitter: Mitsuba dict
+    - camera: place of a camera that moves, in scene units; None for the scene's own camera
+    - about: values that tell the light from others, for JSON
     """
 
     name: str

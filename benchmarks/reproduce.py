@@ -83,17 +83,17 @@ TRAINING = {"AG": ["--visibility-mlp"], "No AG": ["--no-augmentation"]}
 class Sizes:
     """Amounts that are measured.
 
-    pixels               along a side of a picture
-    points, skies        pictures under point lights, half of them with a moving camera, and under environments
-    spp                  samples a pixel of the field, under point lights and under environments
-    reference_spp        paths a pixel of the meshes
-    cells                directional lights that stand for an environment
-    map_resolution       texels along a side of maps and volumes
-    views, photograph    photographs that networks are trained on, and pixels along a side of them
-    ntf, steps           network and steps of the trainings
-    stages               fractions of the steps, each trained by itself, for the transmittance curves
-    study                pixels along a side, samples, lights and queries of the ablation
-    build                numbers of lights that maps and volumes are made for
+    - pixels: along a side of a picture
+    - points, skies: pictures under point lights, half of them with a moving camera, and under environments
+    - spp: samples a pixel of the field, under point lights and under environments
+    - reference_spp: paths a pixel of the meshes
+    - cells: directional lights that stand for an environment
+    - map_resolution: texels along a side of maps and volumes
+    - views, photograph: photographs that networks are trained on, and pixels along a side of them
+    - ntf, steps: network and steps of the trainings
+    - stages: fractions of the steps, each trained by itself, for the transmittance curves
+    - study: pixels along a side, samples, lights and queries of the ablation
+    - build: numbers of lights that maps and volumes are made for
     """
 
     pixels: int = 192
@@ -375,7 +375,7 @@ def ablation(scene: Scene, file: Path, folder: Path, sizes: Sizes) -> Row:
 
 
 class Reproduction:
-    """All jobs of a run in their order: trainings, measurements, then picture by picture.
+    """The jobs of a run in their order: trainings, measurements, then picture by picture.
 
     All scenes and methods of one light come before the next light, so that means of an interrupted run are of equal
     sets.

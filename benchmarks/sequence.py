@@ -3,8 +3,8 @@
     python -m benchmarks.sequence [--frames 120] [--calls 6] [--size 256]
 
 The scene ``statue`` with 4 samples a pixel, ``transmittance_map`` of 128² texels, and a point light on a circle. Calls
-of the stock program with the parameters of the first frame stand between the frames, so that other work on the machine
-slows both down; their number is extrapolated to that of the frames. Kernels of both are compiled before. Takes about 3
+of the stock program render the first frame between the others, so that other work on the machine slows both down.
+Their number is extrapolated to that of the frames. Kernels of both are compiled before. Takes about 3
 minutes on two cores.
 """
 

@@ -48,18 +48,18 @@ Figures = dict[str, dict[str, Any]]
 class Sizes(networks.Sizes):
     """Amounts that are measured, besides those of :class:`benchmarks.networks.Sizes`.
 
-    image           side of pictures that are rendered whole
-    skies           columns and rows of environments, from 1 light to the paper's 500
-    many            columns and rows of a large environment
-    map             texels along a side of our maps
-    error_image     side of the picture whose errors are measured
-    error_lights    its directional lights
-    error_map       texels along a side of its maps
-    single_lights   number of lights whose own errors are measured
-    field_image     side of the picture that every method renders
-    field_lights    columns and rows of its environment
-    setting_points  shading points of the loops over a field of voxels, and over one of networks
-    atlas           texels along a side of an atlas's maps; 0 for the default
+    - image: side of pictures that are rendered whole
+    - skies: columns and rows of environments, from 1 light to the paper's 500
+    - many: columns and rows of a large environment
+    - map: texels along a side of our maps
+    - error_image: side of the picture whose errors are measured
+    - error_lights: its directional lights
+    - error_map: texels along a side of its maps
+    - single_lights: number of lights whose own errors are measured
+    - field_image: side of the picture that every method renders
+    - field_lights: columns and rows of its environment
+    - setting_points: shading points of the loops over a field of voxels, and over one of networks
+    - atlas: texels along a side of an atlas's maps; 0 for the default
     """
 
     image: int = 600

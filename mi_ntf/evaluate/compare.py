@@ -44,8 +44,8 @@ def compare_arrays(image: np.ndarray, reference: np.ndarray, alpha: np.ndarray |
 
     ``aligned`` holds the same after one factor for each channel, stored as ``factors``; published comparisons of relit
     objects remove the scale of the albedo in this way. ``masked`` and ``masked_aligned`` hold those of the object's own
-    pixels, a fraction ``coverage`` of the picture, where `alpha` of the reference (h, w) tells the object from a
-    background. A metric that picture or machine do not allow is None, with ``reason`` and ``remedy`` in
+    pixels, if `alpha` of the reference (h, w) tells them from a background. They are a fraction ``coverage`` of the
+    picture. A metric that picture or machine do not allow is None, with ``reason`` and ``remedy`` in
     ``not_measured``. With `lpips`, LPIPS is measured too, which imports PyTorch where it is installed.
     """
     names = [name for name in METRICS if lpips or name != "lpips"]

@@ -52,11 +52,11 @@ class ExportedMesh:
         try:
             for i, medium in enumerate(media):
                 name = f"{Path(medium.path).stem}{i or ''}.ply"
-                made = export(Path(medium.path), folder / name)
+                exported = export(Path(medium.path), folder / name)
                 place = medium.frame.of_capture(medium.field.header.similarity)
-                text = mitsuba_shape((folder / name).absolute(), made, place)
+                text = mitsuba_shape((folder / name).absolute(), exported, place)
                 parts.append(mi.load_string(text.replace("<shape ", '<shape version="3.9.0" ', 1)))
-                self.shapes += mitsuba_shape(Path(name), made, place)
+                self.shapes += mitsuba_shape(Path(name), exported, place)
                 self.commands += shlex.join(["mi-ntf", "export", os.path.relpath(medium.path), "-o", name]) + "\n"
             self.scene = mi.load_dict({"type": "scene", **{f"part{i}": part for i, part in enumerate(parts)}})
         finally:

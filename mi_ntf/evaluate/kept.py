@@ -15,7 +15,7 @@ NAME, PICTURES = "study.jsonl", "pictures"
 class State:
     """Lines by name in the file ``study.jsonl`` of `folder`; those of another `key` are removed.
 
-    fresh   names of the entries of `key` that differ from the removed lines; "" where nothing was removed
+    - fresh: names of the entries of `key` that differ from the removed lines; "" where nothing was removed
     """
 
     def __init__(self, folder: Path, key: Json):

@@ -1,7 +1,7 @@
 """Error of a mean of pictures, split into noise and bias. Pictures are float arrays (h, w, 3), linear RGB.
 
-Let a_k be pictures of s_k samples a pixel by independent seeds, m their mean weighted by s_k, R a reference of variance
-V, and P = mean R² − V its power. Relative to P:
+Let a_k be pictures of s_k samples a pixel by independent seeds, and m their mean weighted by s_k. Let R be a reference
+of variance V, and P = mean R² − V its power. Relative to P:
 
     error² = mean (m − R)² − V                                    of the mean
     bias²  = mean of (a_k − R)(a_l − R) over pairs k ≠ l − V      the part that remains with more samples

@@ -22,8 +22,8 @@ LARGEST_PASS = 1 << 22
 class Renderer:
     """Renderer of many pictures of a scene by one integrator, which keeps its maps.
 
-    compile   seconds of compilation so far
-    peak      largest number of bytes that Dr.Jit has allocated
+    - compile: seconds of compilation so far
+    - peak: largest number of bytes that Dr.Jit has allocated
     """
 
     scene: "mi.Scene"
@@ -49,9 +49,9 @@ class Renderer:
 class Curve:
     """Error over time of one way to render.
 
-    points     values of each point, for JSON
-    pictures   picture (h, w, 3) at the last point within each of `TIMES`
-    shift      relative difference of mean brightness from the reference at the last point, and its standard error
+    - points: values of each point, for JSON
+    - pictures: picture (h, w, 3) at the last point within each of `TIMES`
+    - shift: relative difference of mean brightness from the reference at the last point, and its standard error
     """
 
     points: list[Json] = field(default_factory=list)

@@ -41,12 +41,12 @@ _WORDS = {"samples": "{} steps", "light_samples": "{} lights sampled at each poi
 class Subject:
     """A scene file and the values of its $names.
 
-    size          width and height of the scene's film
-    media         the ``nrf`` media
-    lights        number of lights with the scene's own dials
-    environment   true if an environment is cut into lights
-    properties    values of `PROPERTIES` of the scene's integrator
-    methods       names of the visibility methods that support all media
+    - size: width and height of the scene's film
+    - media: the ``nrf`` media
+    - lights: number of lights with the scene's own dials
+    - environment: true if an environment is cut into lights
+    - properties: values of `PROPERTIES` of the scene's integrator
+    - methods: names of the visibility methods that support all media
 
     Raises MiNtfError where the scene cannot be rendered.
     """
@@ -103,8 +103,8 @@ def shrinker(shrink: int) -> Callable[["Node"], None]:
 class Way:
     """Way to render the scene: a method, and dials that differ from the scene's own.
 
-    method    name of a visibility method, `STOCK` or `MESH`
-    changes   properties of the integrator that differ from the scene's own: finer or coarser dials
+    - method: name of a visibility method, `STOCK` or `MESH`
+    - changes: properties of the integrator that differ from the scene's own: finer or coarser dials
     """
 
     method: str
@@ -138,8 +138,8 @@ class Way:
 def plan(subject: Subject, mesh: bool) -> list[Way]:
     """Return the ways of a study in their order; `mesh` is true if there is a mesh to compare with.
 
-    First come all methods of the scene with the scene's own dials, among them stock ``volpath`` and the exported mesh
-    before the `BASELINES`, then finer dials.
+    First come all methods of the scene with the scene's own dials. Stock ``volpath`` and the exported mesh stand before
+    the `BASELINES` among them. Finer dials follow.
     """
     methods = [name for name in subject.methods if name not in BASELINES]
     stock = [STOCK, *([MESH] if mesh else []), *(name for name in BASELINES if name in subject.methods)]
