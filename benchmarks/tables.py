@@ -9,8 +9,8 @@ A page marks the place of a table by two lines. The lines between them are repla
     <!-- table: demo -->
     <!-- end -->
 
-A number within a line of text is marked by the name of the file and the keys of the value, joined by dots, and by a
-format of Python or of `FORMATS`:
+A number within a line of text is marked by the name of the file and the keys of the value, joined by dots. A format
+of Python or of `FORMATS` follows:
 
     The lookup takes <!-- value: speed.lookup.median .1f -->7.8<!-- end --> ns.
 

@@ -81,7 +81,8 @@ def ssim(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = Non
     """Return the structural similarity (Wang et al. 2004) of the sRGB-encoded, clipped images; 1 is perfect.
 
     It is the mean of the channels, with Gaussian weights of σ = 1.5 over 11×11 pixels. As in the paper, K = (0.01,
-    0.03), the data range is 1, and the covariance is that of the population. Raises :class:`NotMeasured` below 11×11 pixels.
+    0.03), the data range is 1, and the covariance is that of the population. Raises :class:`NotMeasured` below 11×11
+    pixels.
     """
     from skimage.metrics import structural_similarity
 
