@@ -71,7 +71,6 @@ def check_linear(profile: bytes, path: Path) -> None:
 
 
 def _lattice(step: int) -> "Image.Image":
-    """Return an image of colours spread over the RGB cube."""
     from PIL import Image
 
     axis = np.array([*range(0, 255, step), 255], np.uint8)

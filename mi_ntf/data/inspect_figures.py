@@ -65,7 +65,6 @@ def cameras(splits: Splits, points: np.ndarray | None) -> "Figure":
 
 
 def _sphere(axes: "Axes") -> None:
-    """Draw the unit sphere as a wire frame."""
     turn = np.linspace(0, 2 * np.pi, 61)
     x, y, zero = np.cos(turn), np.sin(turn), np.zeros(61)
     circles = [(np.cos(h) * x, np.cos(h) * y, zero + np.sin(h)) for h in np.radians(np.arange(-60, 61, 30))]

@@ -57,7 +57,6 @@ def load(views: list[View], size: int | None = None, black: bool = False, assume
 
 
 def _fitting(pixels: np.ndarray) -> np.dtype:
-    """Return the smallest type that holds a photograph."""
     if pixels.dtype == np.uint8:
         return np.dtype(np.uint8)
     brightest = max(float(pixels[..., :3].max()), -float(pixels[..., :3].min()))

@@ -194,7 +194,6 @@ def _with_options(views: Views, masks: Path | None, flash_offset: Offset | None)
 
 
 def _summary(data: DataSet, folder: Path, size: int | None, background: str | None) -> str:
-    """Describe the data set in one line."""
     views = every(data.views)
     pixels, text = images.size_of(views[0].image), f"{data.form} in {folder}: {len(views)} photographs"
     if pixels is not None:

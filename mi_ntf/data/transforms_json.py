@@ -99,7 +99,6 @@ def _load(path: Path, assumed: list[str]) -> tuple[Entries, list[object]]:
 
 
 def _intrinsics(data: Entries, where: str) -> Camera | float:
-    """Return the camera of a split."""
     if "camera_intrinsics" not in data:
         return _angle_x(data, where)
     cx, cy, fx, fy = map(float, _numbers(data, "camera_intrinsics", (4,), where))
@@ -150,7 +149,6 @@ def _size(entries: Entries, where: str) -> tuple[int, int] | None:
 
 
 def _view(entry: object, where: str, folder: Path, camera: Camera | float, size: tuple[int, int] | None) -> View:
-    """Return the photograph of one frame."""
     if not isinstance(entry, dict) or "file_path" not in entry:
         raise MiNtfError(f"{where}: 'file_path' is missing; name the image relative to the folder")
     c2w = _numbers(entry, "transform_matrix", (4, 4), where, also=(3, 4))
@@ -218,7 +216,6 @@ def _named_splits(data: Entries, views: list[View], path: Path) -> tuple[dict[st
 
 
 def _sphere(data: Entries, path: Path) -> Sphere | None:
-    """Return the object's sphere, or None if the file has none."""
     if "unit_sphere" not in data:
         return None
     entry, where = data["unit_sphere"], f"{path}, unit_sphere"

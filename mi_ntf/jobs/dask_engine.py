@@ -45,7 +45,6 @@ class Dask:
             self._stack = stack.pop_all()
 
     def _local(self, workers: Workers, stack: contextlib.ExitStack) -> distributed.LocalCluster:
-        """Start a cluster of this machine."""
         self._threads, self._gpus = workers.threads_each(), gpus()
         variables = Setup(self._threads).variables()
         stack.enter_context(environment(variables))  # Dask sets them in this process, too, and never restores them
@@ -94,7 +93,6 @@ class Dask:
             self._ended.add(future)
 
     def _workers(self) -> list[str]:
-        """Return the workers' addresses."""
         return list(self._client.scheduler_info(n_workers=-1)["workers"])
 
     def close(self) -> None:

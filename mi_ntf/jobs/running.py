@@ -114,7 +114,6 @@ def each(work: Callable[[Task], Result], tasks: Sequence[Task], workers: Workers
 
 
 def _do(work: Callable[[Task], Result], index: int, task: Task) -> Done[Result]:
-    """Do a task in this process."""
     try:
         return Done(index, work(task))
     except Exception as error:
