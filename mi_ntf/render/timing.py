@@ -4,10 +4,12 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import TypedDict, TypeVar
 
 import drjit as dr
 import mitsuba as mi
+
+T = TypeVar("T")
 
 
 @dataclass
@@ -32,10 +34,10 @@ class Seconds:
 
 
 _measured: Seconds | None = None
-"""Those of the work that :func:`measure` runs; None where nothing is measured, and inside of :func:`building`."""
+"""Seconds of the work that :func:`measure` runs; None if nothing is measured, and inside of :func:`building`."""
 
 
-def measure(work: Callable[[], Any]) -> tuple[Any, Seconds]:
+def measure(work: Callable[[], T]) -> tuple[T, Seconds]:
     """Return the result of ``work()``, which has to be evaluated by it, and its seconds.
 
     Uses Dr.Jit's kernel history, which is empty afterwards. Work that measures a part of itself has the seconds of that
@@ -79,22 +81,27 @@ def building() -> Iterator[None]:
         _measured = seconds
 
 
-def _compilation(kernel: dict) -> float:
+def _compilation(kernel: dict[str, float]) -> float:
     return 1e-3 * (kernel.get("codegen_time", 0) + kernel.get("backend_time", 0))
 
 
-def once(scene, integrator, spp: int, seed: Any) -> tuple[Any, dict]:
-    """Render `scene` by any integrator.
+class RenderCost(TypedDict):
+    """Cost of a render: seconds in all, those that compiled kernels or built tables, and the most memory of Dr.Jit."""
 
-    Returns the image, and ``wall_seconds`` of all of it, of which ``compile_seconds`` compiled kernels and
-    ``build_seconds`` built maps, atlases and light between patches; ``peak_bytes``, most memory that Dr.Jit held.
-    """
+    wall_seconds: float
+    compile_seconds: float
+    build_seconds: float
+    peak_bytes: int
+
+
+def once(scene: "mi.Scene", integrator: "mi.Integrator", spp: int, seed: int) -> tuple["mi.TensorXf", RenderCost]:
+    """Render `scene` by any integrator; return the image and its cost."""
     dr.sync_thread()
     dr.detail.malloc_clear_statistics()
     begin = time.perf_counter()
 
-    def work():
-        image = mi.render(scene, integrator=integrator, seed=seed, spp=spp)
+    def work() -> "mi.TensorXf":
+        image = mi.render(scene, integrator=integrator, seed=mi.UInt32(seed), spp=spp)
         dr.eval(image)
         dr.sync_thread()
         return image

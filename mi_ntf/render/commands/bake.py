@@ -23,6 +23,7 @@ from ..plugins.registration import load_scene
 from ..scene import loaded
 from ..scene.media import NRFMedium, find_media
 from ..scene.settings import Settings
+from ..transport.context import context_of
 
 
 class MapFile(TypedDict):
@@ -44,7 +45,7 @@ def bake(scene: Path, output: Path, parameters: dict[str, str]) -> MapFile:
     """
     files.check(output)
     loaded_scene = load_scene(scene, parameters)
-    settings, media = loaded_scene.integrator().context.settings, find_media(loaded_scene)
+    settings, media = context_of(loaded_scene).settings, find_media(loaded_scene)
     if len(media) != 1:
         raise MiNtfError(f"{scene} has {len(media)} nrf media, and a map file belongs to one; bake them one by one")
     (medium,) = media

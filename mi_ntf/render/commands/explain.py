@@ -21,7 +21,7 @@ from ..scene.media import find_media, ordinary_shapes
 from ..scene.settings import Settings
 from ..transport import candidates, choosing, effects
 from ..transport.composition import Composition
-from ..transport.context import RenderContext
+from ..transport.context import RenderContext, context_of
 
 Report: TypeAlias = dict[str, Any]
 """Part of the report, as it is written to JSON."""
@@ -54,12 +54,12 @@ def explain(scene: Path, parameters: dict[str, str], measure: bool = False) -> R
         If rendering would raise it.
     """
     loaded = load_scene(scene, parameters)
-    integrator, sensor, media = loaded.integrator(), loaded.sensors()[0], find_media(loaded)
-    whole = integrator.context.settings
+    sensor, media, context = loaded.sensors()[0], find_media(loaded), context_of(loaded)
+    whole = context.settings
     width, height = (int(v) for v in sensor.film().crop_size())
     spp = sensor.sampler().sample_count()
     with user_cache.switched("off"):
-        composition, choice = choosing.Chooser(loaded, whole, integrator.context.limits, sensor, spp).explain()
+        composition, choice = choosing.Chooser(loaded, whole, context.limits, sensor, spp).explain()
     active = replace(composition.effects, reason=choice.best.why) if choice.best else composition.effects
     settings, light, count = composition.settings, composition.lights, len(composition.lights.rows.power)
     report = {
@@ -79,16 +79,16 @@ def explain(scene: Path, parameters: dict[str, str], measure: bool = False) -> R
                          "maps or volumes": _memory_of_maps(composition)},
     }
     if measure:
-        report["measured"] = _measured(loaded, integrator, integrator.context, spp)
+        report["measured"] = _measured(loaded, context, spp)
     return report
 
 
-def _measured(scene: mi.Scene, integrator: mi.Integrator, context: RenderContext, spp: int) -> Report:
+def _measured(scene: mi.Scene, context: RenderContext, spp: int) -> timing.RenderCost:
     """Render twice, since the first time may compile kernels, and build everything anew each time."""
     with user_cache.switched("off"):
-        timing.once(scene, integrator, spp, 1)
+        timing.once(scene, scene.integrator(), spp, 1)
         context.patches = None
-        return timing.once(scene, integrator, spp, 0)[1]
+        return timing.once(scene, scene.integrator(), spp, 0)[1]
 
 
 def _environment(light: Discrete, cells: environment.Cells) -> Report:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+import mitsuba as mi
+
 from ..scene.settings import NO_LIMITS, Limits, Settings
 from .bounced import Patches
 from .camera_light import SampleCache
@@ -38,3 +40,9 @@ class RenderContext:
     sample_cache: SampleCache | None = None
     light_count: int = 0
     achieved: dict[str, Any] = field(default_factory=dict)
+
+
+def context_of(scene: mi.Scene) -> RenderContext:
+    """Return the context of a scene's integrator, which is ``nrf``."""
+    context: RenderContext = vars(scene.integrator())["context"]
+    return context
