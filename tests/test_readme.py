@@ -21,7 +21,7 @@ TEXT = "\n".join(page.read_text(encoding="utf-8") for page in PAGES if page.name
 BLOCKS = re.findall(r"```(\w+)\n(.*?)```", TEXT, re.S)
 COMMANDS = [line.split("#")[0] for line in TEXT.splitlines() if re.match(r"    (mi-ntf|mitsuba|make|python) ", line)]
 COMMANDS = [line.split() for line in dict.fromkeys(map(str.rstrip, COMMANDS))]
-SMALLER = {"--minutes": "0.03", "--steps": "10", "--size": "24", "--budget": "5s"}
+SMALLER = {"--minutes": "0.01", "--steps": "2", "--size": "24", "--budget": "5s"}
 FEWER = '<integer name="environment_lights" value="8"/><integer name="samples" value="96"/>'
 COARSE = '<integer name="resolution" value="64"/>'
 CAPTURE = {"--views": "12", "--size": "24", "--test-views": "1", "--spp": "2"}
