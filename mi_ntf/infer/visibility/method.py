@@ -117,7 +117,7 @@ class Method:
     name: str
     """Value of the property `visibility`."""
     summary: str
-    """One sentence for users."""
+    """Sentence for users."""
     build: Build
     rays: Callable[[int, int], int] = lambda lights, resolution: 0
     """``(lights, resolution)`` → number of rays, each marched or queried once, that fill the tables of a field."""
