@@ -119,5 +119,5 @@ def test_tables_of_the_docstrings_list_every_name():
 
     classes = {"integrator": integrator_class(), "medium": medium_class(phase_class()), "emitter": emitter_class()}
     for plugin, names in PLUGINS.items():
-        table = re.findall(r"^ {8}(\w+) +(?:string|integer|float|boolean|transform) ", classes[plugin].__doc__, re.M)
+        table = re.findall(r"^(\w+) +(?:string|integer|float|boolean|transform) ", classes[plugin].__doc__, re.M)
         assert sorted(table) == sorted(names)

@@ -48,7 +48,7 @@ def images(name: str, kind: str, methods) -> dict[str, np.ndarray]:
 
     with pytest.MonkeyPatch.context() as patch:
         steps = raymarch.default_steps
-        patch.setattr(raymarch, "default_steps", lambda step, gradients: tuple(s / 4 for s in steps(step)))
+        patch.setattr(raymarch, "default_steps", lambda step, gradients=False: tuple(s / 4 for s in steps(step)))
         fine = image("raymarch")
     return {"fine": fine} | {method: image(method) for method in methods}
 
