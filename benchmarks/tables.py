@@ -14,7 +14,7 @@ of Python or of `FORMATS` follows:
 
     The lookup takes <!-- value: speed.lookup.median .1f -->7.8<!-- end --> ns.
 
-A table or value whose JSON file does not exist stays as it is, and a note says so.
+In place of a table whose JSON file does not exist, the page says that it is not measured. Such a value stays as it is.
 """
 
 import re
@@ -33,6 +33,7 @@ VALUE = re.compile(r"(<!-- value: (\S+) (\S+) -->)(.*?)(<!-- end -->)")
 FORMATS: dict[str, Callable[[float], str]] = {"percent": lambda v: f"{100 * v:.1f} %", "s": lambda v: _seconds(v)}
 LIGHTS = {"point": "point light", "env": "environment map"}
 METHODS = ("raymarch", "transmittance_atlas", "neural_transmittance")
+MISSING = "Not measured for this version: `python -m benchmarks.{}` does it."
 Values = dict[str, Any]
 
 
@@ -275,7 +276,7 @@ def rendered(text: str, note: Callable[[str], None] = lambda text: None) -> str:
         name, make = TABLES[match[2]]
         if not (record.RESULTS / f"{name}.json").is_file():
             note(f"table {match[2]}: no {name}.json; run `python -m benchmarks.{name}`")
-            return match[0]
+            return f"{match[1]}{MISSING.format(name)}\n{match[4]}"
         return f"{match[1]}{make(record.read(name)['values'])}\n\n{source(name)}.\n{match[4]}"
 
     def replace_value(match: re.Match[str]) -> str:
