@@ -56,7 +56,9 @@ def _git(*words: str) -> str:
 
 def about(name: str, seconds: float) -> dict[str, Any]:
     """Return the header of a result that took so many seconds to measure."""
-    variant = str(mi.variant() or VARIANTS[0])
+    if mi.variant() is None:  # the script rendered in other processes, which take the first that this machine can run
+        mi.set_variant(*VARIANTS)
+    variant = str(mi.variant())
     hardware = graphics_card() if variant.startswith("cuda") else processor()
     machine = {"processor": hardware, "cores": os.cpu_count(), "load": round(os.getloadavg()[0], 2),
                "variant": variant, "mitsuba": mi.__version__}
