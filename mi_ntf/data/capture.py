@@ -27,6 +27,7 @@ from mi_ntf.data.poses import camera_to_world, view_directions
 if TYPE_CHECKING:
     import mitsuba as mi
 
+POSITIONS = "vertex_positions", "positions"  # parameter of a mesh until Mitsuba 3.9, and from 3.10 on
 DISTANCE = 3.2  # camera to object's centre, in radii of the bounding sphere
 MARGIN = 1.04   # bounding sphere over the object's extent: room for a soft surface in the field
 SURFACE_INTEGRATORS = {"PathIntegrator", "DirectIntegrator"}
@@ -81,8 +82,9 @@ def _outline(shapes: "list[mi.Shape]") -> np.ndarray:
     points = []
     for shape in shapes:
         params = mi.traverse(shape)
-        if "vertex_positions" in params:  # a rectangle calls itself a mesh and has none
-            points.append(np.array(params["vertex_positions"]).reshape(-1, 3))
+        positions = next((name for name in POSITIONS if name in params), None)
+        if positions:  # a rectangle calls itself a mesh and has none
+            points.append(np.array(params[positions]).reshape(-1, 3))
         elif shape.shape_type() == int(mi.ShapeType.Sphere):
             to_world = np.array(params["to_world"].matrix).reshape(4, 4)
             lattice = view_directions(1000, np.random.default_rng(0))

@@ -273,3 +273,11 @@ def test_missing_scene_and_bad_counts(tmp_path):
         small(tmp_path / "gone.xml", tmp_path / "out")
     with pytest.raises(MiNtfError, match="views is 0, must be 1 or more"):
         small(write(tmp_path), tmp_path / "out", views=0)
+
+
+@pytest.mark.parametrize("name", cap.POSITIONS)
+def test_meshes_are_measured_by_their_vertices_under_either_name(monkeypatch, name):
+    """Mitsuba 3.10 renames the parameter."""
+    tetrahedron = np.float32([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    monkeypatch.setattr(mi, "traverse", lambda shape: {name: tetrahedron.ravel()})
+    np.testing.assert_array_equal(cap._outline([None]), tetrahedron)
