@@ -59,3 +59,10 @@ def test_no_render_of_the_same_scene_compiles_again(blobs):
             hashes = {k["hash"] for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT}
         compiled.append(hashes)
     assert compiled[2] <= compiled[0] | compiled[1]
+
+
+def test_scenes_of_shapes_share_one_emitter():
+    """The number of emitters that exist is part of the code of kernels that call emitters."""
+    ball = mi.load_dict({"type": "sphere"})
+    one, other = (surfaces._built([ball]) for _ in range(2))
+    assert one.emitters()[0].ptr == other.emitters()[0].ptr
