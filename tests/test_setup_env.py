@@ -1,4 +1,4 @@
-"""What the set-up script decides before it touches the machine."""
+"""Decisions of the set-up script before it touches the machine."""
 
 import importlib.util
 from pathlib import Path

@@ -81,7 +81,7 @@ def fingerprint() -> str:
 
 
 def read_stamp() -> dict:
-    """What the last complete run wrote; empty if there was none or the environment is gone."""
+    """Return the record of the last complete run, empty if there was none or the environment is gone."""
     try:
         return json.loads(STAMP.read_text()) if PYTHON.exists() else {}
     except (OSError, ValueError):
@@ -134,7 +134,7 @@ def browser() -> None:
 
 
 def in_archive(package: str) -> bool:
-    """Whether apt can install `package`."""
+    """Return True if apt can install `package`."""
     return subprocess.run(["apt-cache", "show", package], capture_output=True).returncode == 0
 
 
@@ -166,7 +166,7 @@ def link_llvm() -> None:
 
 
 def llvm_link() -> Path:
-    """Where Dr.Jit looks first."""
+    """Return the path at which Dr.Jit looks for LLVM first."""
     return site_packages() / "drjit" / "libLLVM.so"
 
 
@@ -176,12 +176,12 @@ def site_packages() -> Path:
 
 
 def has_module(name: str) -> bool:
-    """Whether this interpreter can import `name` (Debian splits ensurepip off)."""
+    """Return True if this interpreter can import `name` (Debian packages ensurepip separately)."""
     return subprocess.run([sys.executable, "-c", f"import {name}"], capture_output=True).returncode == 0
 
 
 def loads(library: str) -> bool:
-    """Whether the dynamic loader knows `library`."""
+    """Return True if the dynamic loader finds `library`."""
     try:
         ctypes.CDLL(library)
         return True
@@ -197,7 +197,7 @@ def run(*command: str) -> None:
 
 
 def say(text: str) -> None:
-    """One line of progress."""
+    """Print a line of progress."""
     print(f"set-up: {text}", flush=True)
 
 

@@ -122,7 +122,7 @@ def gold():
 
 
 def petals(count: int, ring: float, y: float, size, lean: float, phase: float):
-    """One ring of lotus petals: ellipsoids that lean outwards by `lean` radians."""
+    """Return one ring of lotus petals: ellipsoids that lean outwards by `lean` radians."""
     shapes = []
     for angle in 2 * np.pi * (np.arange(count) + phase) / count:
         c, s, cl, sl = np.cos(angle), np.sin(angle), np.cos(lean), np.sin(lean)

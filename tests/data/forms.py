@@ -1,4 +1,4 @@
-"""One tiny scene (two analytic spheres, flash at the lens) written in every form that is read."""
+"""A tiny scene (two analytic spheres, flash at the lens) written in every form that is read."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""One batch of damaged files, in a process of its own: ``fuzz.py KIND SEED FIRST LAST FOLDER``.
+"""A batch of damaged files, in a process of its own: ``fuzz.py KIND SEED FIRST LAST FOLDER``.
 
 For each case a line of JSON before it begins and one when it has ended; a process that dies leaves the first alone.
 Memory is limited to what the process has after its start and `ROOM` bytes.

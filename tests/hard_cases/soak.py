@@ -45,8 +45,7 @@ def render(what: random_scenes.Scene) -> np.ndarray:
 
 
 def check(what: random_scenes.Scene) -> str:
-    """What is wrong with the scene's picture; empty if nothing is, "refused: …" where it says in one sentence why it
-    will not be rendered."""
+    """Return the faults of the scene's picture, or "refused: …" if one sentence says why it is not rendered."""
     try:
         image = render(what)
     except Exception as error:
@@ -128,8 +127,11 @@ def soak(scenes: int, seed: int, files: dict, seconds: float, say=print) -> list
 
 
 def compare(seed: int, files: dict) -> str:
-    """What a z-test says against two scenes of one seed, ours and ``volpath``'s; empty if they agree. A pair that
-    fails is rendered again, longer and by other seeds: by chance that happens to one of ten thousand."""
+    """Return the faults that a z-test finds between pictures of one seed, ours and that of ``volpath``.
+
+    A pair that fails is rendered again with more samples and other seeds. By chance this happens to one pair of ten
+    thousand.
+    """
     what, theirs = random_scenes.draw_pair(seed, files)
     scene = {"type": "scene", **what.scene}
     loaded = [mi.load_dict({**scene, "integrator": i}) for i in (what.integrator, theirs)]

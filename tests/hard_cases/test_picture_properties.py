@@ -1,4 +1,4 @@
-"""What holds for every picture: energy, linearity, and that nothing depends on how the work is cut up."""
+"""Properties of every picture: energy, linearity, and that nothing depends on how the work is cut up."""
 
 import mitsuba as mi
 import numpy as np

@@ -1,4 +1,4 @@
-"""What holds for every visibility method, whatever the field, the rays and the lights: hypothesis draws them. An
+"""Properties of every visibility method, whatever the field, the rays and the lights: hypothesis draws them. An
 example is a batch of some thousand rays under eight lights."""
 
 import mitsuba as mi

@@ -1,4 +1,4 @@
-"""One light of each kind that Mitsuba has."""
+"""Lights of each kind that Mitsuba has."""
 
 import mitsuba as mi
 import numpy as np

@@ -97,7 +97,7 @@ def _slopes(t, x, y) -> None:
 
 
 def empty(**kwargs) -> tuple[Header, dict]:
-    """No density anywhere."""
+    """Return a field without density."""
     header, t = blobs([(0, 0, 0)], [0.3], **kwargs)
     constant(t, "density", [MIN_LOG_DENSITY])
     return header, t

@@ -1,4 +1,4 @@
-"""One formula of core in each framework: NumPy float32, PyTorch and Dr.Jit, values and gradients; the float64 oracle.
+"""A formula of core in each framework: NumPy float32, PyTorch and Dr.Jit, values and gradients; the float64 oracle.
 
 A formula is ``function(ops, *scalars)`` → scalars. Gradients are those of Σ_k v_k/(k + 1), k = 0, 1, …, of its values.
 """

@@ -164,7 +164,7 @@ def _media(d: _Draw, files: dict, count: int, apart: bool):
 
 
 def _lights(kinds, centre, radius, eye, medium) -> dict:
-    """One of each kind; of skies the first alone, as Mitsuba has it."""
+    """Return one light of each kind. Mitsuba allows one environment, so the first sky alone stays."""
     skies = [k for k in kinds if k in SKIES]
     result = {}
     for i, kind in enumerate(kinds):

@@ -1,4 +1,4 @@
-"""What is added to the registries works everywhere: a visibility method and a kind of emitter, one entry each."""
+"""Additions to the registries work everywhere: a visibility method and a kind of emitter, one entry each."""
 
 from pathlib import Path
 

@@ -35,7 +35,7 @@ def sphere_of(path: Path) -> tuple[np.ndarray, float]:
 
 
 def script(path: Path):
-    """One of the scenes' scripts as a module."""
+    """Return one of the scenes' scripts as a module."""
     spec = importlib.util.spec_from_file_location(path.stem, path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
