@@ -157,7 +157,7 @@ def test_program_equals_python(scene: Path, stand_in: dict[str, str]):
 
 @pytest.mark.parametrize("name", ["prb", "direct_projective"])
 def test_look_alike_renders_mitsubas_python_integrators(scene: Path, name: str):
-    """Which the stock program, being of C++, cannot load."""
+    """The stock program cannot load them, since it has no Python."""
     flags = ("-m", "llvm_ad_rgb", f"-Dintegrator={name}", "-o", "image.exr")
     done = run_program("mi-ntf", "render", *flags, scene, cwd=scene.parent)
     assert done.returncode == 0, done.stderr

@@ -172,7 +172,7 @@ def test_every_command_is_shown():
 
 
 def test_readme_is_short():
-    """One screen and a half."""
+    """README has a screen and a half of text."""
     lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
     assert len(lines) <= 90 and max(map(len, lines)) <= 120
 

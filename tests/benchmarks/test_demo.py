@@ -67,7 +67,7 @@ print(found[0])
 
 
 def test_a_full_cache_of_maps_makes_no_difference(tmp_path, monkeypatch):
-    """What would be read from the user's cache, were it on, is made anew in the demo's renders."""
+    """The demo's renders make anew what they could read from the user's cache."""
     monkeypatch.setenv("MI_NTF_CACHE", "on")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     program = [sys.executable, "-c", CACHED]
@@ -253,7 +253,7 @@ def test_the_demo_on_few_pixels(tmp_path):
 
 @pytest.mark.slow
 def test_make_demo():
-    """All of it, as a user types it: the figures that README gives."""
+    """The whole demo, as a user runs it, gives README's figures."""
     done = subprocess.run(["make", "demo"], cwd=ROOT, capture_output=True, text=True, check=False, timeout=3600)
     assert done.returncode == 0, done.stdout + done.stderr
     check_demo(ROOT / "out" / "demo", 0.9, 0.25, 0.07)

@@ -11,7 +11,7 @@ from mi_ntf.evaluate.compare import compare
 
 
 def _has(pixels: np.ndarray, colour) -> int:
-    """How many pixels have about this colour, 0 to 1."""
+    """Return the number of pixels that have about this colour, 0 to 1."""
     return int((np.abs(pixels[..., :3] / 255 - np.asarray(colour)[:3]).max(-1) < 0.02).sum())
 
 

@@ -61,7 +61,7 @@ def test_it_is_measured_on_encoded_images_with_the_weights_of_the_file(weights, 
 
 
 def _absent(capsys, rng) -> tuple[dict, str]:
-    """Why LPIPS was not measured, and the printed table; the other metrics stand."""
+    """Check the reason why LPIPS was not measured, and the printed table with all other metrics."""
     truth = rng.uniform(size=(32, 32, 3))
     result = compare_arrays(truth / 2, truth, lpips=True)
     assert result["lpips"] is result["aligned"]["lpips"] is None and result["relative_rmse"] == pytest.approx(0.5)

@@ -144,7 +144,7 @@ def test_a_finished_study_is_not_rendered_again(folder, done, counted, capsys):
 
 
 def test_an_interrupted_study_renders_what_is_missing(folder, done, counted, tmp_path):
-    """Of a file that was cut off within the fifth way."""
+    """The file was cut off within the fifth way."""
     out = tmp_path / "out"
     shutil.copytree(done, out)
     lines = (out / kept.NAME).read_text().splitlines(keepends=True)

@@ -105,7 +105,7 @@ def field_case(rng, folder: Path, bases):
 
 
 def check_finite(architecture: Architecture, tensors: dict) -> None:
-    """What loads must evaluate to numbers in single precision."""
+    """Check that a loaded file evaluates to numbers in single precision."""
     rng = np.random.default_rng(0)
     x, d = rng.uniform(-1, 1, (64, 3)), rng.normal(size=(64, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)

@@ -21,7 +21,7 @@ from mi_ntf.render.maps import map_cache
 
 @contextmanager
 def little_room(size):
-    """No file may grow beyond `size` bytes: what a full disk is to a writer."""
+    """Limit files to `size` bytes, as a full disk does."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     try:

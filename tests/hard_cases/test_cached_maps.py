@@ -213,7 +213,7 @@ def names_of(cache, medium, options=OPTIONS):
 
 
 def test_keys_follow_the_march_and_the_libraries(medium, cache, monkeypatch):
-    """What decides texels, or their last bits, decides the name."""
+    """The name depends on everything that texels depend on, to the last bit."""
     seen = [names_of(cache, medium)]
     seen.append(names_of(cache, medium, dataclasses.replace(OPTIONS, step=2 / 128)))
     network = dataclasses.replace(OPTIONS, map_source="network")
@@ -250,7 +250,7 @@ def held():
 
 
 def kept(size: int):
-    """What stands for a map of `size` bytes."""
+    """Return a stand-in for a map of `size` bytes."""
     return SimpleNamespace(values=np.zeros(size // 4, np.float32), texels=SimpleNamespace(nbytes=size))
 
 

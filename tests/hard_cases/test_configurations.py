@@ -47,7 +47,7 @@ def neutral(blobs):
 
 
 def channels(rgba: np.ndarray, pixel_format: str) -> np.ndarray:
-    """What a film of this format shows of a picture."""
+    """Return the channels of a picture that a film of this format stores."""
     rgb, alpha = rgba[..., :3], rgba[..., 3:]
     base = pixel_format.removesuffix("_alpha").removesuffix("a")
     value = {"rgb": rgb, "luminance": rgb @ LUMINANCE[:, None], "xyz": rgb @ XYZ.T}[base]

@@ -132,7 +132,7 @@ FLAT = {"raymarch": 2e-3, "transmittance_volume": 2e-3, "transmittance_map": 0.0
 
 @pytest.mark.parametrize("method", METHODS)
 def test_zero_normals(file, method, check):
-    """No side is lit: black and opaque."""
+    """The picture is black and opaque, since no side is lit."""
     def make():
         skin = fields.skin("sphere", visibility=True)
         fields.constant(skin.tensors, "reflectance", [0] * 8)

@@ -30,7 +30,7 @@ def blobs(tmp_path_factory):
 
 
 def picture(field, method: str, light: dict, spp=4, size=12, **options) -> np.ndarray:
-    """One render, (size, size, 3)."""
+    """Return a picture, (size, size, 3)."""
     options = {"map_resolution": 32, "samples": 192, **options}
     many = light if "type" not in light else {"light": light}
     return scenes.render(scenes.scene(field, scenes.nrf(method, **options), many, size=size, spp=spp))[..., :3]
@@ -182,7 +182,7 @@ def test_lights_that_are_no_numbers(blobs, parameter, value):
 
 @pytest.mark.parametrize("light_samples", [0, 2])
 def test_negative_light_subtracts(blobs, light_samples):
-    """As under Mitsuba's own integrators."""
+    """Mitsuba's own integrators do the same."""
     two = {"a": point(CENTER + 2 * RADIUS * TOWARDS, 9.0), "b": point(CENTER + 2 * RADIUS * TOWARDS, -4.0)}
     found = picture(blobs, "raymarch", two, spp=256, light_samples=light_samples)
     wanted = picture(blobs, "raymarch", {"a": point(CENTER + 2 * RADIUS * TOWARDS, 5.0)}, spp=256)

@@ -54,7 +54,7 @@ def wanted(name: str) -> set[str]:
 
 
 def load(path, plugin: str, elements: str, own: str = "") -> str:
-    """What is said of the scene, or nothing where it loads. `own`: the property under test."""
+    """Return the error message of the scene, or nothing if it loads. `own`: the property under test."""
     parts = {p: "" for p in PLUGINS} | {plugin: elements}
     scene = SCENE if own != "resolution" else SCENE.replace('<integer name="resolution" value="16"/>', "")
     filename = "" if own == "filename" else f'<string name="filename" value="{path}"/>'

@@ -115,7 +115,7 @@ def test_few_drawn_lights_bounce_like_many(skin):
 
 
 def test_what_is_read_back_is_computed_once(variant):
-    """One kernel computes three channels."""
+    """A single kernel computes the three channels."""
     values = dr.arange(mi.Float, 1000) + 1
     dr.eval(values)
     light = mi.Color3f(dr.sqrt(values), dr.log(values), values * values)

@@ -85,7 +85,7 @@ def test_maps_of_mixtures_take_four_times_the_memory(tmp_path):
 
 
 def test_memory_of_maps_is_bounded(tmp_path):
-    """Of 512 lights with 288 KiB each, 14 fit into 4 MiB."""
+    """Maps of 14 lights fit into 4 MiB, at 288 KiB each."""
     scene = with_integrator(tmp_path, '<float name="map_memory" value="4"/>')
     light = f'<include filename="{SCENE.parent}/light_point.xml"/>'
     scene.write_text(scene.read_text().replace(light, '<emitter type="constant"/>'))
