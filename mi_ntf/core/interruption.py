@@ -1,28 +1,43 @@
-"""Ctrl-C while Mitsuba renders, which turns KeyboardInterrupt into a RuntimeError of its own."""
+"""Ctrl-C, which Mitsuba, Dr.Jit and imports turn into errors of their own, or lose."""
 
 import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from .errors import root
+
+_pressed = threading.Event()
+
 
 @contextmanager
 def noticed() -> Iterator[threading.Event]:
     """Yield an event that Ctrl-C sets within the block, besides raising KeyboardInterrupt as always.
 
-    In threads other than the main one, which receive no signals, the event stays unset.
+    In threads other than the main one, which receive no signals, the event stays unset. Blocks may be nested.
     """
-    pressed = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield pressed
+    if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGINT) is _press:
+        yield _pressed
         return
-
-    def press(_number: int, _frame: object) -> None:
-        pressed.set()
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGINT, press)
+    before = signal.signal(signal.SIGINT, _press)
     try:
-        yield pressed
+        yield _pressed
     finally:
         signal.signal(signal.SIGINT, before)
+        _pressed.clear()
+
+
+def _press(_number: int, _frame: object) -> None:
+    _pressed.set()
+    raise KeyboardInterrupt
+
+
+def caused(error: BaseException) -> bool:
+    """Return True if Ctrl-C is the reason of `error`."""
+    return _pressed.is_set() or isinstance(root(error), KeyboardInterrupt)
+
+
+def check() -> None:
+    """Raise KeyboardInterrupt if Ctrl-C was pressed, in case that the first one was lost."""
+    if _pressed.is_set():
+        raise KeyboardInterrupt

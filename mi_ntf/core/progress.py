@@ -1,0 +1,233 @@
+"""Progress of long work on standard error, and the words that Ctrl-C leaves.
+
+Work is done in stages. The title of a stage that counts is a plural noun, that of any other one says what is done::
+
+    with progress.Stage("photographs", 120, done=12, then="the same command goes on") as stage:
+        for view in views[12:]:
+            photograph(view)
+            stage.advance()
+
+    with progress.Stage("training", seconds=60 * minutes - spent) as stage:
+        stage.update(fraction, f"step {step}, loss {loss:.4f}")
+        progress.say("step 40: validation 28.10 dB")  # a line that stays
+
+A terminal shows one line, which is removed at the end of the stage: ``photographs: 12 of 120, 25 s left``. Elsewhere
+the line is printed when the stage begins, and every ten seconds. Stages within others are appended to it. Within
+:func:`silent`, which is `--json`, nothing is shown.
+
+Time that is left is counted down from `seconds` if they are given. Otherwise it is estimated from the second update on,
+since what is done first also compiles kernels.
+
+A stage that Ctrl-C ends raises KeyboardInterrupt with a sentence, which the command line prints: ``stopped after 12 of
+120 photographs; the same command goes on``. Code that knows better raises KeyboardInterrupt with its own sentence.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import TracebackType
+
+from . import interruption
+
+BLINK, PLAIN = 0.25, 10.0
+"""Seconds between two updates of a terminal's line, and between two plain lines."""
+
+
+class Stage:
+    """Work that is shown while it lasts; the module's text shows its use.
+
+    Parameters
+    ----------
+    title
+        Plural noun for what is counted, or the work that is done: "photographs", "reading scene.xml".
+    total
+        Number of things that are counted.
+    done
+        Number of those that were there before.
+    seconds
+        Time that the work may take. 0: it is estimated.
+    then
+        End of the sentence after Ctrl-C: how to go on. By default it says that nothing was written.
+    warm
+        Number of things at the beginning that compile kernels, so that their time says nothing on that of the others.
+    inner
+        Show the stage within another one only.
+    shown
+        False: show nothing.
+    write
+        Function for plain lines in place of standard error, and their `interval` in seconds.
+    """
+
+    def __init__(self, title: str, total: int = 0, *, done: int = 0, seconds: float = 0.0, then: str = "",
+                 warm: int = 1, inner: bool = False, shown: bool = True, write: Callable[[str], None] | None = None,
+                 interval: float = PLAIN) -> None:
+        self.title, self.total, self.then, self.write, self.interval = title, total, then, write, interval
+        self.done, self.text = float(done), ""
+        self._seconds, self._warm, self._inner, self._shown = seconds, done + warm if total else 0, inner, shown
+        self._begin = self._last = time.monotonic()
+        self._base: tuple[float, float] | None = None  # time and what was done, from which the rate is measured
+
+    def __enter__(self) -> Stage:
+        if self._shown:
+            _shown.begin(self, self._inner)
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+                 ) -> None:
+        _shown.end(self)
+        if error is not None and interruption.caused(error):
+            if isinstance(error, KeyboardInterrupt) and str(error) and not self.then:
+                return
+            where = f"after {self.done:.0f} of {self.total} {self.title}" if self.total else f"while {self.title}"
+            raise KeyboardInterrupt(f"stopped {where}; {self.then or 'nothing was written'}") from None
+
+    def advance(self, text: str = "") -> None:
+        """Count one thing more; `text` says what is done next."""
+        self.update(self.done + 1, text)
+
+    def update(self, done: float, text: str = "") -> None:
+        """Set the number of things that are done, or the fraction of the work, and what is done now.
+
+        Raises KeyboardInterrupt where Ctrl-C was pressed and lost in other code.
+        """
+        interruption.check()
+        if done != self.done:
+            self._last = time.monotonic()
+            if done > 0 and (self._base is None or done <= self._warm):
+                self._base = self._last, done
+        self.done, self.text = done, text
+        _shown.draw()
+
+    def left(self) -> float | None:
+        """Return the seconds that are left, None before there is an estimate."""
+        now = time.monotonic()
+        if self._seconds:
+            return max(self._begin + self._seconds - now, 0.0)
+        if self._base is None or self.done <= self._base[1]:
+            return None
+        each = (self._last - self._base[0]) / (self.done - self._base[1])
+        rest = (self.total or 1.0) - self.done
+        return max(rest * each - (now - self._last), (rest - 1) * each, 0.0)
+
+    def line(self) -> str:
+        """Return the line that describes the stage, without the time that is left."""
+        count = f"{self.done:.0f} of {self.total}" if self.total else f"{self.done:.0%}" if self.done else ""
+        more = ", ".join(filter(None, (count, self.text)))
+        return f"{self.title}: {more}" if more else self.title
+
+    def seconds(self) -> float:
+        """Return the seconds since the stage began."""
+        return time.monotonic() - self._begin
+
+
+class _Shown:
+    """The stages that are shown, the outermost first, and the thread that shows them."""
+
+    def __init__(self) -> None:
+        self.silent = False
+        self._stages: list[Stage] = []
+        self._lock = threading.RLock()
+        self._over = threading.Event()
+        self._last_line = 0.0  # time of the last line
+        self._width = 0  # characters that stand in the terminal's line
+
+    def begin(self, stage: Stage, inner: bool) -> None:
+        with self._lock:
+            if self.silent or (inner and not self._stages):
+                return
+            self._stages.append(stage)
+            if len(self._stages) == 1:
+                self._over = threading.Event()
+                threading.Thread(target=self._keep_drawing, args=(self._over, self._pace()), daemon=True).start()
+            self.draw(len(self._stages) == 1)
+
+    def end(self, stage: Stage) -> None:
+        with self._lock:
+            if stage in self._stages:
+                self._stages.remove(stage)
+                if not self._stages:
+                    self._over.set()
+                self.clear()
+
+    def _terminal(self) -> bool:
+        plain = os.environ.get("TERM") == "dumb" or (self._stages and self._stages[0].write)
+        return not plain and sys.stderr.isatty()
+
+    def _pace(self) -> float:
+        return BLINK if self._terminal() else self._stages[0].interval
+
+    def _keep_drawing(self, over: threading.Event, pace: float) -> None:
+        while not over.wait(pace):
+            self.draw(True)
+
+    def draw(self, now: bool = False) -> None:
+        """Show the stages; in a pipe only if the last line is old enough, or `now`."""
+        with self._lock:
+            clock = time.monotonic()
+            if not self._stages or (not now and clock - self._last_line < self._pace()):
+                return
+            self._last_line, first = clock, self._stages[0]
+            lines, timed = [stage.line() for stage in self._stages], False
+            for i, stage in enumerate(self._stages):
+                left = stage.left()
+                if left is not None and not timed:
+                    lines[i] += f", {duration(left)} left"
+                    timed = True
+            since = "" if timed or first.seconds() < 1 else f", {duration(first.seconds())}"
+            text = " · ".join(lines) + since
+            if not self._terminal():
+                (first.write or _print)(text)
+                return
+            self.clear()
+            text = text[:(os.get_terminal_size(sys.stderr.fileno()).columns or 80) - 1]
+            sys.stderr.write(text)
+            sys.stderr.flush()
+            self._width = len(text)
+
+    def clear(self) -> None:
+        """Remove the terminal's line, so that another one can be printed."""
+        with self._lock:
+            if self._width:
+                sys.stderr.write("\r\x1b[2K")
+                sys.stderr.flush()
+                self._width = 0
+
+
+_shown = _Shown()
+clear = _shown.clear
+
+
+@contextmanager
+def silent(yes: bool = True) -> Iterator[None]:
+    """Show no progress within the block, unless `yes` is False."""
+    before, _shown.silent = _shown.silent, _shown.silent or yes
+    try:
+        yield
+    finally:
+        _shown.silent = before
+
+
+def say(text: str) -> None:
+    """Print a line on standard error, above the progress, unless that is silent."""
+    if not _shown.silent:
+        clear()
+        _print(text)
+
+
+def _print(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+def duration(seconds: float) -> str:
+    """Return seconds for a reader: 25 s, 2 min 10 s, 1 h 05 min."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02} s"
+    return f"{whole // 3600} h {whole // 60 % 60:02} min"
