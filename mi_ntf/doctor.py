@@ -5,7 +5,6 @@ Checks that may abort the process, as an unfit LLVM does, run in a child process
 
 import ctypes
 import importlib.metadata
-import importlib.util
 import os
 import platform
 import subprocess
@@ -15,21 +14,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mi_ntf import __version__
+from mi_ntf.core import extras
 from mi_ntf.jobs.options import cores
 
 PYTHON_MINIMUM = (3, 10)
 MITSUBA_MINIMUM = (3, 9)
 LLVM_MINIMUM = 17
-EXTRAS = {
-    "train": ("torch", "tensorboard", "matplotlib", "PIL", "cv2"),
-    "video": ("imageio_ffmpeg",),
-    "view": ("viser", "websockets"),
-    "eval": ("skimage", "flip_evaluator", "matplotlib", "PIL"),
-    "mesh": ("skimage", "scipy", "trimesh"),
-    "watch": ("tevclient",),
-    "cluster": ("submitit", "distributed", "bokeh"),
-}
-"""Extras of this package and the modules that they bring."""
 
 # With LLVM 15 or 16 exactly this kind of kernel ends the process.
 _LLVM_PROBE = """
@@ -74,7 +64,7 @@ def examine() -> Report:
     """Run all checks."""
     checks = [check_python(), check_cores(), *check_mitsuba(), check_llvm(), check_cuda()]
     checks += [check_bridge(), check_libpython()]
-    checks += [check_extra(name) for name in EXTRAS]
+    checks += [check_extra(name) for name in extras.EXTRAS]
     return Report(all(check.ok for check in checks if check.needed), __version__, checks)
 
 
@@ -178,7 +168,7 @@ def check_libpython() -> Check:
 
 def check_extra(extra: str) -> Check:
     """Check that the modules of an optional extra are there, without importing them."""
-    missing = [module for module in EXTRAS[extra] if importlib.util.find_spec(module) is None]
+    missing = extras.missing(extra)
     remedy = pip_install(f"[{extra}]") if missing else ""
     state = "missing: " + ", ".join(missing) if missing else "installed"
     return Check(f"extra {extra}", not missing, False, state, remedy)

@@ -13,14 +13,13 @@ Source of the names: Blender's `io/ply/importer/ply_import_data.cc`, where other
 attributes, and Mitsuba's plugin `ply`, which ignores attributes of a single number and warns about them.
 """
 
-import importlib.util
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 
 import numpy as np
 
-from mi_ntf.core import field_file, files
+from mi_ntf.core import extras, field_file, files
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.core.srgb import encode
 from mi_ntf.infer.backend import module
@@ -73,14 +72,12 @@ def export(field: Path, output: Path, resolution: int = 256, level: float | None
     out of range, or the field has no surface.
     """
     field, output = Path(field), Path(output)
-    if output.suffix.lower() not in SUFFIXES:
-        raise MiNtfError(f"{output}: the name ends in {output.suffix!r}, expected one of {', '.join(SUFFIXES)}")
     if not RESOLUTIONS[0] <= resolution <= RESOLUTIONS[1]:
         raise MiNtfError(f"--resolution is {resolution}, expected {RESOLUTIONS[0]} to {RESOLUTIONS[1]} voxels per side")
     if level is not None and not 0 < level < np.inf:
         raise MiNtfError(f"--level is {level:g}, expected a positive density, 1/(radius of the field's sphere)")
-    _check_libraries()
-    files.check(output)
+    extras.need("mesh", "a mesh")
+    files.check(output, SUFFIXES)
     header, tensors = field_file.load(field)
     dj = module("llvm_ad_rgb")
     mesh = surface(NetworkField(header, tensors, dj), resolution, level, dj)
@@ -99,13 +96,6 @@ def mitsuba_shape(path: Path, mesh: MeshFile, to_world: np.ndarray) -> str:
     """
     return _SHAPE.format(file=escape(str(path)), place=" ".join(f"{value:.9g}" for value in to_world.ravel()),
                          specular=mesh.specular, alpha=mesh.roughness**2)
-
-
-def _check_libraries() -> None:
-    missing = [name for name in ("skimage", "scipy", "trimesh") if importlib.util.find_spec(name) is None]
-    if missing:
-        raise MiNtfError(f"meshes need scikit-image, SciPy and trimesh, and {', '.join(missing)} is missing: "
-                         "pip install 'mi-ntf[mesh]'")
 
 
 def _encoded(surface: Surface, vertices: np.ndarray, suffix: str) -> bytes | str:

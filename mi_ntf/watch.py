@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mi_ntf.core import errors, interruption
+from mi_ntf.core import errors, extras, interruption
 from mi_ntf.core.errors import MiNtfError
 
 if TYPE_CHECKING:
@@ -104,10 +104,10 @@ class Tev:
         """Send all channels of a bitmap under `name`. Return False if tev does not listen or take the picture."""
         if not self._listens():
             return False
-        try:
-            import tevclient
-        except ImportError:
+        if extras.missing("watch"):
             return self._say_once("tev listens; it is sent pictures after `pip install 'mi-ntf[watch]'`")
+        import tevclient
+
         names = [field.name for field in bitmap.struct_()]  # type: ignore[attr-defined]  # not in the stub
         pixels = np.array(bitmap, np.float32).reshape(bitmap.height(), bitmap.width(), len(names))
         timeout = socket.getdefaulttimeout()

@@ -1,6 +1,7 @@
 """`mi-ntf export`: the mesh by value, against the photographed meshes, and in programs that read it."""
 
 import re
+import sys
 from pathlib import Path
 
 import mitsuba as mi
@@ -164,10 +165,9 @@ def test_thin_matter_has_a_surface_too(tmp_path: Path):
 
 
 @pytest.mark.parametrize(("name", "options", "says"), [
-    ("m.fbx", {}, r"the name ends in '\.fbx', expected one of \.ply, \.obj, \.glb, \.stl"),
+    ("m.fbx", {}, r"the name ends in '\.fbx', expected \.ply, \.obj, \.glb or \.stl"),
     ("m.ply", {"resolution": 4}, "--resolution is 4, expected 32 to 512 voxels per side"),
     ("m.ply", {"level": -1.0}, "--level is -1, expected a positive density"),
-    ("nowhere/m.ply", {}, "folder .*nowhere does not exist"),
 ])
 def test_faults_are_named_before_the_work(tmp_path: Path, name, options, says):
     with pytest.raises(MiNtfError, match=says):
@@ -175,8 +175,8 @@ def test_faults_are_named_before_the_work(tmp_path: Path, name, options, says):
 
 
 def test_without_the_extra_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(module.importlib.util, "find_spec", lambda name: None if name == "trimesh" else object())
-    with pytest.raises(MiNtfError, match=r"trimesh is missing: pip install 'mi-ntf\[mesh\]'"):
+    monkeypatch.setitem(sys.modules, "trimesh", None)
+    with pytest.raises(MiNtfError, match=r"a mesh needs the extra `mesh` \(trimesh missing\): run pip install"):
         export(STATUE, tmp_path / "m.ply")
 
 

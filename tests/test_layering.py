@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from helpers.programs import run_program
 
-from mi_ntf import doctor
+from mi_ntf.core.extras import EXTRAS
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -147,7 +147,7 @@ def test_third_parties_are_declared_where_they_are_used_and_nowhere_else():
     tops = {name.split(".")[0] for file in FILES for name in imports_of(file)} - {"mi_ntf"} - sys.stdlib_module_names
     # tensorboard is used by way of torch.utils.tensorboard, bokeh by distributed, nanobind's headers by the bridge.
     assert {PACKAGE_OF.get(name, name.lower()) for name in tops} | {"tensorboard", "bokeh", "nanobind"} == shipped
-    for extra, modules in doctor.EXTRAS.items():
+    for extra, modules in EXTRAS.items():
         assert {PACKAGE_OF.get(name, name.lower()) for name in modules} == declared[extra]
 
 

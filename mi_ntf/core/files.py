@@ -1,13 +1,13 @@
 """Atomic writing: a file is written under another name in its folder, then renamed.
 
-Neither an error, nor a full disk, nor ``kill -9`` leaves half a file under the final name.
+Neither an error, nor a full disk, nor ``kill -9`` leaves half a file under the final name. Missing folders are made.
 """
 
 import glob
 import os
 import platform
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -23,6 +23,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
     """
     path = Path(path)
     temporary = _temporary(path)
+    make_folder(path.parent)
     try:
         tidy(path)
         yield temporary
@@ -44,12 +45,22 @@ def write(path: str | Path, *content: str | bytes | memoryview) -> None:
             file.write(part.encode() if isinstance(part, str) else part)
 
 
-def check(path: str | Path) -> None:
-    """Raise MiNtfError if `path` cannot be written to; to be called before the work whose result belongs there."""
+def check(path: str | Path, suffixes: Sequence[str] = (), overwrite: bool = True) -> None:
+    """Raise MiNtfError if `path` cannot be written to; to be called before the work whose result belongs there.
+
+    Missing folders are made. With `suffixes`, such as (".ply", ".obj"), the name must end in one of them. Without
+    `overwrite`, the value of a command's option ``--overwrite``, the file must not exist.
+    """
     path = Path(path)
+    if suffixes and path.suffix.lower() not in suffixes:
+        expected = " or ".join(filter(None, [", ".join(suffixes[:-1]), suffixes[-1]]))
+        raise MiNtfError(f"{path}: the name ends in {path.suffix!r}, expected {expected}")
+    if path.is_dir():
+        raise MiNtfError(f"cannot write {path} (it is a folder); give the name of a file")
+    if path.exists() and not overwrite:
+        raise MiNtfError(f"{path} exists; choose another name, or add --overwrite to replace it")
+    make_folder(path.parent)
     try:
-        if path.is_dir():
-            raise IsADirectoryError("it is a folder")
         _temporary(path).touch()
         _temporary(path).unlink()
     except OSError as error:
@@ -88,8 +99,5 @@ def _alive(process: int) -> bool:
 
 
 def _fault(path: Path, error: Exception) -> MiNtfError:
-    folder = path.absolute().parent
-    if not folder.exists():
-        return MiNtfError(f"cannot write {path}: folder {path.parent} does not exist; create it first")
     reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error).rstrip(".")
     return MiNtfError(f"cannot write {path} ({reason}); free space there or choose another place")

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mi_ntf.core import ops, srgb
+from mi_ntf.core import extras, ops, srgb
 from mi_ntf.core.errors import MiNtfError, shown
 from mi_ntf.data import colour, exif, exr
 
@@ -180,10 +180,9 @@ def _read_tiff(path: Path) -> Decoded:
 
 def opencv(purpose: str) -> ModuleType:
     """Return the module `cv2`. Raises the MiNtfError that `purpose` needs it if it is not installed."""
-    try:
-        import cv2
-    except ImportError:
-        raise MiNtfError(f"{purpose} needs OpenCV, which is not installed: run pip install 'mi-ntf[train]'") from None
+    extras.need("train", purpose, "cv2")
+    import cv2
+
     return cv2
 
 

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..core import files
-from ..core.errors import MiNtfError
 from . import metrics
 from .limits import Json
 
@@ -21,9 +20,7 @@ PERCENTILE = 99.5
 
 def check(path: Path) -> None:
     """Raise :class:`MiNtfError` unless the file is a PNG that can be written."""
-    if path.suffix.lower() != ".png":
-        raise MiNtfError(f"picture {path}: unknown ending {path.suffix!r}; give .png")
-    files.check(path)
+    files.check(path, (".png",))
 
 
 def draw(path: Path, image: np.ndarray, reference: np.ndarray, result: Json) -> None:

@@ -1,11 +1,11 @@
 """Options of commands that choose the workers."""
 
-import importlib
 import os
 import subprocess
 from dataclasses import dataclass
 from typing import Literal
 
+from ..core import extras
 from ..core.errors import MiNtfError
 
 MODULES = {"dask": "distributed", "submitit": "submitit"}  # package that an engine needs
@@ -50,12 +50,8 @@ class Workers:
 
     def check_installed(self) -> None:
         """Raise MiNtfError if the package of the engine is not installed."""
-        module = MODULES[self.engine]
-        try:
-            importlib.import_module(module)
-        except ImportError as error:
-            raise MiNtfError(f"the engine {self.engine} needs {module} ({error}); install it with: "
-                             "pip install 'mi-ntf[cluster]'") from None
+        if self.engine in MODULES:
+            extras.need("cluster", f"the engine {self.engine}", MODULES[self.engine])
 
     def threads_each(self) -> int:
         """Return the number of threads of a worker of this machine."""

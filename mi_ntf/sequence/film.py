@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import files, ops, srgb
+from ..core import extras, files, ops, srgb
 from ..core.errors import MiNtfError
 from . import image_file
 
@@ -31,10 +31,8 @@ class Film:
 
     def check(self) -> None:
         """Raise MiNtfError where no film could be written, before any work."""
-        if self.path.suffix.lower() not in CODECS:
-            raise MiNtfError(f"film {self.path}: unknown ending {self.path.suffix!r}; give .mp4 or .webm")
         _ffmpeg()
-        files.check(self.path)
+        files.check(self.path, tuple(CODECS))
 
     @property
     def note(self) -> str:
@@ -90,8 +88,7 @@ def _even(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 def _ffmpeg() -> str:
     """Return the path of the program ffmpeg."""
-    try:
-        import imageio_ffmpeg
-    except ImportError:
-        raise MiNtfError("a film is written by ffmpeg: pip install 'mi-ntf[video]'") from None
+    extras.need("video", "a film")
+    import imageio_ffmpeg
+
     return str(imageio_ffmpeg.get_ffmpeg_exe())

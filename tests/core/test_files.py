@@ -59,11 +59,9 @@ def test_a_disk_that_fills_up_midway(tmp_path, room):
 def test_places_that_cannot_be_written_to(tmp_path):
     (tmp_path / "file").write_text("")
     for call in (files.check, lambda path: files.write(path, "x")):
-        with pytest.raises(MiNtfError, match=r"folder .*/no does not exist; create it first"):
-            call(tmp_path / "no" / "f")
-        with pytest.raises(MiNtfError, match=r"cannot write .*/file/f \(Not a directory\)"):
+        with pytest.raises(MiNtfError, match=r"cannot make the folder .*/file \(File exists\); choose another"):
             call(tmp_path / "file" / "f")
-        with pytest.raises(MiNtfError, match=r"cannot write \S+ \((it is a folder|Is a directory)\); free space"):
+        with pytest.raises(MiNtfError, match=r"cannot write \S+ \((it is a folder|Is a directory)\); "):
             call(tmp_path)
         with pytest.raises(MiNtfError, match=r"File name too long"):
             call(tmp_path / ("f" * 250))
@@ -71,6 +69,29 @@ def test_places_that_cannot_be_written_to(tmp_path):
         files.make_folder(tmp_path / "file" / "a" / "b")
     files.check(tmp_path / "good")
     assert names(tmp_path) == ["file"]
+
+
+def test_missing_folders_are_made(tmp_path):
+    files.check(tmp_path / "a" / "b" / "f")
+    files.write(tmp_path / "c" / "d" / "f", "x")
+    assert names(tmp_path / "a" / "b") == [] and names(tmp_path / "c" / "d") == ["f"]
+
+
+def test_a_finished_file_is_replaced_only_on_request(tmp_path):
+    path = tmp_path / "f.ply"
+    path.write_text("finished")
+    files.check(path, (".ply",), overwrite=True)
+    with pytest.raises(MiNtfError, match=r"f\.ply exists; choose another name, or add --overwrite to replace it"):
+        files.check(path, (".ply",), overwrite=False)
+    assert path.read_text() == "finished"
+
+
+def test_an_unknown_suffix_is_refused_before_anything_is_made(tmp_path):
+    with pytest.raises(MiNtfError, match=r"f\.png: the name ends in '\.png', expected \.ply, \.obj or \.stl"):
+        files.check(tmp_path / "no" / "f.png", (".ply", ".obj", ".stl"))
+    with pytest.raises(MiNtfError, match=r"f: the name ends in '', expected \.exr$"):
+        files.check(tmp_path / "f", (".exr",))
+    assert names(tmp_path) == []
 
 
 def test_only_files_of_killed_writers_are_removed(tmp_path):

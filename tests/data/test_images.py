@@ -79,7 +79,7 @@ def test_tiff_of_8_bits_is_srgb_and_what_is_no_tiff_is_refused(tmp_path):
 def test_without_opencv_the_extra_is_named(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "cv2", None)
     (tmp_path / "a.tif").touch()
-    with pytest.raises(MiNtfError, match=r"a.tif: TIFF of more than 8 bits needs OpenCV, .* run pip install .mi-ntf"):
+    with pytest.raises(MiNtfError, match=r"a.tif: TIFF of more than 8 bits needs the extra `train` \(cv2 missing"):
         images.read_image(tmp_path / "a.tif")
 
 
@@ -123,3 +123,18 @@ def test_bright_pixels_keep_their_value(tmp_path):
     for name, dtype in (("dim", np.float16), ("bright", np.float32)):
         with OpenEXR.File(str(tmp_path / f"{name}.exr")) as file:
             assert file.channels()["RGBA"].pixels.dtype == dtype
+
+
+@pytest.mark.parametrize("suffix", ["webp", "bmp"])
+def test_other_files_of_8_bits(tmp_path, suffix):
+    rgb = np.random.default_rng(0).integers(0, 256, (4, 3, 3)).astype(np.uint8)
+    Image.fromarray(rgb).save(tmp_path / f"a.{suffix}", lossless=True)
+    np.testing.assert_array_equal(images.decode(tmp_path / f"a.{suffix}").rgb, rgb)
+    assert images.size_of(tmp_path / f"a.{suffix}") == (3, 4)
+
+
+@pytest.mark.parametrize("suffix", [".heic", ".HEIC", ".cr2", ".avif"])
+def test_photographs_of_telephones_and_raw_files_say_what_to_do(tmp_path, suffix):
+    (tmp_path / f"a{suffix}").write_bytes(b"\0\0\0\x18ftypheic" + bytes(99))
+    with pytest.raises(MiNtfError, match=rf"a{suffix}: images of type '{suffix}' are not read; convert it to .exr, "):
+        images.decode(tmp_path / f"a{suffix}")

@@ -62,10 +62,8 @@ def test_equal_and_odd_shapes_are_drawn(tmp_path):
 
 
 def test_compare_refuses_a_bad_name_before_it_reads(tmp_path):
-    with pytest.raises(MiNtfError, match=r"picture p.jpg: unknown ending '.jpg'; give .png"):
+    with pytest.raises(MiNtfError, match=r"p.jpg: the name ends in '.jpg', expected .png"):
         compare("nowhere.exr", "nowhere.exr", compare_picture.Path("p.jpg"))
-    with pytest.raises(MiNtfError, match=r"cannot write .*folder .* does not exist; create it first"):
-        compare("nowhere.exr", "nowhere.exr", tmp_path / "no" / "p.png")
 
 
 def test_compare_writes_it_and_names_it(tmp_path):

@@ -164,7 +164,7 @@ def test_a_bad_engine_is_bad_usage(tmp_path, capsys):
 @pytest.mark.parametrize(("engine", "module"), [("dask", "distributed"), ("submitit", "submitit")])
 def test_an_engine_that_is_absent_is_named_with_its_remedy(engine, module, monkeypatch):
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(MiNtfError, match=rf"the engine {engine} needs {module} .*pip install 'mi-ntf\[cluster\]'"):
+    with pytest.raises(MiNtfError, match=rf"the engine {engine} needs the extra `cluster` \({module} missing\): run"):
         jobs.run(chores.square, [1], jobs.Workers(engine, 2), quiet=True)
 
 
