@@ -14,7 +14,8 @@ _pressed = threading.Event()
 def noticed() -> Iterator[threading.Event]:
     """Yield an event that Ctrl-C sets within the block, besides raising KeyboardInterrupt as always.
 
-    In threads other than the main one, which receive no signals, the event stays unset. Blocks may be nested.
+    Errors that it causes leave the block as KeyboardInterrupt. In threads other than the main one, which receive no
+    signals, the event stays unset. Blocks may be nested.
     """
     if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGINT) is _press:
         yield _pressed
@@ -22,9 +23,26 @@ def noticed() -> Iterator[threading.Event]:
     before = signal.signal(signal.SIGINT, _press)
     try:
         yield _pressed
+    except Exception:
+        if _pressed.is_set():
+            raise KeyboardInterrupt from None
+        raise
     finally:
         signal.signal(signal.SIGINT, before)
         _pressed.clear()
+
+
+@contextmanager
+def ignored() -> Iterator[None]:
+    """Make processes that start in the block ignore Ctrl-C: this process ends them, and they would print tracebacks."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _press(_number: int, _frame: object) -> None:

@@ -31,8 +31,11 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import TracebackType
+from typing import TypeVar
 
 from . import interruption
+
+S = TypeVar("S", bound="Stage")
 
 BLINK, PLAIN = 0.25, 10.0
 """Seconds between two updates of a terminal's line, and between two plain lines."""
@@ -60,7 +63,7 @@ class Stage:
     shown
         False: show nothing.
     write
-        Function for plain lines in place of standard error, and their `interval` in seconds.
+        Function for plain lines in place of standard error, the first after `interval` seconds.
     """
 
     def __init__(self, title: str, total: int = 0, *, done: int = 0, seconds: float = 0.0, then: str = "",
@@ -70,9 +73,10 @@ class Stage:
         self.done, self.text = float(done), ""
         self._seconds, self._warm, self._inner, self._shown = seconds, done + warm if total else 0, inner, shown
         self._begin = self._last = time.monotonic()
+        self.visible = False
         self._base: tuple[float, float] | None = None  # time and what was done, from which the rate is measured
 
-    def __enter__(self) -> Stage:
+    def __enter__(self: S) -> S:
         if self._shown:
             _shown.begin(self, self._inner)
         return self
@@ -101,7 +105,8 @@ class Stage:
             if done > 0 and (self._base is None or done <= self._warm):
                 self._base = self._last, done
         self.done, self.text = done, text
-        _shown.draw()
+        if self.visible:
+            _shown.draw()
 
     def left(self) -> float | None:
         """Return the seconds that are left, None before there is an estimate."""
@@ -141,15 +146,21 @@ class _Shown:
             if self.silent or (inner and not self._stages):
                 return
             self._stages.append(stage)
-            if len(self._stages) == 1:
-                self._over = threading.Event()
-                threading.Thread(target=self._keep_drawing, args=(self._over, self._pace()), daemon=True).start()
-            self.draw(len(self._stages) == 1)
+            stage.visible = True
+            try:
+                if len(self._stages) == 1:
+                    self._over = threading.Event()
+                    threading.Thread(target=self._keep_drawing, args=(self._over, self._pace()), daemon=True).start()
+                self.draw(len(self._stages) == 1 and not stage.write)
+            except BaseException:
+                self.end(stage)
+                raise
 
     def end(self, stage: Stage) -> None:
         with self._lock:
             if stage in self._stages:
                 self._stages.remove(stage)
+                stage.visible = False
                 if not self._stages:
                     self._over.set()
                 self.clear()
@@ -212,9 +223,9 @@ def silent(yes: bool = True) -> Iterator[None]:
         _shown.silent = before
 
 
-def say(text: str) -> None:
-    """Print a line on standard error, above the progress, unless that is silent."""
-    if not _shown.silent:
+def say(text: str, warning: bool = False) -> None:
+    """Print a line on standard error, above the progress. A warning is printed even if progress is silent."""
+    if warning or not _shown.silent:
         clear()
         _print(text)
 

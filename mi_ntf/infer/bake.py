@@ -36,15 +36,16 @@ def bake(field: NetworkField, resolution: int, dj: ModuleType,
     trilinear interpolation is right on average (Condat and Möller 2011, quasi-interpolation); none exceeds the highest
     sample. ``reflectance``, only of fields with a slow network, has the 8 channels of :func:`flat`. ``hull`` (k, 3):
     points whose convex hull holds all density. ``numbers``: upper bound of the density; highest specular lobe,
-    s/(4 α²), at a voxel with matter. `progress` counts the sampled densities.
+    s/(4 α²), at a voxel with matter. `progress` receives about the fraction of the time.
     """
-    places, values = _density(field, resolution, dj, progress)
+    places, values = _density(field, resolution, dj, lambda done: progress(0.6 * done))
     coarse = min(resolution, REFLECTANCE_RESOLUTION)
     octants = bricks.octants_of(values > LOG_MIN_DENSITY)
     ends, matter = _outline(places, values, resolution, coarse)
     result = _named("density", bricks.pack(values[:, None], places, octants, resolution, LOG_FLOOR))
     majorant = float(np.exp(values.max())) if len(values) else 0.0
     del values
+    progress(0.7)
     index = np.flatnonzero(matter)
     matter_reflectance = at_voxels(lambda p: flat(field.reflectance(p)), 8, index, coarse, dj)
     gloss = float((matter_reflectance[:, 7] / (4 * matter_reflectance[:, 6] ** 4)).max(initial=0.0))

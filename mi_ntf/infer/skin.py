@@ -9,7 +9,7 @@ from ..core import skin
 from ..core.ops import dot
 from . import ops
 from .backend import floats
-from .bake import REFLECTANCE_RESOLUTION, at_voxels, flat
+from .bake import REFLECTANCE_RESOLUTION, Progress, at_voxels, flat
 from .bricks import of_dense
 from .bundle import density_where, onward, safe_inverse
 from .grid import GridField, bricks_of
@@ -39,14 +39,14 @@ def measured(grid: GridField, dj: ModuleType) -> Softness:
     return Softness(measure(grid, dj), dj)
 
 
-def measure(grid: GridField, dj: ModuleType) -> dict[str, np.ndarray]:
-    """Return the arrays of a :class:`Softness` of `grid`."""
-    values, solid = _measure(grid, min(grid.resolution, REFLECTANCE_RESOLUTION), dj)
+def measure(grid: GridField, dj: ModuleType, progress: Progress = lambda done: None) -> dict[str, np.ndarray]:
+    """Return the arrays of a :class:`Softness` of `grid`; `progress` receives the fraction of the work that is done."""
+    values, solid = _measure(grid, min(grid.resolution, REFLECTANCE_RESOLUTION), dj, progress)
     arrays = of_dense(values[..., None], values > 0)
     return {f"softness.{name}": array for name, array in arrays.items()} | {"solid": np.array([solid])}
 
 
-def _measure(grid: GridField, n: int, dj: ModuleType) -> tuple[np.ndarray, float]:
+def _measure(grid: GridField, n: int, dj: ModuleType, progress: Progress) -> tuple[np.ndarray, float]:
     """Return the softness (z, y, x), float32, and the fraction of skins that are opaque."""
     solid = 0.0
     result, known = np.zeros((n, n, n), np.float32), np.zeros((n, n, n), bool)
@@ -74,7 +74,8 @@ def _measure(grid: GridField, n: int, dj: ModuleType) -> tuple[np.ndarray, float
         x, normal = _centres(index, n, dj), tuple(floats(c, dj) for c in normals.T)
         out, inward = floats(out, dj), floats(inward, dj)
         sigma, total = grid.density(x), dj.Float(0)
-        for turn in skin.TURNS:
+        for number, turn in enumerate(skin.TURNS):
+            progress((2 + number) / (2 + len(skin.TURNS)))
             d = skin.across(ops, normal, tuple(dr.opaque(dj.Float, c) for c in turn))
             total = total + skin.squared_horizon(ops, out, _depth(grid, x, d, skin.FLATTEST * out), sigma)
             dr.eval(total)

@@ -3,14 +3,13 @@
 import contextlib
 import itertools
 import logging
-import signal
-import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import distributed
 
+from ..core import interruption
 from ..core.errors import MiNtfError
 from .options import Workers, gpus
 from .worker import Answer, Setup, attempt, environment
@@ -50,7 +49,7 @@ class Dask:
         stack.enter_context(environment(variables))  # Dask sets them in this process, too, and never restores them
         # No limit of memory: Dask's limit is no measure of the memory that a picture needs for a moment.
         try:
-            with _without_ctrl_c():
+            with interruption.ignored():
                 cluster = distributed.LocalCluster(
                     n_workers=workers.workers, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0",
                     memory_limit=0, env=variables)
@@ -110,19 +109,6 @@ def try_task(work: bytes, index: int, task: object, threads: int | None, devices
     worker = distributed.get_worker()
     gpu = devices[int(str(worker.name)) % len(devices)] if devices else None
     return attempt(Setup(threads or worker.state.nthreads, gpu), work, index, task, worker.address)
-
-
-@contextlib.contextmanager
-def _without_ctrl_c() -> Iterator[None]:
-    """Make processes that start in the block ignore Ctrl-C: this process ends them, and they would print tracebacks."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def _connect(address: str | distributed.LocalCluster) -> distributed.Client:

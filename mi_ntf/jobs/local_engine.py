@@ -9,6 +9,7 @@ from multiprocessing import connection
 from multiprocessing.process import BaseProcess
 from typing import cast
 
+from ..core import interruption
 from .options import Workers, gpus
 from .worker import Answer, Setup, environment, serve
 
@@ -65,7 +66,7 @@ class _Slot:
             context = multiprocessing.get_context("spawn")  # Dr.Jit's threads do not survive a fork
             self.pipe, theirs = context.Pipe()
             self._process = context.Process(target=serve, args=(theirs, self._setup, self._work), daemon=True)
-            with environment(self._setup.variables()):
+            with environment(self._setup.variables()), interruption.ignored():
                 self._process.start()
             theirs.close()
         assert self.pipe is not None

@@ -1,17 +1,13 @@
-"""Tasks are handed to an engine and tried again if they fail, with one progress bar for all of them."""
+"""Tasks are handed to an engine and tried again if they fail, with one line of progress for all of them."""
 
 import pickle
-import sys
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Generic, Protocol, TypeVar, cast
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
+from ..core import interruption, progress
 from ..core.errors import MiNtfError
 from .options import Workers
 from .worker import Answer, describe
@@ -49,24 +45,23 @@ class Done(Generic[Result]):
 
 
 def run(work: Callable[[Task], Result], tasks: Sequence[Task], workers: Workers = Workers(), *,  # noqa: B008
-        title: str = "tasks", names: Sequence[str] = (), folder: Path | None = None, quiet: bool = False
-        ) -> list[Result]:
+        title: str = "tasks", names: Sequence[str] = (), folder: Path | None = None, done: int = 0) -> list[Result]:
     """Return ``work(task)`` for each of `tasks`, in their order; :func:`each` explains the parameters.
 
     Raises MiNtfError if tasks fail, after all others are done.
     """
-    ends = sorted(each(work, tasks, workers, title=title, names=names, folder=folder, quiet=quiet),
-                  key=lambda done: done.index)
-    failed = [f"{_name(done.index, names)}: {done.error}" for done in ends if done.error]
+    ends = sorted(each(work, tasks, workers, title=title, names=names, folder=folder, done=done),
+                  key=lambda end: end.index)
+    failed = [f"{_name(end.index, names)}: {end.error}" for end in ends if end.error]
     if failed:
         more = f"; and {len(failed) - SHOWN} more" if len(failed) > SHOWN else ""
         raise MiNtfError(f"{len(failed)} of {len(tasks)} {title} failed, the others are done: "
                          f"{'; '.join(failed[:SHOWN])}{more}. Run the same command again once that is mended")
-    return [done.value for done in ends]
+    return [end.value for end in ends]
 
 
 def each(work: Callable[[Task], Result], tasks: Sequence[Task], workers: Workers = Workers(), *,  # noqa: B008
-         title: str = "tasks", names: Sequence[str] = (), folder: Path | None = None, quiet: bool = False
+         title: str = "tasks", names: Sequence[str] = (), folder: Path | None = None, done: int = 0
          ) -> Generator[Done[Result], None, None]:
     """Yield the end of every task as it comes, in any order. Closing the generator ends the work.
 
@@ -79,36 +74,41 @@ def each(work: Callable[[Task], Result], tasks: Sequence[Task], workers: Workers
     workers : Workers
         This process tries a task once, other workers ``ATTEMPTS`` times.
     title : str
-        Plural noun for the tasks, for the progress bar.
+        Plural noun for the tasks, for the line of progress.
     names : sequence of str, optional
         Names of the tasks for messages, their numbers by default.
     folder : Path, optional
         Place for the files of the engine ``submitit``, visible to all machines; they are removed after success.
-    quiet : bool
-        Shows no bar.
+    done : int
+        Number of tasks that earlier runs have done, for the line of progress.
 
     Raises
     ------
     MiNtfError
         If options do not fit, an engine is not available, or workers end as soon as they begin.
+    KeyboardInterrupt
+        After Ctrl-C, with the number of tasks that are done.
     """
     workers.check()
     if not tasks:
         return
-    with _bar(title, len(tasks), quiet) as (notify, advance):
+    if done:
+        progress.say(f"goes on: {done} of {done + len(tasks)} {title} are there")
+    with progress.Stage(title, done + len(tasks), done=done, then="the same command goes on",
+                        warm=workers.workers or 1) as stage:
         if workers.here:
             for index, task in enumerate(tasks):
                 yield _do(work, index, task)
-                advance()
+                stage.advance()
             return
-        engine = _engine(workers, _pickled(work), folder, notify)
+        engine = _engine(workers, _pickled(work), folder, progress.say)
         try:
             if engine.about:
-                notify(engine.about)
-            for answer in _answers(engine, tasks, names, BARREN + 2 * (workers.workers or 0), notify):
+                progress.say(engine.about)
+            for answer in _answers(engine, tasks, names, BARREN + 2 * (workers.workers or 0)):
                 yield Done(answer.index, cast(Result, None if answer.error else pickle.loads(answer.value)),
                            answer.error)
-                advance()
+                stage.advance()
         finally:
             engine.close()
 
@@ -117,11 +117,12 @@ def _do(work: Callable[[Task], Result], index: int, task: Task) -> Done[Result]:
     try:
         return Done(index, work(task))
     except Exception as error:
+        if interruption.caused(error):
+            raise KeyboardInterrupt from None
         return Done(index, cast(Result, None), describe(error))
 
 
-def _answers(engine: Engine, tasks: Sequence[object], names: Sequence[str], barren: int, notify: Callable[[str], None]
-             ) -> Iterator[Answer]:
+def _answers(engine: Engine, tasks: Sequence[object], names: Sequence[str], barren: int) -> Iterator[Answer]:
     """Yield the last answer to each task, which is tried until it is done or has failed often enough."""
     for index, task in enumerate(tasks):
         engine.submit(index, task)
@@ -134,7 +135,7 @@ def _answers(engine: Engine, tasks: Sequence[object], names: Sequence[str], barr
             raise MiNtfError(f"{lost} workers ended one after the other without an answer, the last one: "
                              f"{answer.error}; mend that and run again")
         if answer.error and not answer.last and attempts[answer.index] < ATTEMPTS:
-            notify(f"{_name(answer.index, names)}: {answer.error}; it is tried again")
+            progress.say(f"{_name(answer.index, names)}: {answer.error}; it is tried again", warning=True)
             engine.submit(answer.index, tasks[answer.index], answer.where)
             continue
         waiting -= 1
@@ -165,25 +166,6 @@ def _pickled(work: Callable[[Task], Result]) -> bytes:
         return pickle.dumps(work)
     except (pickle.PicklingError, AttributeError, TypeError) as error:
         raise MiNtfError(f"{name} cannot be sent to workers ({error}); give a function of a module") from None
-
-
-@contextmanager
-def _bar(title: str, total: int, quiet: bool) -> Iterator[tuple[Callable[[str], None], Callable[[], None]]]:
-    """Yield functions that print a line above the bar, and that count one task more."""
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
-               TextColumn("left"), TimeRemainingColumn())
-    progress = Progress(*columns, console=console, transient=True)
-    with nullcontext() if quiet else progress:
-        bar = progress.add_task(title, total=total)
-
-        def notify(text: str) -> None:
-            if quiet:
-                print(text, file=sys.stderr)
-            else:
-                console.print(text, markup=False, soft_wrap=True)
-
-        yield notify, lambda: progress.advance(bar)
 
 
 def _name(index: int, names: Sequence[str]) -> str:

@@ -4,11 +4,12 @@ The stock program shows messages from level Info on, Python from level Warn on.
 """
 
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from types import TracebackType
 
 import drjit as dr
 import mitsuba as mi
+
+from ..core import progress
 
 INTERVAL = 3.0
 """Seconds between two lines of progress. Shorter work shows none."""
@@ -31,6 +32,7 @@ def debug(text: str) -> None:
 
 def _log(level: mi.LogLevel, text: str) -> None:
     # File names may hold bytes that the locale cannot decode. Python represents them as lone surrogates.
+    progress.clear()
     readable = text.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
     mi.Log(level, readable)  # type: ignore[operator]  # Mitsuba's stubs leave it out
 
@@ -40,35 +42,27 @@ def resolve(path: str) -> str:
     return str(mi.file_resolver().resolve(path))  # type: ignore[operator]  # Mitsuba's stubs leave it out
 
 
-@contextmanager
-def timed(action: str) -> Iterator[None]:
-    """Log `action` after the block, with the seconds that the block took."""
-    begin = time.perf_counter()
-    yield
-    info(f"{action} ({time.perf_counter() - begin:.2g} s)")
+class Work(progress.Stage):
+    """Work of the plugin `who`, which is part of the progress of a command.
 
-
-class Progress:
-    """Progress of long work called `name`, with an estimate of the remaining time.
-
-    Logs a line every ``INTERVAL`` seconds.
+    At level Info it is logged instead: every ``INTERVAL`` seconds while it lasts, and `ended` with the seconds.
     """
 
-    def __init__(self, name: str) -> None:
-        self._name, self._begin = name, time.perf_counter()
-        self._last = self._begin
+    def __init__(self, who: str, title: str, seconds: float = 0.0) -> None:
+        self._logs = bool(mi.log_level() <= mi.LogLevel.Info)
+        super().__init__(title, seconds=seconds, inner=not self._logs, interval=INTERVAL,
+                         write=(lambda text: info(f"{who}: {text}")) if self._logs else None)
+        self.ended, self._who, self._waited = title, who, 0.0
 
-    def __call__(self, done: float) -> None:
-        """Report that the fraction `done` of the work has been started; wait for queued kernels before a line."""
-        if not 0 < done < 1 or time.perf_counter() - self._last < INTERVAL:
-            return
-        dr.sync_thread()
-        self._last = time.perf_counter()
-        remaining = (self._last - self._begin) * (1 / done - 1)
-        info(f"{self._name}: {done:.0%}, about {_duration(remaining)} left")
+    def update(self, done: float, text: str = "") -> None:
+        """Show the fraction `done` of the work that was started, after queued kernels have ended."""
+        if self.visible and time.monotonic() - self._waited > 1:
+            dr.sync_thread()
+            self._waited = time.monotonic()
+        super().update(done, text)
 
-
-def _duration(seconds: float) -> str:
-    if seconds < 100:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+                 ) -> None:
+        super().__exit__(kind, error, trace)
+        if error is None and self._logs and self.ended:
+            info(f"{self._who}: {self.ended} ({self.seconds():.2g} s)")

@@ -1,16 +1,15 @@
 """The work of ``mi-ntf sequence``: list the frames, check which exist, render the others."""
 
 import re
-import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from ..core import files
+from ..core import files, progress
 from ..core.errors import MiNtfError
 from ..jobs import Workers, each
 from ..render.scene.environment_option import Environment
@@ -82,8 +81,7 @@ def tasks_of(scene: Path, folder: Path, frames: list[Frame], variant: str = "",
 def check(tasks: list[Task]) -> Check:
     """Read all files that the tasks would write."""
     result = Check(len(tasks))
-    for task in tasks:
-        fault = _fault(task)
+    for _, fault in _faults(tasks):
         if fault is None:
             result.done += 1
         else:
@@ -91,7 +89,7 @@ def check(tasks: list[Task]) -> Check:
     return result
 
 
-def run(tasks: list[Task], work: Callable[[Task], float] = render, quiet: bool = False, film: Film | None = None,
+def run(tasks: list[Task], work: Callable[[Task], float] = render, film: Film | None = None,
         workers: Workers = Workers()) -> Summary:  # noqa: B008
     """Render the frames that are not there yet, and at the end their `film`.
 
@@ -104,23 +102,26 @@ def run(tasks: list[Task], work: Callable[[Task], float] = render, quiet: bool =
     if tasks:
         files.make_folder(Path(tasks[0].folder))
     todo = []
-    for task in tasks:
-        fault = _fault(task)
+    for task, fault in _faults(tasks):
         if fault is not None:
             todo.append(task)
             if fault.kind != "missing":
-                print(f"mi-ntf: made anew: {fault.text}", file=sys.stderr)
-    seconds = _rendered(todo, work, workers, quiet)
+                progress.say(f"mi-ntf: made anew: {fault.text}", warning=True)
+    seconds = _rendered(todo, len(tasks) - len(todo), work, workers)
     if film:
-        film.write(task.path for task in tasks)
+        with progress.Stage(f"encoding {film.path}", then="all frames are there, and the same command makes the film"):
+            film.write(task.path for task in tasks)
     return Summary(tasks[0].folder if tasks else "", len(tasks), len(tasks) - len(todo), len(todo),
                    time.perf_counter() - begin, seconds[0] if seconds else None,
                    float(np.median(seconds[1:])) if seconds[1:] else None, seconds,
                    str(film.path) if film else None, film.note if film else None)
 
 
-def _rendered(tasks: list[Task], work: Callable[[Task], float], workers: Workers, quiet: bool) -> list[float]:
-    """Render the frames of `tasks` and return the seconds of each, in the order in which they ended."""
+def _rendered(tasks: list[Task], existing: int, work: Callable[[Task], float], workers: Workers) -> list[float]:
+    """Render the frames of `tasks` and return the seconds of each, in the order in which they ended.
+
+    `existing` is the number of frames that are there already.
+    """
     if not tasks:
         return []
     folder = Path(tasks[0].folder).absolute()
@@ -129,7 +130,7 @@ def _rendered(tasks: list[Task], work: Callable[[Task], float], workers: Workers
         tasks = [replace(task, scene=str(Path(task.scene).absolute()), folder=str(folder)) for task in tasks]
     seconds: list[float] = []
     errors: list[str] = []
-    with closing(each(work, tasks, workers, title="frames", names=names, folder=folder, quiet=quiet)) as results:
+    with closing(each(work, tasks, workers, title="frames", names=names, folder=folder, done=existing)) as results:
         for result in results:
             if not result.error:
                 seconds.append(result.value)
@@ -156,6 +157,16 @@ def print_summary(summary: Summary) -> None:
         print(f"the first in {summary.first:.2f} s, each of the others in {summary.each:.2f} s (median)")
     if summary.film is not None:
         print(f"{summary.film}: {summary.toned}")
+    elif summary.images > 1:
+        print("next: the same command with --film FILM.mp4 makes a film of them")
+
+
+def _faults(tasks: list[Task]) -> Iterator[tuple[Task, image_file.Fault | None]]:
+    """Yield each task with the fault of its file, None if the file is intact."""
+    with progress.Stage("frames looked for", len(tasks), then="nothing was changed") as stage:
+        for task in tasks:
+            yield task, _fault(task)
+            stage.advance()
 
 
 def _fault(task: Task) -> image_file.Fault | None:

@@ -43,7 +43,7 @@ def variant(monkeypatch, folder):
 def done(folder):
     """The study of two fields on a floor under three lights; tests of what it leaves share it."""
     mi.set_variant(VARIANT)
-    study.tradeoff(folder / "many.xml", folder / "out", {}, 4.0, quiet=True)
+    study.tradeoff(folder / "many.xml", folder / "out", {}, 4.0)
     return folder / "out"
 
 
@@ -151,7 +151,7 @@ def test_an_interrupted_study_renders_what_is_missing(folder, done, counted, tmp
     at = [i for i, line in enumerate(lines) if line.startswith('{"name": "way ')]
     names = [json.loads(lines[i])["values"]["method"] for i in at]
     (out / kept.NAME).write_text("".join(lines[: at[4]]) + lines[at[4]][:50])
-    result = study.tradeoff(folder / "many.xml", out, {}, 4.0, quiet=True)
+    result = study.tradeoff(folder / "many.xml", out, {}, 4.0)
     assert [row["method"] for row in result["ways"]] == names and result["finished"]
     again = {*counted} - {"raymarch", "stock"}  # raymarch is the small render that shows how steady the machine is
     assert again == {*names[4:]} - {"raymarch", ways.STOCK}
@@ -180,7 +180,7 @@ def test_what_begins_anew_renders_its_own_reference(folder, done, tmp_path, lost
     shutil.copytree(done, out)
     if lost:
         (out / kept.NAME).unlink()
-    result = study.tradeoff(folder / "one.xml", out, {"res": "16"}, 1.0, quiet=True)
+    result = study.tradeoff(folder / "one.xml", out, {"res": "16"}, 1.0)
     assert result["finished"] and result["size"] == (16, 16)
     with np.load(out / kept.PICTURES / "reference.npz") as file:
         assert file["image"].shape == (16, 16, 3)
@@ -259,7 +259,7 @@ def test_a_way_that_fails_is_a_row_that_says_why(folder, tmp_path, monkeypatch):
         return once(scene, integrator, *rest)
 
     monkeypatch.setattr(measure, "once", failing)
-    study.tradeoff(folder / "one.xml", tmp_path, {"res": "16"}, 1.0, quiet=True)
+    study.tradeoff(folder / "one.xml", tmp_path, {"res": "16"}, 1.0)
     rows = {row["way"]: row for row in result_of(tmp_path)["ways"]}
     assert rows["transmittance_map"]["reason"] == "no room for maps" and rows["raymarch"]["points"]
     assert "failed: no room for maps" in outline((tmp_path / "index.html").read_text()).texts
@@ -280,7 +280,7 @@ def test_what_is_built_is_built_anew_for_each_way(folder, tmp_path, monkeypatch)
                             name, lambda *v: made.append(name) or make(*v), *rest, **options))
     for _ in range(2):
         shutil.rmtree(tmp_path / "out", ignore_errors=True)
-        study.tradeoff(folder / "one.xml", tmp_path / "out", {"res": "16"}, 1.0, quiet=True)
+        study.tradeoff(folder / "one.xml", tmp_path / "out", {"res": "16"}, 1.0)
     maps = {name for name in made}
     assert all(made.count(name) >= 2 for name in maps) and len(maps) >= 2
     assert not list((folder / "cache").rglob("maps/*"))
@@ -298,7 +298,7 @@ def fake_study(folder, tmp_path, monkeypatch, budget):
     monkeypatch.setattr(study.Study, "_probe", lambda self, render: None)
     monkeypatch.setattr(study.Study, "_try", use)
     monkeypatch.setattr(study.Study, "result", lambda self: self.state.lines["end"])
-    return shares, study.tradeoff(folder / "one.xml", tmp_path, {}, budget, quiet=True)["left_out"]
+    return shares, study.tradeoff(folder / "one.xml", tmp_path, {}, budget)["left_out"]
 
 
 def test_the_budget_is_shared_evenly(folder, tmp_path, monkeypatch):
@@ -349,7 +349,7 @@ def test_a_reference_that_is_missing_is_refused(folder, tmp_path):
 
 def test_a_captured_mesh_adds_the_exported_one_and_a_second_error(folder, tmp_path):
     """Any scene of other shapes stands for the captured mesh."""
-    result = study.tradeoff(folder / "one.xml", tmp_path, {"res": "16"}, 1.0, folder / "one.xml", quiet=True)
+    result = study.tradeoff(folder / "one.xml", tmp_path, {"res": "16"}, 1.0, folder / "one.xml")
     rows = {r["method"]: r for r in result["ways"]}
     assert rows["mesh"]["points"] and "mi-ntf export " in rows["mesh"]["command"]
     assert "are not counted" in rows["mesh"]["note"] and '<shape type="ply">' in rows["mesh"]["xml"]

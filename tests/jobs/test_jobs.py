@@ -51,7 +51,7 @@ def test_failing_tasks_are_tried_again_and_told_after_the_others(engine, tmp_pat
     (tmp_path / "out").mkdir()
     tasks = [(tmp_path / "out", number) for number in range(12)]
     results, failed = {}, {}
-    for done in jobs.each(chores.write, tasks, jobs.Workers(engine, 2), folder=tmp_path / "jobs", quiet=True):
+    for done in jobs.each(chores.write, tasks, jobs.Workers(engine, 2), folder=tmp_path / "jobs"):
         (failed if done.error else results)[done.index] = done.error or done.value
     assert results == {number: number**2 for number in range(12) if number not in (3, 9)}
     assert failed[3] == "this is none of mine; give another"
@@ -64,26 +64,26 @@ def test_failing_tasks_are_tried_again_and_told_after_the_others(engine, tmp_pat
 def test_one_error_names_what_failed(tmp_path):
     with pytest.raises(MiNtfError, match=r"^1 of 4 views failed, the others are done: c: this is none of mine; give "
                                          r"another\. Run the same command again once that is mended$"):
-        jobs.run(chores.write, [(tmp_path, n) for n in (1, 2, 3, 4)], title="views", names="abcd", quiet=True)
+        jobs.run(chores.write, [(tmp_path, n) for n in (1, 2, 3, 4)], title="views", names="abcd")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["1-0", "2-0", "3-0", "4-0"]  # in this process: tried once
 
 
 def test_files_of_submitit_are_open_to_this_user_alone(tmp_path):
     """They are pickles, which run what they say."""
-    list(jobs.each(chores.write, [(tmp_path, 3)], jobs.Workers("submitit", 1), folder=tmp_path / "jobs", quiet=True))
+    list(jobs.each(chores.write, [(tmp_path, 3)], jobs.Workers("submitit", 1), folder=tmp_path / "jobs"))
     (folder_left,) = (tmp_path / "jobs").iterdir()  # since the task fails
     assert folder_left.stat().st_mode & 0o777 == 0o700
 
 
 def test_submitit_leaves_nothing_where_all_went_well(tmp_path):
-    assert jobs.run(chores.square, range(9), jobs.Workers("submitit", 2), folder=tmp_path, quiet=True) == \
+    assert jobs.run(chores.square, range(9), jobs.Workers("submitit", 2), folder=tmp_path) == \
         [n * n for n in range(9)]
     assert list(tmp_path.iterdir()) == []
 
 
 def test_workers_are_processes_with_their_threads_and_a_gpu_each(monkeypatch):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5")
-    results = jobs.run(chores.place, range(8), jobs.Workers("local", 2, threads=3), quiet=True)
+    results = jobs.run(chores.place, range(8), jobs.Workers("local", 2, threads=3))
     gpus = {pid: about.pop("CUDA_VISIBLE_DEVICES") for pid, about in results}
     assert sorted(gpus.values()) == ["3", "5"] and os.getpid() not in gpus
     assert all(about == {"OMP_NUM_THREADS": "3", "drjit": 3} for _, about in results)
@@ -92,7 +92,7 @@ def test_workers_are_processes_with_their_threads_and_a_gpu_each(monkeypatch):
 
 def test_a_worker_of_one_thread_reads_exr_files():
     environment = Path(__file__).parents[2] / "scenes" / "common" / "env.exr"
-    assert jobs.run(chores.read, [environment], jobs.Workers("local", 1, threads=1), quiet=True) == [(32, 64, 3)]
+    assert jobs.run(chores.read, [environment], jobs.Workers("local", 1, threads=1)) == [(32, 64, 3)]
 
 
 def test_gpus_are_counted_without_loading_anything(monkeypatch, tmp_path):
@@ -107,12 +107,12 @@ def test_gpus_are_counted_without_loading_anything(monkeypatch, tmp_path):
 def test_workers_that_all_end_are_not_tried_for_ever(monkeypatch):
     monkeypatch.setattr(running, "BARREN", 1)
     with pytest.raises(MiNtfError, match=r"3 workers ended one after the other without an answer, .*SIGKILL"):
-        jobs.run(chores.die, range(1000), jobs.Workers("local", 1, threads=1), quiet=True)
+        jobs.run(chores.die, range(1000), jobs.Workers("local", 1, threads=1))
 
 
 def test_work_that_is_not_waited_for_ends(tmp_path):
     tasks = [tmp_path / "slow"]
-    going = jobs.each(chores.sleep, [*tasks, "no path"], jobs.Workers("local", 2), quiet=True)
+    going = jobs.each(chores.sleep, [*tasks, "no path"], jobs.Workers("local", 2))
     assert "write_text" in next(going).error  # three attempts long, in which the other has begun
     pid = int(tasks[0].read_text())
     going.close()
@@ -122,9 +122,9 @@ def test_work_that_is_not_waited_for_ends(tmp_path):
 
 def test_what_cannot_be_sent_is_said():
     with pytest.raises(MiNtfError, match=r"test_what_cannot_be_sent_is_said\..*lambda.* cannot be sent to workers"):
-        jobs.run(lambda task: task, [1], jobs.Workers("local", 2), quiet=True)
+        jobs.run(lambda task: task, [1], jobs.Workers("local", 2))
     with pytest.raises(MiNtfError, match=r"0: .*[Cc]an't (get local object|pickle)"):
-        jobs.run(chores.unsendable, [1], jobs.Workers("local", 2), quiet=True)
+        jobs.run(chores.unsendable, [1], jobs.Workers("local", 2))
 
 
 def test_answers_are_read_as_far_as_they_are_whole(tmp_path):
@@ -165,7 +165,7 @@ def test_a_bad_engine_is_bad_usage(tmp_path, capsys):
 def test_an_engine_that_is_absent_is_named_with_its_remedy(engine, module, monkeypatch):
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(MiNtfError, match=rf"the engine {engine} needs the extra `cluster` \({module} missing\): run"):
-        jobs.run(chores.square, [1], jobs.Workers(engine, 2), quiet=True)
+        jobs.run(chores.square, [1], jobs.Workers(engine, 2))
 
 
 def test_a_scheduler_that_does_not_answer(monkeypatch):
@@ -173,4 +173,4 @@ def test_a_scheduler_that_does_not_answer(monkeypatch):
 
     monkeypatch.setattr(dask_engine, "PATIENCE", 0.5)
     with pytest.raises(MiNtfError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9"):
-        jobs.run(chores.square, [1], jobs.Workers("dask", scheduler="tcp://127.0.0.1:9"), quiet=True)
+        jobs.run(chores.square, [1], jobs.Workers("dask", scheduler="tcp://127.0.0.1:9"))

@@ -1,18 +1,16 @@
 """The study of one scene by `mi-ntf tradeoff`, from its references to its report."""
 
 import statistics
-import sys
-import threading
 import time
 from pathlib import Path
 
 import mitsuba as mi
 
 from ... import __version__
-from ...core import files, interruption
+from ...core import files, interruption, progress
 from ...core.errors import MiNtfError, sentence
 from ...render.machine import machine
-from ..budget import Tell, progress
+from ...render.scene.environment_option import Environment
 from ..exported_mesh import ExportedMesh
 from ..kept import State
 from ..limits import Json
@@ -31,14 +29,12 @@ REFERENCE = 0.2
 class Study:
     """Run of a study, which continues an earlier run of the same study.
 
-    `out`, `budget` and `reference` are those of :func:`tradeoff`. `tell` is called with the progress. `pressed` is set
-    by Ctrl-C (:mod:`mi_ntf.core.interruption`).
+    `out`, `budget` and `reference` are those of :func:`tradeoff`.
     """
 
-    def __init__(self, subject: Subject, out: Path, budget: float, reference: Path | None, tell: Tell,
-                 pressed: threading.Event):
-        self.subject, self.budget, self._tell, self._pressed = subject, budget, tell, pressed
-        self._mesh_path = reference or references.shipped(subject.path, subject.parameters)
+    def __init__(self, subject: Subject, out: Path, budget: float, reference: Path | None):
+        self.subject, self.budget = subject, budget
+        self._mesh_path = reference or (None if subject.env else references.shipped(subject.path, subject.parameters))
         self._needs_mesh = reference is not None
         stamp = reference and [str(reference), reference.stat().st_mtime_ns]
         self.state = State(out, {"scene": subject.key(), "version": __version__, "machine": machine(),
@@ -47,9 +43,9 @@ class Study:
         self.truth: Truth | None = None
         self.mesh: Truth | None = None
         if self.state.fresh:
-            self.tell(f"begins anew, since {out} holds a study of another {self.state.fresh}", True)
+            progress.say(f"begins anew, since {out} holds a study of another {self.state.fresh}")
         elif rows := self.lines("way"):
-            self.tell(f"continues; {len(rows)} ways are finished", True)
+            progress.say(f"goes on: {len(rows)} ways are finished")
 
     @property
     def spent(self) -> float:
@@ -60,12 +56,20 @@ class Study:
         """Return the lines of each ``way``, or of each ``probe``, a render that shows the noise of the machine."""
         return [line for name, line in self.state.lines.items() if name.startswith(f"{kind} ")]
 
-    def tell(self, text: str, done: bool = False) -> None:
-        """Report the work that is done now, or that is finished."""
-        self._tell(self.spent, text, done)
-
     def run(self) -> None:
         """Do the work that is not finished yet."""
+        with progress.Stage("study", seconds=max(self.budget - self.spent, 1.0)) as self._stage:
+            self._run()
+
+    def _tell(self, text: str) -> None:
+        """Show the work that is done now."""
+        self._stage.update(0, text)
+
+    def _say(self, text: str) -> None:
+        """Print the work that is finished."""
+        progress.say(f"{self.spent:5.0f} s  {text}")
+
+    def _run(self) -> None:
         shrink, marching = self._prepare()
         if "end" in self.state.lines:
             return
@@ -86,16 +90,15 @@ class Study:
         self._add("end", {"left_out": left_out})
 
     def _add(self, name: str, values: Json) -> None:
-        """Store a line, unless Ctrl-C was pressed, which Mitsuba may have turned into another error."""
-        if self._pressed.is_set():
-            raise KeyboardInterrupt
+        """Store a line, unless Ctrl-C was pressed."""
+        interruption.check()
         self.state.add(name, {**values, "clock": self.spent})
 
     def _prepare(self) -> tuple[int, Renderer]:
         """Choose the size of the picture and make the references; return the former and the reference's renderer."""
         subject, lines, seconds = self.subject, self.state.lines, REFERENCE * self.budget
         if "picture" not in lines:
-            self.tell("choice of the picture's size")
+            self._tell("choice of the picture's size")
             self._add("picture", {"shrink": references.choose_shrink(subject, seconds / 2)})
         shrink = lines["picture"]["shrink"]
         width, height = subject.pixels(shrink)
@@ -103,11 +106,11 @@ class Study:
         render = references.renderer(subject, way, shrink)
         if "reference" not in lines or not self.state.pictures("reference"):
             truth, rate = references.converge(render, width * height, int(way.properties(subject)["samples"]),
-                                              max(seconds - self.spent, 0.0), self.tell)
+                                              max(seconds - self.spent, 0.0), self._tell)
             self.state.keep("reference", {"image": truth.image})
             self._add("reference", {"variance": truth.variance, "noise": truth.noise, "about": truth.about,
                                     "probe": max(1, int(0.25 / rate))})
-            self.tell(f"reference: {truth.about}, noise {truth.noise:.2%}", True)
+            self._say(f"reference: {truth.about}, noise {truth.noise:.2%}")
         known = lines["reference"]
         self.truth = Truth(self.state.pictures("reference")["image"], known["variance"], known["about"])
         if self._mesh_path:
@@ -116,7 +119,7 @@ class Study:
             except MiNtfError as error:
                 if self._needs_mesh:
                     raise
-                self.tell(f"no mesh to compare with: {error}", True)
+                self._say(f"no mesh to compare with: {error}")
         return shrink, render
 
     def _probe(self, render: Renderer) -> None:
@@ -129,7 +132,7 @@ class Study:
         assert self.truth is not None
         row: Json = {"way": way.name, "method": way.method, "title": way.title, "finer": bool(way.changes),
                      "points": [], "reason": "", "note": "", "command": ""}
-        self.tell(way.title)
+        self._tell(way.title)
         try:
             scene, properties = None, way.properties(self.subject)
             row["xml"] = integrator_xml(way.plugin, properties)
@@ -139,20 +142,23 @@ class Study:
                 row["note"] = (f"Making the mesh took {mesh.seconds:.0f} s, which are not counted, as those of the "
                                "field's voxels are not for the other ways. ")
             render = references.renderer(self.subject, way, shrink, scene)
-            curve = follow(render, self.truth, self.mesh, seconds, lambda e: self.tell(f"{way.title}: error {e:.1%}"))
+            curve = follow(render, self.truth, self.mesh, seconds, lambda e: self._tell(f"{way.title}: error {e:.1%}"))
             end = curve.points[-1]
             if len(curve.points) == 1:
                 row["note"] += (f"A single pass takes longer than this way's part of the budget, {seconds:.0f} s, so "
                                 "its noise and bias are not known.")
             if way.plugin == "nrf":
-                row["command"] = render_command(self.subject.path, self.subject.parameters, properties, end["samples"])
+                row["command"] = render_command(self.subject.path, self.subject.parameters, properties, end["samples"],
+                                                self.subject.env)
             self.state.keep(way.name, curve.pictures)
             row |= {"points": curve.points, "shift": curve.shift, "compile": render.compile, "peak": render.peak}
             text = f"error {end['error']:.1%} after {end['seconds']:.1f} s"
         except Exception as error:
+            if interruption.caused(error):
+                raise KeyboardInterrupt from None
             row["reason"] = text = sentence(error)
         self._add(f"way {way.name}", row)
-        self.tell(f"{way.title}: {text}", True)
+        self._say(f"{way.title}: {text}")
 
     def result(self) -> Json:
         """Return the content of ``tradeoff.json``."""
@@ -174,7 +180,7 @@ class Study:
 
 
 def tradeoff(scene: Path, out: Path = Path("tradeoff"), parameters: dict[str, str] | None = None,
-             budget: float = 300.0, reference: Path | None = None, quiet: bool = False) -> Json:
+             budget: float = 300.0, reference: Path | None = None, environment: Environment | None = None) -> Json:
     """Study what accuracy costs on a scene, and write ``index.html``, ``tradeoff.csv`` and ``tradeoff.json``.
 
     Parameters
@@ -187,8 +193,8 @@ def tradeoff(scene: Path, out: Path = Path("tradeoff"), parameters: dict[str, st
         Seconds of the study.
     reference
         The captured mesh: an EXR picture, or the XML file of its scene. None stands for the file of shipped scenes.
-    quiet
-        True to show no progress on stderr.
+    environment
+        Changes of the scene's environment. Files of shipped scenes do not fit to them.
 
     Returns
     -------
@@ -205,21 +211,19 @@ def tradeoff(scene: Path, out: Path = Path("tradeoff"), parameters: dict[str, st
     if reference is not None and not reference.is_file():
         raise MiNtfError(f"reference {reference} does not exist; give an EXR picture or the XML file of a mesh scene")
     study: Study | None = None
-    with interruption.noticed() as pressed:
-        try:
-            subject = Subject(scene, parameters or {})
-            files.make_folder(out)
-            with progress(budget, quiet) as tell:
-                study = Study(subject, out, budget, reference, tell, pressed)
-                study.run()
-        except BaseException:
-            if not pressed.is_set():
-                raise
-            done = f"{len(study.lines('way'))} ways are finished; " if study else ""
-            print(f"mi-ntf: interrupted; {done}the same command continues the study", file=sys.stderr)
-            raise KeyboardInterrupt from None
-        finally:
-            if study and study.truth is not None:
-                pictures = {row["way"]: study.state.pictures(row["way"]) for row in study.lines("way")}
-                report.write(study.result(), study.truth.image, pictures, out)
+    try:
+        with progress.Stage(f"reading {scene}"):
+            subject = Subject(scene, parameters or {}, environment)
+        files.make_folder(out)
+        study = Study(subject, out, budget, reference)
+        study.run()
+    except KeyboardInterrupt:
+        if study is None:
+            raise
+        raise KeyboardInterrupt(f"stopped; {len(study.lines('way'))} ways are finished, and the same command goes on"
+                                ) from None
+    finally:
+        if study and study.truth is not None:
+            pictures = {row["way"]: study.state.pictures(row["way"]) for row in study.lines("way")}
+            report.write(study.result(), study.truth.image, pictures, out)
     return study.result()

@@ -106,7 +106,7 @@ def build(name: str, medium: NRFMedium, table: LightTable | None, options: Optio
     if not method.numbers:
         return method.build(medium, table, options, module_of(mi.Float), keep)
     size = "" if method.per_field or table is None else f", {table.count} × {options.map_resolution}² texels"
-    with timing.building(), log.timed(f"nrf integrator: made the {name}{size}"):
+    with timing.building(), log.Work("nrf integrator", f"making the {name}{size}"):
         return method.build(medium, table, options, module_of(mi.Float), keep)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
@@ -68,7 +67,7 @@ class Patches:
     def __init__(self, scene: FieldScene) -> None:
         self._key = _key(scene)
         self.skins = [Skin(part.medium) for part in scene.parts]
-        arrays = user_cache.cached("patches", user_cache.key(*self._key), lambda: self._arrays(scene),
+        arrays = user_cache.cached("patches", user_cache.key(*self._key), lambda: self._found(scene),
                                  placed=len(self.skins) > 1)
         for number, skin in enumerate(self.skins):
             for name in Skin.ARRAYS:
@@ -78,9 +77,12 @@ class Patches:
         log.info(f"nrf integrator: light bounces between {len(self.albedo)} patches of skins, which count as diffuse: "
                  "fast and biased; bounces=paths is not")
 
+    def _found(self, scene: FieldScene) -> dict[str, np.ndarray]:
+        with log.Work("nrf integrator", "finding the patches that light bounces between"):
+            return self._arrays(scene)
+
     def _arrays(self, scene: FieldScene) -> dict[str, np.ndarray]:
         """Return the arrays of all skins, `first` and `hits`, computed by random rays."""
-        begin = time.perf_counter()
         rng = np.random.default_rng(SEED)
         self.skins[:] = [skin_of(part.medium, rng) for part in scene.parts]
         for skin, hits_of_skin in zip(self.skins, self._trace(scene, radiosity.FEW, rng), strict=True):
@@ -93,7 +95,6 @@ class Patches:
             # Matter that is seen from behind sends no light.
             hits[ray] = np.where(((normal * d).sum(1) < 0) & (patch >= 0), patch + start, -1)
         arrays = {f"{i}.{name}": getattr(s, name) for i, s in enumerate(self.skins) for name in Skin.ARRAYS}
-        log.info(f"nrf integrator: found the patches that light bounces between ({time.perf_counter() - begin:.2g} s)")
         return arrays | {"first": first, "hits": hits.reshape(-1, radiosity.SIDE**2)}
 
     def fit(self, scene: FieldScene) -> bool:

@@ -27,6 +27,13 @@ CHUNK = 1 << 18
 
 def render(context: RenderContext, scene: mi.Scene, sensor: mi.Sensor, seed: int | UInt32, spp: int, develop: bool,
            should_stop: Callable[[], bool]) -> Array:
+    """Render `scene` into the film of `sensor`, and show the progress; see :func:`_render`."""
+    with log.Work("nrf integrator", "rendering", context.limits.seconds) as work:
+        return _render(context, scene, sensor, seed, spp, develop, should_stop, work)
+
+
+def _render(context: RenderContext, scene: mi.Scene, sensor: mi.Sensor, seed: int | UInt32, spp: int, develop: bool,
+            should_stop: Callable[[], bool], work: log.Work) -> Array:
     """Render `scene` into the film of `sensor`, in one pass unless a limit decides on the samples.
 
     Parameters
@@ -39,6 +46,8 @@ def render(context: RenderContext, scene: mi.Scene, sensor: mi.Sensor, seed: int
         Return the developed image; it is empty otherwise.
     should_stop
         Called before each chunk of pixels; True ends the render.
+    work
+        The progress.
     """
     if dr.flag(dr.JitFlag.FreezingScope):
         raise MiNtfError(
@@ -65,7 +74,7 @@ def render(context: RenderContext, scene: mi.Scene, sensor: mi.Sensor, seed: int
             picture.begin_pass(camera)
         block = halves.block()
         complete = _trace(context, composition, Reconstruction(block, camera), picture, _seed(seed, progress.passes),
-                          progress, should_stop)
+                          progress, should_stop, work)
         if complete or not progress.passes or (progress.count and len(composition.runs) == 1):
             halves.add(block, camera.spp, picture)
         if not complete:
@@ -74,11 +83,11 @@ def render(context: RenderContext, scene: mi.Scene, sensor: mi.Sensor, seed: int
             halves.wait()
         progress.done(camera.spp, halves.noise() if limits.noise > 0 else math.nan)
         samples = progress.next() if limits.of_samples else 0
+    work.ended = ""
     if not composition.effects.gradients:
         halves.wait()  # the program develops the film next
         width, height = film.crop_size()
-        log.info(f"nrf integrator: done, {width} × {height} pixels with {progress.count} samples each "
-                 f"({progress.elapsed():.2g} s)")
+        work.ended = f"done, {width} × {height} pixels with {progress.count} samples each"
     context.achieved = _achieved(limits, composition, choice, progress)
     if not develop:
         return mi.TensorXf()
@@ -141,16 +150,19 @@ class _Halves:
 
 
 def _trace(context: RenderContext, composition: Composition, pixels: Reconstruction, picture: aovs.Picture | None,
-           seed: UInt32, progress: passes.Passes, should_stop: Callable[[], bool]) -> bool:
+           seed: UInt32, progress: passes.Passes, should_stop: Callable[[], bool], work: log.Work) -> bool:
     """Trace one pass: for each run of lights all camera rays, in chunks of pixels; return False if it was stopped."""
     camera = pixels.camera
     alpha = mi.has_flag(camera.film.flags(), mi.FilmFlags.Alpha)
     rays_in_flight = (context.rays_in_flight or CHUNK) // (IN_SMOKE if composition.smoke else 1)
     chunks = range(0, camera.count, max(1, rays_in_flight // camera.spp))
     runs, cache = range(len(composition.runs)), context.sample_cache
-    report = log.Progress("nrf integrator: rendering")
     for number, (run, first) in enumerate(itertools.product(runs, chunks)):
-        report(number / (len(runs) * len(chunks)))
+        done = number / (len(runs) * len(chunks))
+        if progress.limits.of_samples:
+            work.update(0, f"pass {progress.passes + 1} of {camera.spp} samples, {done:.0%}")
+        else:
+            work.update(done)
         if should_stop() or progress.overtime(context.timeout):
             _stop(pixels, run, first, len(runs))
             progress.ended = "timeout"
