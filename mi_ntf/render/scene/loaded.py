@@ -83,7 +83,7 @@ def _begin_other_media(variant: str) -> None:
 def _load(path: str, _identity: tuple[int, int, int] | None, resolution: int | None, variant: str) -> LoadedField:
     dj = module(variant)
     header, tensors = field_file.load(path)
-    with log.timed(f"nrf medium: loaded {path}"):
+    with log.Work("nrf medium", f"reading {path}"):
         network, digest = NetworkField(header, tensors, dj), _digest(header, tensors)
         n = resolution or voxels(header)
         stored = field_file.load_baked(path, _stamp(digest, n))
@@ -110,9 +110,9 @@ def add_baked(path: Path, resolution: int | None = None) -> dict[str, str | int]
 
 
 def _baked(path: str, network: NetworkField, n: int, dj: ModuleType) -> dict[str, np.ndarray]:
-    with log.timed(f"nrf medium: baked {path}, {n}³ voxels"):
-        arrays = bake(network, n, dj, log.Progress(f"nrf medium: baking {path}, {n}³ voxels"))
-        return arrays | measure(GridField(arrays, network, dj), dj)
+    with log.Work("nrf medium", f"baking {Path(path).name}, {n}³ voxels") as work:
+        arrays = bake(network, n, dj, lambda done: work.update(0.75 * done))
+        return arrays | measure(GridField(arrays, network, dj), dj, lambda done: work.update(0.75 + 0.25 * done))
 
 
 def _stamp(digest: str, n: int) -> str:
