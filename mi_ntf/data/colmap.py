@@ -20,8 +20,8 @@ import numpy as np
 
 from mi_ntf.core.errors import MiNtfError, shown
 from mi_ntf.data import file_names
-from mi_ntf.data.file_names import SUFFIXES, is_file_name, locate, mask_places, plain
-from mi_ntf.data.schema import Camera, DataSet, View
+from mi_ntf.data.file_names import is_file_name, locate, mask_places, photographs, plain
+from mi_ntf.data.schema import Camera, DataSet, View, drop_missing
 
 FORM = "COLMAP model"
 MODELS = {
@@ -96,9 +96,11 @@ def read(folder: Path) -> DataSet:
                           (camera.width, camera.height)))
     if not views:
         raise MiNtfError(f"{model}: the model has no posed photograph; run `colmap mapper` again")
-    stored = sum(f.suffix.lower() in SUFFIXES for f in (root / "images").rglob("*"))
-    notes = [f"{stored - len(views)} of {stored} photographs in {root / 'images'} have no pose and are left out"]
-    return DataSet(FORM, {"train": views}, None, points, notes if stored > len(views) else [], assumed)
+    splits, notes = drop_missing({"train": views})
+    stored, posed = len(photographs((root / "images").rglob("*"))), len(splits["train"])
+    if stored > posed:
+        notes.append(f"{stored - posed} of {stored} photographs in {root / 'images'} have no pose and are left out")
+    return DataSet(FORM, splits, None, points, notes, assumed)
 
 
 def _largest(folder: Path) -> tuple[Path, list[str]]:

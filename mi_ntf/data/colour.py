@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from PIL import Image, ImageCms
 
 TOLERANCE = 2  # levels by which colours may differ for a profile to count as sRGB or as linear Rec. 709
+INTEROPERABILITY = 0xA005  # directory of Exif
 SRGB_GAMMA = 1 / 2.2  # `gAMA` of files in sRGB, by the specification
 PRIMARIES = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06)  # x and y of red, green and blue of Rec. 709 and sRGB
 
@@ -44,6 +45,9 @@ def to_srgb(image: "Image.Image", path: Path) -> "tuple[Image.Image, str | None]
         assert converted is not None  # it is None for transforms in place
         return converted, f"colours are converted from the ICC profile {conversion.title} to sRGB"
     rgb = image.convert("RGB")
+    if image.getexif().get_ifd(INTEROPERABILITY).get(1) == "R03":  # cameras write no profile
+        raise MiNtfError(f"{path}: its Exif tags say Adobe RGB, and it has no ICC profile; convert it to sRGB, or "
+                         "develop it anew as sRGB")
     if image.format != "PNG" or "srgb" in image.info:
         return rgb, None
     chromaticity = image.info.get("chromaticity")

@@ -1,8 +1,9 @@
 """EXR files: the display window of the layer that holds the rendered picture.
 
-Channels R, G, B[, A] without a layer's name are the picture. Otherwise it is the only layer (ViewLayer.Combined.R, of
-Blender and Nuke) or part that has R, G and B, or the only one that is called Combined, Beauty or RGBA. Pixels of the
-display window outside the data window are black and empty.
+Channels R, G, B[, A] (or red, green, blue, alpha) without a layer's name are the picture. Otherwise it is the only
+layer (ViewLayer.Combined.R, of Blender and Nuke) or part that has R, G and B, or the only one that is called Combined,
+Beauty or RGBA, or Blender's Composite.Combined. Pixels of the display window outside the data window are black and
+empty.
 """
 
 from pathlib import Path
@@ -18,6 +19,10 @@ if TYPE_CHECKING:
     import OpenEXR
 
 PICTURES = ("combined", "beauty", "rgba")  # last part of the names of layers of rendered pictures, in lower case
+COMPOSITE = "composite.combined"  # of Blender's compositor, beside the layers that it composes
+CHANNELS = {name: channel for channel, word in zip("RGBA", ("red", "green", "blue", "alpha"), strict=True)
+            for name in (channel.lower(), word)}
+"""Channels by their names in lower case."""
 LARGEST = 1 << 16  # pixels of a display window's side
 
 
@@ -42,6 +47,9 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray | None, list[str]]:
             raise MiNtfError(f"{path}: its 'chromaticities' are {shown([round(v, 4) for v in primaries[:6]])}, other "
                              "primaries than Rec. 709's; convert it to linear Rec. 709 (sRGB primaries)")
         (low, high), (left_top, right_bottom) = header["dataWindow"], header["displayWindow"]
+        if any(channel.pixels.dtype.kind == "u" for channel in layer.channels.values()):
+            raise MiNtfError(f"{path}: its channels are whole numbers, whose white is not known; write it with "
+                             "floating-point numbers")
         planes = {key: np.array(channel.pixels, dtype=np.float32) for key, channel in layer.channels.items()}
     if (low != left_top).any() or (high != right_bottom).any():
         size = right_bottom - left_top + 1
@@ -82,7 +90,8 @@ def _picture(file: "OpenEXR.File", path: Path) -> Layer:
     for i, part in enumerate(file.parts):
         for name, channel in file.channels(i).items():
             layer, _, last = name.rpartition(".")
-            layers.setdefault((layer or (part.name() if len(file.parts) > 1 else ""), i), {})[last] = channel
+            key = layer or (part.name() if len(file.parts) > 1 else ""), i
+            layers.setdefault(key, {}).setdefault(CHANNELS.get(last.lower(), last), channel)  # capitals come first
     complete = [key for key, channels in layers.items() if set("RGB") <= set(channels)]
     if not complete:
         names = sorted({name for i in range(len(file.parts)) for name in file.channels(i)})
@@ -90,7 +99,8 @@ def _picture(file: "OpenEXR.File", path: Path) -> Layer:
                          f"{', '.join(c for c in 'RGB' if c not in names)}; write it as RGB or RGBA")
     titled = [key for key in complete if key[0].rpartition(".")[2].lower() in PICTURES]
     nameless = [key for key in complete if not key[0]]
-    chosen = next((keys for keys in (nameless, complete, titled) if len(keys) == 1), None)
+    composite = [key for key in complete if key[0].lower() == COMPOSITE]
+    chosen = next((keys for keys in (nameless, complete, titled, composite) if len(keys) == 1), None)
     if chosen is None:
         raise MiNtfError(f"{path}: has the layers {shown([layer for layer, _ in complete])}, of which none alone is "
                          f"called {', '.join(PICTURES)}; write the rendered picture as R, G, B, A without a layer")

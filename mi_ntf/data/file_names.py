@@ -11,8 +11,9 @@ from typing import TypeGuard
 
 from mi_ntf.core.errors import MiNtfError
 
-SUFFIXES = (".png", ".exr", ".jpg", ".jpeg", ".tif", ".tiff")
-MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+SRGB_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp")  # files of 8 bits
+TIFF_SUFFIXES = (".tif", ".tiff")
+SUFFIXES = (".png", ".exr", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")  # of several files the first is read
 
 
 def is_file_name(name: object) -> TypeGuard[str]:
@@ -21,6 +22,25 @@ def is_file_name(name: object) -> TypeGuard[str]:
         return False
     parts = [len(part.encode()) for part in name.split("/")]
     return 0 < sum(parts) <= 2000 and max(parts) <= 240
+
+
+def photographs(files: Iterable[Path]) -> list[Path]:
+    """Return those of the files, sorted, that are photographs by their names. Hidden files are none (`._IMG_1.jpg`)."""
+    return sorted(path for path in files if path.suffix.lower() in SUFFIXES and not path.name.startswith("."))
+
+
+def is_absolute(name: str) -> bool:
+    """Return True if `name` is absolute, here or on Windows."""
+    return plain(name).startswith("/") or name[1:2] == ":"
+
+
+def moved(folder: Path, name: str) -> str:
+    """Return the last parts of an absolute `name` that are a file in `folder`, if the name itself is none."""
+    if not is_absolute(name) or Path(name).is_file():
+        return name
+    parts = plain(name).split("/")
+    tails = ("/".join(parts[i:]) for i in range(1, len(parts)))
+    return next((tail for tail in tails if on_disk(folder / tail)), name)
 
 
 def plain(name: str) -> str:
@@ -61,8 +81,9 @@ def first(places: Iterable[Path]) -> Path | None:
 def mask_places(masks: Path, name: str) -> list[Path]:
     """Return the possible paths of the mask of photograph `name` in the folder `masks`.
 
-    A mask has the photograph's name as a PNG file, the name that COLMAP writes (name.jpg.png), or another suffix. A
-    leading folder `images` (`images_4`) is dropped.
+    A mask has the photograph's name as a PNG file, the name that COLMAP writes (name.jpg.png), that of Metashape
+    (name_mask.png) or RealityCapture (name.mask.png), or another suffix. A leading folder `images` (`images_4`) is
+    dropped.
     """
     relative = Path(name)
     if relative.is_absolute() or not relative.name:
@@ -70,8 +91,8 @@ def mask_places(masks: Path, name: str) -> list[Path]:
     if len(relative.parts) > 1 and relative.parts[0].startswith("images"):
         relative = Path(*relative.parts[1:])
     base = masks / relative
-    return [base.with_suffix(".png"), base.with_name(base.name + ".png"),
-            *(base.with_suffix(suffix) for suffix in MASK_SUFFIXES[1:])]
+    return [*(base.with_name(f"{stem}{end}.png") for end in ("", "_mask", ".mask") for stem in (base.stem, base.name)),
+            *(base.with_suffix(suffix) for suffix in (*SRGB_SUFFIXES[1:], *TIFF_SUFFIXES))]
 
 
 def read_text(path: Path) -> tuple[str, str | None]:

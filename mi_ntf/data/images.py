@@ -1,7 +1,8 @@
 """Image files as pixels over black, with explicit colour spaces.
 
     EXR          linear; alpha premultiplied, as renderers write it; windows and layers: `exr`
-    PNG, JPEG    8 bit, sRGB or the space of their ICC profile or gAMA (`colour`); alpha straight (JPEG has none)
+    PNG, JPEG    8 bit, sRGB or the space of their ICC profile or gAMA (`colour`); alpha straight (JPEG has none);
+                 WebP and BMP likewise
     TIFF         8 bit: as PNG; 16 bit: linear, 65535 is 1, alpha straight; floating point: as EXR
     masks        `masks`
 
@@ -19,6 +20,7 @@ import numpy as np
 from mi_ntf.core import extras, ops, srgb
 from mi_ntf.core.errors import MiNtfError, shown
 from mi_ntf.data import colour, exif, exr
+from mi_ntf.data.file_names import SUFFIXES, TIFF_SUFFIXES
 
 LINEAR = srgb.decode(ops, np.arange(256) / 255.0).astype(np.float32)  # sRGB's 256 levels in linear light
 
@@ -102,9 +104,9 @@ def check_exists(path: Path) -> None:
 def decode(path: Path) -> Decoded:
     """Return the image in `path`. Raises MiNtfError."""
     check_exists(path)
-    reader = {".exr": _read_exr, ".png": _read_srgb, ".jpg": _read_srgb, ".jpeg": _read_srgb, ".tif": _read_tiff,
-              ".tiff": _read_tiff}.get(path.suffix.lower())
-    if reader is None:
+    suffix = path.suffix.lower()
+    reader = _read_exr if suffix == ".exr" else _read_tiff if suffix in TIFF_SUFFIXES else _read_srgb
+    if suffix not in SUFFIXES:
         raise MiNtfError(f"{path}: images of type '{path.suffix}' are not read; convert it to .exr, .tif, .png or .jpg")
     try:
         image = reader(path)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mi_ntf.core import files
+from mi_ntf.core import files, progress
 from mi_ntf.data import assumptions, inspect_figures, measures
 from mi_ntf.data.measures import Numbers, Splits, percent
 from mi_ntf.data.page import Page
@@ -28,6 +28,11 @@ def inspect(folder: Path, out: Path | None = None, **options: Any) -> Numbers:
     folder = Path(folder)
     out = Path(f"{folder.resolve().name}-inspect.html") if out is None else Path(out)
     files.check(out)
+    with progress.Stage(f"inspecting {folder}", then=f"{out} is not written"):
+        return _inspect(folder, out, options)
+
+
+def _inspect(folder: Path, out: Path, options: dict[str, Any]) -> Numbers:
     messages: list[str] = []
     splits = load_dataset(folder, messages.append, **{k: v for k, v in options.items() if v is not None})
     rows = measures.measure(splits)
@@ -37,7 +42,8 @@ def inspect(folder: Path, out: Path | None = None, **options: Any) -> Numbers:
             "assumed": [text for text in messages if text.startswith(assumptions.PREFIX)], **numbers,
             "warnings": measures.warnings(numbers, rows), "page": str(out),
             "views": [{key: _plain(value) for key, value in row._asdict().items()} for row in rows]}
-    _page(folder, form.read(folder), splits, rows, data).write(out)
+    with progress.Stage("writing the page", inner=True):
+        _page(folder, form.read(folder), splits, rows, data).write(out)
     return data
 
 
@@ -63,7 +69,8 @@ def summary(data: Numbers) -> list[tuple[str, str]]:
         ("cameras to object", f"{_range(data['distance'])} radii; the median is {length:.4g} of the data set's "
                               "lengths"),
         ("pixel at the object", f"{_range(data['pixel'])} radii"),
-        ("flash beside the lens", f"{_range(data['flash_degrees'], 1, '.1f')} degrees, seen from the object"),
+        ("flash beside the lens", "not known; taken to be at the lens" if data["flash_degrees"] is None else
+         f"{_range(data['flash_degrees'], 1, '.1f')} degrees, seen from the object"),
         ("largest gap of cameras", f"{data['gap']['degrees']:.0f} degrees"),
         ("brightness, largest / smallest", f"{' '.join(map(_number, ratio))} (R G B)"),
         ("colour, largest / smallest", f"{_number(balance['red_over_green'])} (R/G) "
@@ -106,7 +113,8 @@ def _page(folder: Path, described: DataSet, splits: Splits, rows: list[measures.
     page.section("Photographs")
     header = ["", "file", "split", "covers", "R", "G", "B", "saturated", "black", "distance", "flash", "outside hull"]
     page.table(header, [[i, row.name, row.split, percent(row.coverage), *(f"{v:.3g}" for v in row.brightness),
-                         percent(row.saturated), percent(row.black), f"{row.distance:.3g}", f"{row.flash:.1f}°",
+                         percent(row.saturated), percent(row.black), f"{row.distance:.3g}",
+                         f"{row.flash:.1f}°" if np.isfinite(row.flash) else "–",
                          percent(row.uncovered)] for i, row in enumerate(rows)], folded=f"All {len(rows)}")
     return page
 

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mi_ntf.data import colour, exif, lens, measures, page
+from mi_ntf.data.file_names import SRGB_SUFFIXES
 from mi_ntf.data.images import LINEAR, levels, linear, opencv
 from mi_ntf.data.measures import Splits
 from mi_ntf.data.schema import Camera, Split, View
@@ -148,7 +149,7 @@ def _whole(view: View, pinhole: Camera, width: int, height: int) -> np.ndarray |
     """
     from PIL import Image
 
-    if view.image.suffix.lower() not in (".jpg", ".jpeg", ".png"):
+    if view.image.suffix.lower() not in SRGB_SUFFIXES:
         return None
     bent = view.camera if isinstance(view.camera, Camera) and any(view.camera.distortion) else None
     with Image.open(view.image) as image:

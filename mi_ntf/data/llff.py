@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from mi_ntf.core.errors import MiNtfError, shown
-from mi_ntf.data.file_names import SUFFIXES, mask_places
+from mi_ntf.data.file_names import mask_places, photographs
 from mi_ntf.data.poses import check_rigid
 from mi_ntf.data.schema import Camera, DataSet, View
 
@@ -35,7 +35,7 @@ def read(folder: Path) -> DataSet:
         rows = np.array(stored, np.float64)
     if not images.is_dir():
         raise MiNtfError(f"{images} does not exist; put the photographs of {path} there")
-    names = sorted(p.name for p in images.iterdir() if p.suffix.lower() in SUFFIXES)
+    names = [path.name for path in photographs(images.iterdir())]
     if len(names) != len(rows):
         raise MiNtfError(f"{path}: has {len(rows)} poses, {images} has {len(names)} photographs; one belongs to each, "
                          "in the order of the names: take out the photographs that have no pose")

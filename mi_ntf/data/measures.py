@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mi_ntf.core import progress
 from mi_ntf.data import silhouettes
 from mi_ntf.data.images import LINEAR, linear
 from mi_ntf.data.poses import view_directions
@@ -33,7 +34,7 @@ class Photograph(NamedTuple):
     saturated: float  # fraction of the object's pixels; NaN if the file does not tell
     black: float  # fraction of the object's pixels
     distance: float  # from the camera to the object's centre, radii
-    flash: float  # angle between camera and flash at the object's centre, degrees
+    flash: float  # angle between camera and flash at the object's centre, degrees; NaN if not known
     pixel: float  # width of a pixel at the object's centre, radii
     uncovered: float  # fraction of the silhouette outside the hull of all others; NaN if not compared
 
@@ -59,17 +60,20 @@ def measure(splits: Splits) -> list[Photograph]:
     ordered = places(splits)
     outlines, rows, white = [], [], white_level(splits)
     compared = silhouettes.chosen(len(ordered)).tolist()
-    for number, (name, key, i) in enumerate(ordered):
-        split = splits[key]
-        pixels = linear(split.images[i])
-        sure = certain(split, pixels[..., 3])
-        if number in compared:
-            outlines.append(silhouettes.Outline(possible(split, pixels[..., 3]), sure, split.c2w[i], split.focal[i],
-                                                split.principal[i]))
-        rows.append(_photograph(name, key, split, i, pixels, sure, white))
+    with progress.Stage("measured photographs", len(ordered), inner=True) as stage:
+        for number, (name, key, i) in enumerate(ordered):
+            split = splits[key]
+            pixels = linear(split.images[i])
+            sure = certain(split, pixels[..., 3])
+            if number in compared:
+                outlines.append(silhouettes.Outline(possible(split, pixels[..., 3]), sure, split.c2w[i], split.focal[i],
+                                                    split.principal[i]))
+            rows.append(_photograph(name, key, split, i, pixels, sure, white))
+            stage.advance()
     if len(outlines) > 2:
         train = splits["train"]
-        fractions = silhouettes.disagreement(outlines, train.center, train.radius)
+        with progress.Stage("comparing the silhouettes", inner=True):
+            fractions = silhouettes.disagreement(outlines, train.center, train.radius)
         for number, fraction in zip(compared, fractions, strict=True):
             rows[number] = rows[number]._replace(uncovered=float(fraction))
     return rows
@@ -120,7 +124,7 @@ def _photograph(name: str, key: str, split: Split, i: int, pixels: np.ndarray, s
         saturated=float((largest >= 0.999 * LINEAR[SATURATED]).mean()) if white.clips else float("nan"),
         black=float((largest < BLACK).mean()),
         distance=float(far / split.radius),
-        flash=float(np.degrees(np.arccos(np.clip(eye @ lamp / (far * lit), -1, 1)))),
+        flash=float(np.degrees(np.arccos(np.clip(eye @ lamp / (far * lit), -1, 1)))) if split.located else np.nan,
         pixel=float(far / split.focal[i].mean() / split.radius),
         uncovered=float("nan"))
 

@@ -4,6 +4,7 @@ No other copy of all photographs exists. Files of 8 bits make an array of bytes,
 array of half precision, or of single precision if half does not hold the light of some photograph.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -26,13 +27,13 @@ class Photographs(NamedTuple):
     principal: np.ndarray
 
 
-def load(views: list[View], size: int | None = None, black: bool = False, assumed: Assumptions | None = None
-         ) -> Photographs:
+def load(views: list[View], size: int | None = None, black: bool = False, assumed: Assumptions | None = None,
+         advance: Callable[[], None] = lambda: None) -> Photographs:
     """Read the photographs of a split, scaled down to a longer side of `size` pixels.
 
-    With `black`, alpha comes from the black background instead of masks. All photographs have one size
-    in the end: those that lie otherwise than the first are turned by 90 degrees. `assumed` receives the assumptions.
-    Raises MiNtfError.
+    With `black`, alpha comes from the black background instead of masks. All photographs have one size in the end:
+    those that lie otherwise than the first are turned by 90 degrees. `assumed` receives the assumptions, and `advance`
+    is called after each photograph. Raises MiNtfError.
     """
     stored, straighten, intrinsics, poses = np.empty((0, 0, 0, 4), np.uint8), lens.Straightener(), [], []
     assumed = Assumptions() if assumed is None else assumed
@@ -52,6 +53,7 @@ def load(views: list[View], size: int | None = None, black: bool = False, assume
         stored[i] = pixels if pixels.dtype == stored.dtype or pixels.dtype != np.uint8 else images.linear(pixels)
         intrinsics.append((camera.fx, camera.fy, camera.cx, camera.cy))
         poses.append(c2w)
+        advance()
     numbers = np.array(intrinsics, dtype=np.float64)
     return Photographs(stored, np.stack(poses), numbers[:, :2], numbers[:, 2:])
 
@@ -112,9 +114,11 @@ def _mask(view: View, image: images.Decoded, assumed: Assumptions) -> np.ndarray
 
     Training must know which pixels show the object, so a photograph with neither is an error.
     """
-    if image.alpha is not None and not view.mask_first:
-        return None
     place = first(view.masks)
+    if image.alpha is not None and not view.mask_first:
+        if place is None or image.alpha.min() < (255 if image.alpha.dtype == np.uint8 else 1):
+            return None
+        assumed.add("an alpha channel that is opaque throughout gives way to a mask", view.image)
     if place is None:
         lacks = "has no mask" if view.mask_first else "has no alpha channel and no mask"
         raise MiNtfError(f"{view.image}: {lacks}{' (' + str(view.masks[0]) + ')' if view.masks else ''}; training must "

@@ -14,10 +14,11 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
+from mi_ntf.core import progress
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.data import (
     assumptions,
@@ -59,7 +60,8 @@ Offset = tuple[float, float, float]
 
 
 def load_dataset(folder: Path, say: Say = print, *, size: int | None = None, masks: Path | None = None,
-                 background: str | None = None, flash_offset: Offset | None = None) -> dict[str, Split]:
+                 background: str | None = None, flash_offset: Offset | Literal["estimate"] | None = None
+                 ) -> dict[str, Split]:
     """Return the splits `train`, `val` and `test` with all their images, in one similarity.
 
     Parameters
@@ -74,46 +76,54 @@ def load_dataset(folder: Path, say: Say = print, *, size: int | None = None, mas
         Folder of masks with the photographs' names, instead of alpha channels and the form's own masks.
     background : str, optional
         "black": there are no masks, and the flash was the only light in a dark room (:attr:`Split.masked`).
-    flash_offset : tuple of float, optional
-        Place of the flash (right, up, forward) from the lens in the data set's lengths, if it has no `pl_pos`.
+    flash_offset : tuple of float or "estimate", optional
+        Place of the flash (right, up, forward) from the lens in the data set's lengths, if it has no `pl_pos`. With
+        "estimate" the lens is its place until training has found another.
 
     Raises
     ------
     MiNtfError
         If there is no data set in `folder`, or it has a fault.
     """
-    folder = Path(folder)
-    _check_options(size, masks, background, flash_offset)
+    folder, estimate = Path(folder), flash_offset == "estimate"
+    offset = None if isinstance(flash_offset, str) else flash_offset
+    _check_options(size, masks, background, offset)
     form, notes = find_form(folder)
     name = form.name
     try:
         data = form.read(folder)
         name = data.form
-        views, assumed = assumptions.settle(_with_options(data.views, masks, flash_offset), background is None)
+        views, assumed = assumptions.settle(_with_options(data.views, masks, offset), background is None)
         say(_summary(data, folder, size, background))
         for note in [*notes, *data.notes, *(PREFIX + text for text in [*data.assumed, *assumed])]:
             say(note)
-        return _load(folder, data, split_off(views, say), say, size, background == "black", flash_offset)
+        return _load(folder, data, split_off(views, say), say, size, background == "black",
+                     _flash_note(offset, estimate, views["train"][0]))
     except MiNtfError as error:
         raise MiNtfError(f"{error} (read as {name})") from error
 
 
-def _load(folder: Path, data: DataSet, views: Views, say: Say, size: int | None, black: bool,
-          flash_offset: Offset | None) -> dict[str, Split]:
-    """Return the splits of `views` with their images and everything that the data set leaves open."""
+def _load(folder: Path, data: DataSet, views: Views, say: Say, size: int | None, black: bool, flash: str | None
+          ) -> dict[str, Split]:
+    """Return the splits of `views` with their images and everything that the data set leaves open.
+
+    `flash` is a note on the place of the flash.
+    """
     _check_lights(every(views))
     poses.check_views(views["train"], None if data.sphere is None else data.sphere[0])
     for view in every(views):  # before an hour is spent on the existing ones
         images.check_exists(view.image)
     assumed = Assumptions()
-    loaded = {name: photographs.load(split, size, black, assumed) for name, split in views.items()}
+    with progress.Stage("photographs", len(every(views))) as stage:
+        loaded = {name: photographs.load(split, size, black, assumed, stage.advance) for name, split in views.items()}
     for text in assumed.sentences():
         say(PREFIX + text)
     _check_masks(views["train"], loaded["train"].images)
     _say_pixels(loaded["train"].images, size, black, say)
     if data.sphere is None:
-        (center, radius), source = estimates.find_sphere(*loaded["train"], data.points,
-                                                         "lit regions" if black else "masks")
+        with progress.Stage("finding the object's sphere"):
+            (center, radius), source = estimates.find_sphere(*loaded["train"], data.points,
+                                                             "lit regions" if black else "masks")
         say(f"the object's sphere is found {source}: center {center.round(4).tolist()}, radius {radius:.4g}")
     else:
         (center, radius), source = data.sphere, "'unit_sphere' of the data set"
@@ -121,12 +131,8 @@ def _load(folder: Path, data: DataSet, views: Views, say: Say, size: int | None,
     lights = {name: np.stack([v.c2w[:3, 3] if v.light_pos is None else v.light_pos for v in split]).astype(np.float32)
               for name, split in views.items()}
     first = views["train"][0]
-    if flash_offset is not None:
-        say("the flash is taken to be {:g} right, {:g} up, {:g} forward of the lens, in the data set's lengths".format(
-            *flash_offset))
-    elif first.light_pos is None:
-        say("no light positions given ('pl_pos'): a flash at the lens is assumed; under any other light the "
-            "reflectance comes out wrong (--flash-offset says where it is)")
+    if flash:
+        say(flash)
     calibrated, estimate = first.light_intensity is not None, 0.0
     if not calibrated:
         estimate = estimates.find_intensity(loaded["train"].images, lights["train"], center, radius)
@@ -139,6 +145,20 @@ def _load(folder: Path, data: DataSet, views: Views, say: Say, size: int | None,
                               for path in (view.image for view in split)),
                         not black, calibrated, first.light_pos is not None)
             for name, split in views.items()}
+
+
+def _flash_note(offset: Offset | None, estimate: bool, view: View) -> str | None:
+    """Return the note on the flash's place, None if the data set has it."""
+    if offset is not None:
+        right, up, forward = offset
+        return (f"the flash is taken to be {right:g} right, {up:g} up, {forward:g} forward of the lens, in the data "
+                "set's lengths")
+    if view.light_pos is not None:
+        return None
+    if estimate:
+        return "no light positions given ('pl_pos'): training estimates where the flash stands"
+    return ("no light positions given ('pl_pos'): a flash at the lens is assumed; under any other light the "
+            "reflectance comes out wrong (--flash-offset says where it is, `train --flash-offset estimate` finds it)")
 
 
 def _check_options(size: int | None, masks: Path | None, background: str | None, flash_offset: Offset | None) -> None:
@@ -159,11 +179,18 @@ def _check_options(size: int | None, masks: Path | None, background: str | None,
 
 def find_form(folder: Path) -> tuple[Form, list[str]]:
     """Return the form of the data set in `folder`, and notes on further forms. Raises MiNtfError if there is none."""
+    if folder.is_file():
+        raise MiNtfError(f"{folder} is a file; name the folder that it is in, {folder.parent}")
     if not folder.is_dir():
         raise MiNtfError(f"{folder} does not exist or is no folder; make a data set with "
                          f"`mi-ntf capture SCENE.xml {folder}`")
     forms = [form for form in FORMS if form.is_in(folder)]
     if not forms:
+        near = [str(place) for place in (folder.parent, *sorted(folder.iterdir())) if place.is_dir()
+                and any(form.is_in(place) for form in FORMS)]
+        if near:
+            others = f"{' and '.join(near[:5])} {'holds' if len(near) == 1 else 'hold'} one"
+            raise MiNtfError(f"{folder}: no data set is here, but {others}; name that folder")
         raise MiNtfError(f"{folder}: no data set is here: neither transforms_train.json (capture, NeRF-synthetic, "
                          "NRHints) nor transforms.json (nerfstudio) nor a COLMAP model (cameras and images, .bin or "
                          ".txt, in sparse/0, sparse or the folder itself) nor poses_bounds.npy (LLFF); "

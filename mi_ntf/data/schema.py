@@ -118,6 +118,20 @@ class Split:
     located: bool = True  # the lights' places come from the data set; else they are the lenses'
 
 
+def drop_missing(splits: dict[str, list[View]]) -> tuple[dict[str, list[View]], list[str]]:
+    """Return the splits without the views that have no photograph, and a note on them.
+
+    If most photographs are missing, it is the wrong folder or an incomplete copy: then all views stay, and reading them
+    raises the error.
+    """
+    complete = {split: [view for view in views if view.image.is_file()] for split, views in splits.items()}
+    count, existing = (sum(map(len, each.values())) for each in (splits, complete))
+    if existing == count or existing <= count / 2 or not complete["train"]:
+        return splits, []
+    return ({split: views for split, views in complete.items() if views},
+            [f"{count - existing} of {count} frames have no photograph and are left out"])
+
+
 def write_transforms(folder: Path, split: str, transforms: Transforms) -> Path:
     """Write `transforms_<split>.json` (whole or not at all) and return its path."""
     data = {

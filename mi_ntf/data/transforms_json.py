@@ -1,11 +1,11 @@
 """Readers of `transforms_<split>.json` (our captures, NeRF-synthetic, NRHints) and of nerfstudio's `transforms.json`.
 
-:func:`read_splits` reads a file for each split. The camera is `camera_angle_x` (radians), or NRHints'
-`camera_intrinsics` [cx, cy, fx, fy] (pixels). `file_path` may lack its extension, which NRHints names in `file_ext`.
-`pl_pos` is x, y, z or x, y, z, 1; without it the light is at the camera. `pl_intensity` is one number or RGB. Missing
-`w`, `h`, `pl_intensity` and `unit_sphere` are derived from the images.
+:func:`read_splits` reads a file for each split. The camera is `camera_angle_x` (radians), NRHints' `camera_intrinsics`
+[cx, cy, fx, fy] (pixels), or as below. `file_path` may lack its extension, which NRHints names in `file_ext`. `pl_pos`
+is x, y, z or x, y, z, 1; without it the light is at the camera. `pl_intensity` is one number or RGB. Missing `w`, `h`,
+`pl_intensity` and `unit_sphere` are derived from the images.
 
-:func:`read_nerfstudio` reads the file of nerfstudio and instant-ngp:
+:func:`read_nerfstudio` reads the file of nerfstudio and instant-ngp. An entry of a frame replaces that of the file:
 
     fl_x, fl_y, cx, cy, w, h     pixels, for all frames or in each; (0, 0) is the corner of the top left pixel. Missing
                                  fl_y: fl_x; missing cx, cy: the middle; missing fl_x: `camera_angle_x` (radians)
@@ -14,12 +14,12 @@
     frames                       file_path, transform_matrix (camera-to-world, OpenGL axes), mask_path (white: object)
     train_filenames, val_filenames, test_filenames    file_path of the frames of each split
 
-Frames of nerfstudio without a photograph are dropped, as instant-ngp does. Every fault names file, frame and value.
+Frames of nerfstudio without a photograph are dropped, as instant-ngp does. An entry that is null counts as missing.
+Every fault names file, frame and value.
 Sources: the loaders of NeRF (Mildenhall et al. 2020) and NRHints (Zeng et al. 2023); nerfstudio's "Data conventions",
 and for k4 its undistortion (`full_images_datamanager`), which refuses it as well.
 """
 
-import dataclasses
 import json
 import os
 from pathlib import Path
@@ -27,11 +27,11 @@ from pathlib import Path
 import numpy as np
 
 from mi_ntf.core.errors import MiNtfError, shown
-from mi_ntf.data import file_names
+from mi_ntf.data import file_names, images
 from mi_ntf.data.estimates import Sphere
 from mi_ntf.data.file_names import is_file_name, locate, plain
 from mi_ntf.data.poses import check_rigid
-from mi_ntf.data.schema import SPLITS, Camera, DataSet, View, focal_length
+from mi_ntf.data.schema import SPLITS, Camera, DataSet, View, drop_missing, focal_length
 
 NERFSTUDIO = "nerfstudio data set (transforms.json)"
 STRAIGHT = ("PINHOLE", "SIMPLE_PINHOLE")
@@ -46,12 +46,13 @@ def read_splits(folder: Path) -> DataSet:
     views: dict[str, list[View]] = {}
     spheres: dict[str, Sphere] = {}
     notes: list[str] = []
+    with_intrinsics = False
     for split in SPLITS:
         path = folder / f"transforms_{split}.json"
         if split == "train" or path.is_file():
             data, frames = _load(path, notes)
-            camera, size = _intrinsics(data, str(path)), _size(data, str(path))
-            views[split] = [_view(entry, f"{path}, frame {i}", folder, camera, size) for i, entry in enumerate(frames)]
+            views[split] = _views(data, frames, path, notes)
+            with_intrinsics |= "camera_intrinsics" in data
             if (sphere := _sphere(data, path)) is not None:
                 spheres[split] = sphere
     expected = spheres.get("train") or next(iter(spheres.values()), None)
@@ -63,7 +64,7 @@ def read_splits(folder: Path) -> DataSet:
                              "object: write the same sphere")
     if expected is not None:
         form = "photographs of `mi-ntf capture`"
-    elif any(isinstance(view.camera, Camera) or view.light_pos is not None for view in views["train"]):
+    elif with_intrinsics or any(view.light_pos is not None for view in views["train"]):
         form = "NRHints data set"
     else:
         form = "NeRF-synthetic (Blender) data set"
@@ -75,21 +76,16 @@ def read_nerfstudio(folder: Path) -> DataSet:
     path = folder / "transforms.json"
     assumed: list[str] = []
     data, frames = _load(path, assumed)
-    views = [_nerfstudio_view(data, entry, f"{path}, frame {i}", folder) for i, entry in enumerate(frames)]
-    splits, notes = _named_splits(data, views, path)
-    complete = {split: [view for view in chosen if view.image.is_file()] for split, chosen in splits.items()}
-    count, existing = (sum(map(len, each.values())) for each in (splits, complete))
-    if existing > count / 2 and complete["train"]:  # else it is the wrong folder, or a copy that was broken off
-        splits = {split: chosen for split, chosen in complete.items() if chosen}
-        notes += [f"{count - existing} of {count} frames have no photograph and are left out"] * (existing < count)
-    return DataSet(NERFSTUDIO, splits, _sphere(data, path), None, notes, assumed)
+    splits, notes = _named_splits(data, _views(data, frames, path, assumed), path)
+    splits, missing = drop_missing(splits)
+    return DataSet(NERFSTUDIO, splits, _sphere(data, path), None, notes + missing, assumed)
 
 
 def _load(path: Path, assumed: list[str]) -> tuple[Entries, list[object]]:
     """Return the contents of the file and its `frames`; assumptions about the text are added to `assumed`."""
     try:
         text, note = file_names.read_text(path)
-        data = json.loads(text)
+        data = json.loads(text, object_hook=_without_nulls)
     except (OSError, ValueError, RecursionError) as error:  # also half a character of UTF-16
         raise MiNtfError(f"{path}: not valid JSON ({error}); the file is damaged, capture or copy it again") from None
     if not isinstance(data, dict) or not isinstance(data.get("frames"), list) or not data["frames"]:
@@ -98,9 +94,24 @@ def _load(path: Path, assumed: list[str]) -> tuple[Entries, list[object]]:
     return data, data["frames"]
 
 
-def _intrinsics(data: Entries, where: str) -> Camera | float:
-    if "camera_intrinsics" not in data:
-        return _angle_x(data, where)
+def _without_nulls(entries: Entries) -> Entries:
+    return {key: value for key, value in entries.items() if value is not None}
+
+
+def _views(data: Entries, frames: list[object], path: Path, assumed: list[str]) -> list[View]:
+    """Return the photographs of all frames; an assumption about their places is added to `assumed`."""
+    views = [_view(data, entry, f"{path}, frame {i}", path.parent) for i, entry in enumerate(frames)]
+    names = [str(entry["file_path"]) for entry in frames if isinstance(entry, dict)]
+    elsewhere = [name for name, view in zip(names, views, strict=True)
+                 if file_names.is_absolute(name) and not file_names.is_absolute(view.name)]
+    if elsewhere:
+        assumed.append(f"{len(elsewhere)} photographs are not at the places that {path} names (first {elsewhere[0]}); "
+                       "those of the same names in its folder are read")
+    return views
+
+
+def _intrinsics(data: Entries, where: str) -> Camera:
+    """Return the camera of NRHints' entry."""
     cx, cy, fx, fy = map(float, _numbers(data, "camera_intrinsics", (4,), where))
     if min(fx, fy) <= 0:
         raise MiNtfError(f"{where}: 'camera_intrinsics' is {data['camera_intrinsics']}; the focal lengths, its "
@@ -108,8 +119,10 @@ def _intrinsics(data: Entries, where: str) -> Camera | float:
     return Camera(fx, fy, cx, cy)
 
 
-def _nerfstudio_camera(entries: Entries, where: str) -> Camera | float:
-    """Return the camera of the entries of a frame and of its file."""
+def _camera(entries: Entries, image: Path, where: str) -> Camera | float:
+    """Return the camera of the entries of a frame and of its file. Missing sizes are those of the file `image`."""
+    if "camera_intrinsics" in entries:
+        return _intrinsics(entries, where)
     fisheye = " (is_fisheye)" if entries.get("is_fisheye") else ""
     model = entries.get("camera_model", "OPENCV")
     if model not in MODELS or fisheye:
@@ -121,12 +134,14 @@ def _nerfstudio_camera(entries: Entries, where: str) -> Camera | float:
         raise MiNtfError(f"{where}: 'k4' is {entries['k4']}; that term is not undone: calibrate with k1 to k3, p1 and "
                          "p2 alone, or undistort the photographs first")
     bent = bent if any(bent) else ()
+    if not (bent or {"fl_x", "cx", "cy"} & entries.keys()):
+        return _angle_x(entries, where)
+    if not {"w", "h"} <= entries.keys():
+        entries = dict(zip("wh", images.size_of(image) or (), strict=False)) | entries
     if "fl_x" in entries:
         fx = _positive(entries, "fl_x", where)
-    elif bent or "cx" in entries or "cy" in entries:
-        fx = focal_length(_angle_x(entries, where), _positive(entries, "w", where))
     else:
-        return _angle_x(entries, where)
+        fx = focal_length(_angle_x(entries, where), _positive(entries, "w", where))
     fy = _positive(entries, "fl_y", where) if "fl_y" in entries else fx
     cx, cy = (_number(entries, key, where) if key in entries else 0.5 * _positive(entries, side, where)
               for key, side in (("cx", "w"), ("cy", "h")))
@@ -148,45 +163,44 @@ def _size(entries: Entries, where: str) -> tuple[int, int] | None:
     return int(_positive(entries, "w", where)), int(_positive(entries, "h", where))
 
 
-def _view(entry: object, where: str, folder: Path, camera: Camera | float, size: tuple[int, int] | None) -> View:
-    if not isinstance(entry, dict) or "file_path" not in entry:
+def _view(data: Entries, frame: object, where: str, folder: Path) -> View:
+    """Return the photograph of one frame, whose entries replace those of the file, `data`."""
+    if not isinstance(frame, dict):
+        raise MiNtfError(f"{where}: is {shown(frame)}, expected 'file_path', 'transform_matrix' and what the frame has "
+                         "of its own")
+    if "file_path" not in frame:
         raise MiNtfError(f"{where}: 'file_path' is missing; name the image relative to the folder")
-    c2w = _numbers(entry, "transform_matrix", (4, 4), where, also=(3, 4))
+    c2w = _numbers(frame, "transform_matrix", (4, 4), where, also=(3, 4))
     c2w = np.vstack([c2w, np.eye(4)[len(c2w):]])
     check_rigid(c2w, where, "'transform_matrix'")
+    name = _file_name(frame, "file_path", folder, where)
+    if Path(name).suffix.lower() not in file_names.SUFFIXES:
+        extension = _file_name(frame, "file_ext", folder, where) if frame.get("file_ext") else None
+        name = _with_suffix(folder, name, extension, where)
+    image, name = locate(folder, name), plain(name)
+    camera, size = _camera(data | frame, image, where), _size(data | frame, where)
+    with_mask = "mask_path" in frame
+    masks = ([locate(folder, _file_name(frame, "mask_path", folder, where))] if with_mask
+             else file_names.mask_places(folder / "masks", name))
+    return View(where, image, name, masks, c2w, camera, size, *_light(frame, where), mask_first=with_mask)
+
+
+def _light(frame: Entries, where: str) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Return the place (3,) and the radiant intensity (3,) of the light, None for what the frame does not give."""
     position = intensity = None
-    if "pl_pos" in entry:
-        position = _numbers(entry, "pl_pos", (3,), where, also=(4,))
+    if "pl_pos" in frame:
+        position = _numbers(frame, "pl_pos", (3,), where, also=(4,))
         if len(position) == 4 and position[3] != 1:
             raise MiNtfError(f"{where}: 'pl_pos' has a fourth number, {position[3]:g}, which is 1 in homogeneous "
                              "coordinates; write x, y and z alone, and an intensity as 'pl_intensity'")
         position = position[:3]
-    if "pl_intensity" in entry:
-        shape = () if isinstance(entry["pl_intensity"], int | float) else (3,)
-        intensity = np.broadcast_to(_numbers(entry, "pl_intensity", shape, where), (3,)).copy()
+    if "pl_intensity" in frame:
+        shape = () if isinstance(frame["pl_intensity"], int | float) else (3,)
+        intensity = np.broadcast_to(_numbers(frame, "pl_intensity", shape, where), (3,)).copy()
         if intensity.min() < 0 or intensity.max() <= 0:
             raise MiNtfError(f"{where}: 'pl_intensity' is {intensity.tolist()}, must be positive; leave it out in all "
                              "frames to have it estimated")
-    name = _file_name(entry, "file_path", where)
-    if Path(name).suffix.lower() not in file_names.SUFFIXES:
-        extension = _file_name(entry, "file_ext", where) if entry.get("file_ext") else None
-        name = _with_suffix(folder, name, extension, where)
-    image, name = locate(folder, name), plain(name)
-    masks = file_names.mask_places(folder / "masks", name)
-    return View(where, image, name, masks, c2w, camera, size, position, intensity)
-
-
-def _nerfstudio_view(data: Entries, entry: object, where: str, folder: Path) -> View:
-    """Return the photograph of one frame, whose entries replace those of the file."""
-    if not isinstance(entry, dict):
-        raise MiNtfError(f"{where}: is {shown(entry)}, expected 'file_path', 'transform_matrix' and what the frame has "
-                         "of its own")
-    entries = data | entry
-    view = _view(entry, where, folder, _nerfstudio_camera(entries, where), _size(entries, where))
-    if "mask_path" in entry:
-        mask = locate(folder, _file_name(entry, "mask_path", where))
-        view = dataclasses.replace(view, masks=[mask], mask_first=True)
-    return view
+    return position, intensity
 
 
 def _named_splits(data: Entries, views: list[View], path: Path) -> tuple[dict[str, list[View]], list[str]]:
@@ -194,16 +208,17 @@ def _named_splits(data: Entries, views: list[View], path: Path) -> tuple[dict[st
     lists = {f"{split}_filenames": data[f"{split}_filenames"] for split in SPLITS if data.get(f"{split}_filenames")}
     if not lists:
         return {"train": views}, []
-    place = {os.path.normpath(view.name): view for view in views}
+    keyed = [(os.path.normpath(view.name), view) for view in views]
+    place = {os.path.splitext(name)[0]: view for name, view in keyed} | dict(keyed)
     splits = {}
     for key, names in lists.items():
         if not isinstance(names, list) or not all(map(is_file_name, names)):
             raise MiNtfError(f"{path}: '{key}' is {shown(names)}, expected a list of frames' 'file_path'")
-        unknown = next((name for name in names if os.path.normpath(plain(name)) not in place), None)
-        if unknown is not None:
-            raise MiNtfError(f"{path}: '{key}' has {shown(unknown)}, which is the 'file_path' of no frame; write the "
-                             "names alike")
-        splits[key.removesuffix("_filenames")] = [place[os.path.normpath(plain(name))] for name in names]
+        listed = [place.get(os.path.normpath(plain(file_names.moved(path.parent, name)))) for name in names]
+        if None in listed:
+            raise MiNtfError(f"{path}: '{key}' has {shown(names[listed.index(None)])}, which is the 'file_path' of no "
+                             "frame; write the names alike")
+        splits[key.removesuffix("_filenames")] = [view for view in listed if view]
     used = {id(view) for split in splits.values() for view in split}
     rest = [view for view in views if id(view) not in used]
     if "train" in splits:
@@ -222,11 +237,12 @@ def _sphere(data: Entries, path: Path) -> Sphere | None:
     return Sphere(_numbers(entry, "center", (3,), where), _positive(entry, "radius", where))
 
 
-def _file_name(entry: Entries, key: str, where: str) -> str:
+def _file_name(entry: Entries, key: str, folder: Path, where: str) -> str:
+    """Return the name of a file; one in `folder` if `entry` has a place on another machine."""
     name = entry[key]
     if not is_file_name(name):
         raise MiNtfError(f"{where}: '{key}' is {shown(name)}, expected the name of a file")
-    return name
+    return file_names.moved(folder, name)
 
 
 def _with_suffix(folder: Path, name: str, extension: str | None, where: str) -> str:

@@ -157,3 +157,12 @@ def test_deep_tiff_is_linear_or_refused(tmp_path, icc, fault):
         return
     with pytest.raises(MiNtfError, match=rf"a.tif: its ICC profile is {fault}; TIFF of more than 8 bits is read as"):
         images.decode(tmp_path / "a.tif")
+
+
+def test_adobe_rgb_of_cameras_is_refused(tmp_path):
+    """Cameras write no profile, but the interoperability index of Exif."""
+    tags = Image.Exif()
+    tags.get_ifd(0x8769)[0xA005] = {1: "R03"}
+    Image.fromarray(PICTURE).save(tmp_path / "_a.jpg", exif=tags, quality=100)
+    with pytest.raises(MiNtfError, match=r"_a.jpg: its Exif tags say Adobe RGB, and it has no ICC profile; convert it"):
+        images.decode(tmp_path / "_a.jpg")

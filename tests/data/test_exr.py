@@ -98,3 +98,27 @@ def test_refused(tmp_path, names, header, text):
     write(tmp_path / "a.exr", {name: PICTURE for name in names}, **header)
     with pytest.raises(MiNtfError, match=text):
         images.decode(tmp_path / "a.exr")
+
+
+NAMES = {"lower case": "rgba", "Nuke": ("red", "green", "blue", "alpha"),
+         "title case": ("Red", "Green", "Blue", "Alpha")}
+
+
+@pytest.mark.parametrize("names", NAMES.values(), ids=NAMES)
+@pytest.mark.parametrize("layer", ["", "rgba."])
+def test_names_of_channels(tmp_path, names, layer):
+    with OpenEXR.File({}, {layer + name: PICTURE[..., k].copy() for k, name in enumerate(names)}) as file:
+        file.write(str(tmp_path / "a.exr"))
+    image = images.decode(tmp_path / "a.exr")
+    np.testing.assert_array_equal(np.concatenate([image.rgb, image.alpha[..., None]], -1), PICTURE)
+
+
+def test_the_composite_goes_before_the_layers_of_blender(tmp_path):
+    write(tmp_path / "a.exr", {"ViewLayer.Combined.": PICTURE * 0.5, "Composite.Combined.": PICTURE})
+    np.testing.assert_array_equal(images.decode(tmp_path / "a.exr").rgb, PICTURE[..., :3])
+
+
+def test_whole_numbers_are_refused(tmp_path):
+    write(tmp_path / "a.exr", {"": (255 * PICTURE).astype(np.uint32)})
+    with pytest.raises(MiNtfError, match=r"a.exr: its channels are whole numbers, whose white is not known; write it "):
+        images.decode(tmp_path / "a.exr")

@@ -13,7 +13,7 @@ from mi_ntf.core.errors import MiNtfError
 from mi_ntf.data import inspect_figures, measures, silhouettes
 from mi_ntf.data.capture import camera_to_world
 from mi_ntf.data.images import LINEAR
-from mi_ntf.data.inspect import inspect, print_table
+from mi_ntf.data.inspect import inspect, print_table, summary
 from mi_ntf.data.schema import Camera, Split, View
 
 AXES = np.concatenate([np.eye(3), -np.eye(3)])
@@ -133,6 +133,13 @@ def test_flash_beside_the_lens():
     assert numbers["flash_degrees"]["most"] == pytest.approx(18, abs=1e-3)
 
 
+def test_a_flash_whose_place_is_not_known():
+    """The data set's light is the lens then, and its angle there tells nothing."""
+    numbers, _, _ = changed(located=False)
+    assert numbers["flash_degrees"] is None
+    assert dict(summary(numbers))["flash beside the lens"] == "not known; taken to be at the lens"
+
+
 def test_small_objects_and_inverted_masks():
     images = six()["train"].images.copy()
     images[:, :, :18, 3] = 0
@@ -232,8 +239,9 @@ def test_every_form(tmp_path, monkeypatch, form, capsys):
 
 
 def test_a_page_that_cannot_be_written_is_told_before_the_work(tmp_path):
-    with pytest.raises(MiNtfError, match=r"cannot write .*page.html: folder .* does not exist"):
-        inspect(tmp_path / "no set", tmp_path / "nowhere" / "page.html")
+    (tmp_path / "file").touch()
+    with pytest.raises(MiNtfError, match=r"cannot make the folder .*file "):
+        inspect(tmp_path / "no set", tmp_path / "file" / "page.html")
     with pytest.raises(MiNtfError, match=r"no set does not exist"):
         inspect(tmp_path / "no set", tmp_path / "page.html")
-    assert list(tmp_path.iterdir()) == []
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]

@@ -100,3 +100,33 @@ def test_red_masks_of_a_data_set_are_said(tmp_path):
     np.testing.assert_array_equal(result[..., 3], 255 * expected[7])
     assert any(text.startswith("assumed: a coloured mask shows the object where it is not black (16 photographs, first")
                for text in messages)
+
+
+@pytest.mark.parametrize("opaque", [True, False])
+def test_an_opaque_alpha_channel_is_no_mask(tmp_path, opaque):
+    """Screenshots and many editors write one; a cut-out's alpha goes before the folder of masks."""
+    forms.colmap(tmp_path)
+    for path in (tmp_path / "images").iterdir():
+        with Image.open(path) as image:
+            image.putalpha(255 if opaque else Image.fromarray(SHARES))
+        image.save(path)
+    messages = []
+    pictures = load_dataset(tmp_path, messages.append)["train"].images
+    if opaque:
+        np.testing.assert_array_equal(pictures[0, ..., 3], forms.straight_srgb(forms.PICTURES[0])[..., 3])
+        assert "assumed: an alpha channel that is opaque throughout gives way to a mask (16 photographs" in " ".join(
+            messages)
+    else:
+        np.testing.assert_array_equal(pictures[0, ..., 3], SHARES)
+
+
+@pytest.mark.parametrize("name", ["{}_mask.png", "{}.mask.png", "{}.png.mask.png", "{}.webp", "{}.bmp"])
+def test_masks_as_other_programs_name_them(tmp_path, name):
+    forms.colmap(tmp_path)
+    expected = load_dataset(tmp_path, lambda _: None)["train"].images
+    for path in sorted((tmp_path / "masks").iterdir()):
+        with Image.open(path) as image:
+            image.load()
+        path.unlink()
+        image.save(tmp_path / "masks" / name.format(path.stem), lossless=True)
+    np.testing.assert_array_equal(load_dataset(tmp_path, lambda _: None)["train"].images, expected)

@@ -84,6 +84,16 @@ def test_a_flash_beside_the_lens(tmp_path):
         load(tmp_path, flash_offset=(1, float("nan"), 2))
 
 
+def test_a_flash_that_training_will_find(tmp_path):
+    """The note that the reflectance comes out wrong is for those who do not know of the option."""
+    _, messages = load(forms.blender(tmp_path))
+    assert "a flash at the lens is assumed" in messages and "`train --flash-offset estimate` finds it" in messages
+    splits, messages = load(tmp_path, flash_offset="estimate")
+    assert "training estimates where the flash stands" in messages and "assumed" not in messages
+    assert not splits["train"].located
+    assert "where the flash stands" not in load(forms.nrhints(tmp_path / "lit"), flash_offset="estimate")[1]
+
+
 def test_a_flash_that_the_data_set_places_itself(tmp_path):
     with pytest.raises(MiNtfError, match=r"frame 0: 'pl_pos' says where the light is, and so does a flash offset of "
                                          r"\[0, 1, 0\]; leave one of the two out \(read as NRHints data set\)"):

@@ -158,7 +158,8 @@ def _shrink(folder: Path) -> None:
      r"and .* \(read as COLMAP model\)$"),
     ("PINHOLE", _cut, r"points3D.txt: cannot be read .*has 2 words.*`colmap model_converter`"),
     ("PINHOLE", lambda f: (f / "images").rename(f / "photos"), "images does not exist; put the photographs of"),
-    ("PINHOLE", lambda f: (f / "images/002.png").unlink(), "images/002.png does not exist; the data set is incomplete"),
+    ("PINHOLE", lambda f: [p.unlink() for p in sorted((f / "images").iterdir())[2:12]],
+     "images/002.png does not exist; the data set is incomplete"),
     ("PINHOLE", lambda f: (f / "masks/002.png").unlink(), "002.png: has no alpha channel and no mask"),
     ("PINHOLE", _shrink, "003.png: is 12x12, .*image '003.png' says 24x24; photograph and camera must belong together"),
 ])
@@ -171,7 +172,23 @@ def test_faults_of_colmap_folders(tmp_path, model, change, text):
 def test_photographs_without_a_pose_are_counted(tmp_path):
     forms.colmap(tmp_path)
     (tmp_path / "images/late.jpg").write_bytes(b"")
+    (tmp_path / "images/._000.png").write_bytes(b"")  # macOS leaves such files in archives
     assert "1 of 17 photographs in" in load(tmp_path)[1]
+
+
+def test_poses_without_a_photograph_are_counted(tmp_path):
+    """Somebody has deleted the blurred photograph."""
+    (forms.colmap(tmp_path) / "images/003.png").unlink()
+    splits, messages = load(tmp_path)
+    assert "1 of 16 frames have no photograph and are left out\n" in messages and "have no pose" not in messages
+    np.testing.assert_allclose(np.concatenate([split.c2w for split in splits.values()]).sum(0),
+                               np.delete(forms.C2W, 3, 0).sum(0), atol=1e-6)
+
+
+def test_hidden_files_of_macos_are_no_photographs(tmp_path):
+    for path in list((forms.llff(tmp_path) / "images").iterdir()):
+        path.with_name(f"._{path.name}").write_bytes(b"")
+    assert "16 photographs" in load(tmp_path)[1]
 
 
 # --- faults of transforms_*.json ------------------------------------------------------------------------------------
@@ -298,3 +315,13 @@ def test_folders_that_hold_nothing(tmp_path):
         load(tmp_path)
     with pytest.raises(MiNtfError, match=r"gone does not exist or is no folder; make a data set with `mi-ntf capture"):
         load(tmp_path / "gone")
+
+
+def test_the_folder_that_was_meant_is_named(tmp_path):
+    folder = forms.nerfstudio(tmp_path / "sets" / "spheres")
+    forms.blender(tmp_path / "sets" / "other")
+    for given, named in ((folder / "images", folder), (folder.parent, f"{folder.parent / 'other'} and {folder}")):
+        with pytest.raises(MiNtfError, match=rf"{given}: no data set is here, but {named} holds? one"):
+            load(given)
+    with pytest.raises(MiNtfError, match=rf"transforms.json is a file; name the folder that it is in, {folder}"):
+        load(folder / "transforms.json")

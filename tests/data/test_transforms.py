@@ -134,3 +134,55 @@ def test_lights_of_the_training_split_alone(tmp_path, form, key):
 def test_latin_1_is_said(tmp_path, form):
     latin(form(tmp_path))
     assert load(tmp_path)[1].count("is no UTF-8 and is read as Latin-1") == 3
+
+
+def edit_file(folder: Path, change) -> None:
+    """Put the contents of every file of the folder through `change`."""
+    for path in folder.glob("transforms*.json"):
+        data = json.loads(path.read_text())
+        change(data)
+        path.write_text(json.dumps(data))
+
+
+INTRINSICS = {"fl_x": forms.FOCAL, "fl_y": forms.FOCAL, "cx": 12, "cy": 12, "w": 24, "h": 24}
+
+
+@pytest.mark.parametrize(("form", "change"), [
+    (forms.blender, lambda d: d.pop("camera_angle_x") and d.update(INTRINSICS)),
+    (forms.blender, lambda d: d.update(INTRINSICS, camera_angle_x=0.5)),
+    (forms.blender, lambda d: d.pop("camera_angle_x") and [f.update(INTRINSICS) for f in d["frames"]]),
+    (forms.blender, lambda d: d.pop("camera_angle_x") and [f.update(camera_angle_x=forms.ANGLE) for f in d["frames"]]),
+    (forms.blender, lambda d: d.update(fl_x=None, w=None, h=None)),
+    (forms.nerfstudio, lambda d: [d.pop(key) for key in ("w", "h", "cx", "cy")]),
+    (forms.nerfstudio, lambda d: [f.update(mask_path=None, k1=None, w=None) for f in d["frames"]]),
+], ids=["fl_x", "fl_x goes before camera_angle_x", "fl_x of each frame", "camera_angle_x of each frame", "null",
+        "sizes from the photographs", "null in frames"])
+def test_cameras_as_other_programs_write_them(tmp_path, form, change):
+    edit_file(form(tmp_path), change)
+    for name, views in forms.splits().items():
+        check_cameras(load(tmp_path)[0][name], views)
+
+
+def test_lens_distortion_of_splits_is_undone(tmp_path):
+    """A lens that magnifies the corners: the picture without it is wider."""
+    edit_file(forms.blender(tmp_path), lambda d: d.update(INTRINSICS, k1=0.5))
+    splits, messages = load(tmp_path)
+    assert "lens distortion undone" in messages and (splits["train"].focal != forms.FOCAL).all()
+
+
+@pytest.mark.parametrize("place", ["/home/somebody/set/", "C:\\Users\\somebody\\set\\", "D:/set/"])
+def test_absolute_names_of_another_machine(tmp_path, place):
+    """The photographs are there under the last parts of their names, and masks belong to those parts."""
+    forms.nerfstudio(tmp_path)
+    (tmp_path / "masks").mkdir()
+    for path in sorted((tmp_path / "images").iterdir()):
+        with Image.open(path) as image:
+            image.getchannel("A").save(tmp_path / "masks" / path.name)
+        image.convert("RGB").save(path)
+    edit_file(tmp_path, lambda d: [f.update(file_path=place + f["file_path"][2:]) for f in d["frames"]])
+    splits, messages = load(tmp_path)
+    for name, views in forms.splits().items():
+        check_cameras(splits[name], views)
+    assert splits["test"].names == ("images/frame_00015.png",)
+    assert f"assumed: 16 photographs are not at the places that {tmp_path}/transforms.json names (first {place}" in (
+        messages.replace("\\\\", "\\"))
