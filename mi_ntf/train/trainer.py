@@ -162,7 +162,10 @@ class Trainer:
         start = time.monotonic()
         self.log = Log(tensorboard if parallel.first() else None, view and parallel.first())
         self.notes = Notes(parallel.first())
-        self.data = TrainingData.load(dataset, self.notes, reading or {})
+        reading = reading or {}
+        if estimate and reading.get("flash_offset") is None:
+            reading = {**reading, "flash_offset": "estimate"}
+        self.data = TrainingData.load(dataset, self.notes, reading)
         self.clock = Clock(minutes or math.inf, steps or math.inf, spent=time.monotonic() - start)
         self.learner = Learner(self.clock)
         self.generator = device.generator(seed)

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypedDict
+from typing import Literal, TypedDict
 
 import torch
 
@@ -25,7 +25,7 @@ class Reading(TypedDict, total=False):
     size: int | None
     masks: Path | None
     background: str | None
-    flash_offset: tuple[float, float, float] | None
+    flash_offset: tuple[float, float, float] | Literal["estimate"] | None
 
 
 @dataclass(frozen=True)
