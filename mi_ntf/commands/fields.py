@@ -32,6 +32,8 @@ class Capture:
     """Seed of view directions and samples."""
     flash_offset: FlashOffset = None
     """Offset of the flash from the lens: right,up,forward in scene lengths."""
+    shapes: str = ""
+    """Shapes to photograph, as cow,grass, or all but some, as not:floor. The default is all but lights."""
     workers: WorkerOptions = field(default_factory=Workers)
 
     def run(self) -> None:
@@ -40,8 +42,11 @@ class Capture:
         from mi_ntf.data.capture import capture
 
         offset = options.parse_offset(self.flash_offset) or (0.0, 0.0, 0.0)
-        capture(self.scene, self.folder, views=self.views, size=self.size, test_views=self.test_views, spp=self.spp,
-                seed=self.seed, flash_offset=offset, workers=self.workers)
+        report = capture(self.scene, self.folder, views=self.views, size=self.size, test_views=self.test_views,
+                         spp=self.spp, seed=self.seed, flash_offset=offset, shapes=self.shapes, workers=self.workers)
+        kept = f", {report['kept']} of them from an earlier run" if report["kept"] else ""
+        print(f"photographs: {self.folder} ({report['rendered'] + report['kept']}{kept})",
+              f"next: mi-ntf train {self.folder} -o field.safetensors --minutes 10", sep="\n")
 
 
 @dataclass

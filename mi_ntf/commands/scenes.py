@@ -22,13 +22,17 @@ class Swap:
     """Trained field."""
     output: Output
     """Scene to write."""
+    shapes: str = ""
+    """Shapes to replace, as cow,grass, or all but some, as not:floor. The default is all but lights."""
 
     def run(self) -> None:
-        """Write the scene, and print what was left out to standard error."""
+        """Write the scene, and print what was replaced and what stays."""
         from mi_ntf.swap import swap
 
-        for note in swap(self.scene, self.field_file, self.output):
+        report = swap(self.scene, self.field_file, self.output, self.shapes)
+        for note in report.notes:
             print(f"mi-ntf: {note}", file=sys.stderr)
+        print(report, f"scene: {self.output}", f"next: mitsuba -m llvm_ad_rgb {self.output}", sep="\n")
 
 
 @dataclass

@@ -3,121 +3,46 @@
 Every view has a point light exactly at the camera (collocated capture, method of Bi et al. 2020), or at one place
 beside it. At the camera the light's transmittance is the view's: a medium of density σ dims it twice,
 L = ∫ σ_s f T² I/t² dt. Alpha is the opacity, the fraction of paths that meet matter. The scene's own sensors and
-emitters are ignored; its shapes, media, materials and, if suitable, its integrator are used. This is the only file of
-`data` that uses Mitsuba.
+emitters are ignored; its shapes, media, materials and, if suitable, its integrator are used. In `data`, only
+this file and `capture_scene` use Mitsuba.
 """
 
-import hashlib
 import json
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from mi_ntf import jobs
-from mi_ntf.core import files
+from mi_ntf.core import files, progress
 from mi_ntf.core.errors import MiNtfError
-from mi_ntf.core.variants import VARIANTS, enough_threads
-from mi_ntf.data import schema
+from mi_ntf.data import capture_scene, schema
 from mi_ntf.data.estimates import bounding_sphere
 from mi_ntf.data.poses import camera_to_world, view_directions
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
-POSITIONS = "vertex_positions", "positions"  # parameter of a mesh until Mitsuba 3.9, and from 3.10 on
 DISTANCE = 3.2  # camera to object's centre, in radii of the bounding sphere
 MARGIN = 1.04   # bounding sphere over the object's extent: room for a soft surface in the field
-SURFACE_INTEGRATORS = {"PathIntegrator", "DirectIntegrator"}
-VOLUME_INTEGRATORS = {"VolumetricPathIntegrator", "VolpathMisIntegratorImpl"}  # class names of volpath and volpathmis
 
 
-def _load(path: Path) -> "tuple[list[mi.Shape], mi.Integrator]":
-    """Return the scene's shapes that emit no light, and an integrator that sees them.
-
-    The integrator is the scene's own if it is a path tracer, a volumetric one for media; else `path` or `volpath` of
-    depth 6.
-    """
-    import drjit as dr
-    import mitsuba as mi
-
-    enough_threads(dr)
-    variant = mi.variant()
-    if variant is None:
-        mi.set_variant(*VARIANTS)
-    elif "rgb" not in variant:
-        raise MiNtfError(f"variant '{variant}' is active; photographs are linear RGB: set an rgb variant "
-                         "such as llvm_ad_rgb")
-    if not Path(path).is_file():
-        raise MiNtfError(f"{path} does not exist; name a Mitsuba scene file (.xml)")
-    scene = mi.load_file(str(path))
-    if not isinstance(scene, mi.Scene):
-        raise MiNtfError(f"{path}: holds a {type(scene).__name__}, not a scene; the root element must be <scene>")
-    shapes = [shape for shape in scene.shapes() if not shape.is_emitter()]
-    if not shapes:
-        raise MiNtfError(f"{path}: no shapes that reflect light ({len(scene.shapes())} emitters); "
-                         "add the object to photograph")
-    around = [shape.id() for shape in shapes if shape.exterior_medium()]
-    if around:
-        raise MiNtfError(f"{path}: shape '{around[0]}' has an exterior medium, in which the cameras would stand; give "
-                         "the medium to a bounding shape as its interior")
-    media = any(shape.interior_medium() for shape in shapes)
-    integrator = scene.integrator()
-    if integrator is None or integrator.class_name() not in VOLUME_INTEGRATORS | (set() if media else
-                                                                                   SURFACE_INTEGRATORS):
-        integrator = mi.load_dict({"type": "volpath" if media else "path", "max_depth": 6, "hide_emitters": True})
-    return sorted(shapes, key=lambda shape: (_fingerprint(shape), shape.id())), integrator  # Mitsuba's order is chance
-
-
-def _outline(shapes: "list[mi.Shape]") -> np.ndarray:
-    """Return points (P, 3) whose hull contains every shape.
-
-    They are the vertices of meshes, points all over spheres (within 0.5 %), and the box corners of all other shapes.
-    Media count by the shapes that bound them.
-    """
-    import mitsuba as mi
-
-    points = []
-    for shape in shapes:
-        params = mi.traverse(shape)
-        positions = next((name for name in POSITIONS if name in params), None)
-        if positions:  # a rectangle calls itself a mesh and has none
-            points.append(np.array(params[positions]).reshape(-1, 3))
-        elif shape.shape_type() == int(mi.ShapeType.Sphere):
-            to_world = np.array(params["to_world"].matrix).reshape(4, 4)
-            lattice = view_directions(1000, np.random.default_rng(0))
-            points.append(lattice @ to_world[:3, :3].T + to_world[:3, 3])
-        else:
-            points.append(np.array([np.array(shape.bbox().corner(i)).ravel() for i in range(8)]))
-    return np.concatenate(points).astype(np.float64)
-
-
-def _fingerprint(thing: "mi.Object") -> str:
-    """Return a hash of all parameters (vertices, materials) of a Mitsuba object."""
-    import mitsuba as mi
-
-    digest = hashlib.sha256()
-    for key, value in sorted(mi.traverse(thing), key=lambda item: item[0]):
-        digest.update(key.encode())
-        digest.update(np.array(value).tobytes() if hasattr(value, "__len__") else repr(value).encode())
-    return digest.hexdigest()[:16]
-
-
-def _studio(shapes: "list[mi.Shape]", integrator: "mi.Integrator", angle: float, size: int) -> "mi.Scene":
-    """Return a scene of the shapes with a perspective camera (box filter, RGBA) and a point light, not yet placed."""
+def _studio(subject: capture_scene.Subject, angle: float, size: int) -> "mi.Scene":
+    """Return a scene of the subject with a perspective camera (box filter, RGBA) and a point light, not yet placed."""
     import mitsuba as mi
 
     film = {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgba", "component_format": "float32",
             "rfilter": {"type": "box"}}
     scene = mi.load_dict({
         "type": "scene",
-        "integrator": integrator,
+        "integrator": subject.integrator,
         "sensor": {"type": "perspective", "fov": float(np.degrees(angle)), "near_clip": 1e-4, "far_clip": 1e6,
                    "film": film, "sampler": {"type": "independent"}},
         "light": {"type": "point", "position": [0, 0, 0], "intensity": {"type": "rgb", "value": [1.0, 1.0, 1.0]}},
-        **{f"shape_{i:04d}": shape for i, shape in enumerate(shapes)},
+        **{f"group_{i}": group for i, group in enumerate(subject.groups)},
+        **{f"shape_{i:04d}": shape for i, shape in enumerate(subject.shapes)},
     })
     assert isinstance(scene, mi.Scene)
     return scene
@@ -130,7 +55,8 @@ def _open_manifest(out: Path, settings: dict[str, object]) -> None:
         files.write(path, json.dumps(settings, indent=1) + "\n")
         return
     try:
-        before = {"flash_offset": [0.0, 0.0, 0.0]} | dict(json.loads(path.read_bytes()))  # old files lack this key
+        before = {"flash_offset": [0.0, 0.0, 0.0], "shapes": ""}  # which old files lack
+        before |= dict(json.loads(path.read_bytes()))
     except (ValueError, TypeError, RecursionError) as error:
         raise MiNtfError(f"{path}: cannot be read ({error}), so what this folder was captured with is not known; "
                          "use another folder or delete this one") from None
@@ -152,6 +78,8 @@ class Request:
     spp: int
     seed: int
     flash_offset: tuple[float, float, float]
+    shapes: str = ""  # names as in the option --shapes
+    parameters: tuple[tuple[str, str], ...] = ()  # values of the scene's $names
     variant: str = ""  # of Mitsuba
     object: str = ""  # fingerprint of the studio
 
@@ -164,12 +92,13 @@ class Session:
 
         if request.variant:
             mi.set_variant(request.variant)
-        shapes, integrator = _load(request.scene)
-        self.center, radius = bounding_sphere(_outline(shapes))
+        subject = capture_scene.load(request.scene, request.shapes, dict(request.parameters))
+        self.notes = subject.notes
+        self.center, radius = bounding_sphere(capture_scene.outline(subject.shapes))
         self.radius = MARGIN * radius
         self.angle = float(2.0 * np.arcsin(1.0 / DISTANCE))
-        self.studio = _studio(shapes, integrator, self.angle, request.size)
-        self.request = replace(request, variant=str(mi.variant()), object=_fingerprint(self.studio))
+        self.studio = _studio(subject, self.angle, request.size)
+        self.request = replace(request, variant=str(mi.variant()), object=capture_scene.fingerprint(self.studio))
         self.offset = np.array(request.flash_offset, dtype=np.float64)
         far = DISTANCE * self.radius
         if self.offset.shape != (3,) or not np.isfinite(self.offset).all() or self.offset[2] > 0.5 * far:
@@ -230,15 +159,18 @@ def photograph(task: tuple[Request, int]) -> None:
 
 
 def capture(scene: Path, out: Path, *, views: int = 100, size: int = 128, test_views: int = 20, spp: int = 64,
-            seed: int = 0, flash_offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
-            workers: jobs.Workers = jobs.Workers()) -> dict[str, object]:  # noqa: B008
+            seed: int = 0, flash_offset: tuple[float, float, float] = (0.0, 0.0, 0.0), shapes: str = "",
+            parameters: dict[str, str] | None = None, workers: jobs.Workers = jobs.Workers()) -> dict[str, Any]:  # noqa: B008
     """Photograph a scene (Mitsuba XML) into the data set `out`. The same call resumes what an earlier run began.
 
     `views` are for training, and max(4, views // 20) are added for validation. `size` is the width and height in
     pixels; each pixel has `spp` paths. `flash_offset` is the flash's place right, up and forward of the lens in scene
-    lengths. The result has the "center" and "radius" of the object's sphere, the numbers of images "rendered" and
-    "kept", and "seconds". Raises MiNtfError if the scene cannot be photographed, if the folder holds a capture with
-    other settings, or, after all others, if views fail.
+    lengths. `shapes` chooses shapes as the option ``--shapes`` does: by names, by ``not:`` and names, or all.
+    `parameters` are values of the scene's $names.
+
+    The result has the "center" and "radius" of the object's sphere, the numbers of images "rendered" and "kept", and
+    "seconds". Raises MiNtfError if the scene cannot be photographed, if the folder holds a capture with other settings,
+    or, after all others, if views fail.
     """
     for name, value in (("views", views), ("size", size), ("test_views", test_views), ("spp", spp)):
         if value < 1:
@@ -246,17 +178,21 @@ def capture(scene: Path, out: Path, *, views: int = 100, size: int = 128, test_v
     workers.check()
     start = time.monotonic()
     out = Path(out).absolute()
-    session = Session(Request(Path(scene).absolute(), out, views, size, test_views, spp, seed, flash_offset))
+    with progress.Stage(f"reading {scene}"):
+        session = Session(Request(Path(scene).absolute(), out, views, size, test_views, spp, seed, flash_offset,
+                                  shapes, tuple((parameters or {}).items())))
     request, frames = session.request, session.frames
+    for note in session.notes:
+        progress.say(note)
     files.make_folder(out)
-    _open_manifest(out, {"scene": Path(scene).name, "object": request.object,
+    _open_manifest(out, {"scene": Path(scene).name, "shapes": shapes, "object": request.object,
                          "integrator": " ".join(str(session.studio.integrator()).split()), "views": views, "size": size,
                          "test_views": test_views, "spp": spp, "seed": seed, "flash_offset": session.offset.tolist()})
     missing = [index for index, frame in enumerate(frames) if not (out / frame.file).exists()]
     _sessions[:] = [session]
     try:
         jobs.run(photograph, [(request, index) for index in missing], workers, title="photographs",
-                 names=[frames[index].file for index in missing], folder=out)
+                 names=[frames[index].file for index in missing], folder=out, done=len(frames) - len(missing))
     finally:
         _sessions.clear()
     for split, entries in session.plan.items():

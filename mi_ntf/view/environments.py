@@ -5,7 +5,7 @@ from pathlib import Path
 
 import mitsuba as mi
 
-from mi_ntf import swap
+from mi_ntf import scene_xml
 from mi_ntf.core.errors import MiNtfError
 
 from .save import save
@@ -27,11 +27,12 @@ def beside(session: Session) -> list[Path]:
 
 def _files(session: Session) -> list[Path]:
     """Return the files of the present environments."""
-    root = swap.parse(session.path)
+    root = scene_xml.parse(session.path)
     values = {d.get("name", ""): d.get("value", "") for d in root.iter("default")} | session.define
-    swap.inline(root, session.path, session.path.parent, values, lambda content: content.find("emitter") is not None)
+    scene_xml.Includes(session.path.parent, values).inline(
+        root, session.path, lambda content: content.find("emitter") is not None)
     names = [s.get("value", "") for e in root.findall("emitter") for s in e.findall("string[@name='filename']")]
-    places = [session.path.parent / swap.substitute(name, values) for name in names]
+    places = [session.path.parent / scene_xml.substitute(name, values) for name in names]
     return [p for p in [session.environment, *places] if p is not None and p.is_file()]
 
 

@@ -6,7 +6,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from mi_ntf import swap
+from mi_ntf import scene_xml
 from mi_ntf.core import files
 from mi_ntf.core.errors import MiNtfError, shown
 
@@ -38,11 +38,11 @@ def save(session: Session, out: Path, environment: Path | None = None) -> None:
     """
     if out.resolve() == session.path.resolve():
         raise MiNtfError(f"{out} is the scene that is being viewed; choose another name")
-    root = swap.parse(session.path)
+    root = scene_xml.parse(session.path)
     values = {d.get("name", ""): d.get("value", "") for d in root.iter("default")} | session.define
-    swap.inline(root, session.path, session.path.parent, values,
-                lambda content: any(content.find(f".//{tag}") is not None for tag in CHANGED))
-    swap.move_paths(root, session.path.parent, out.parent, values)
+    scene_xml.Includes(session.path.parent, values).inline(
+        root, session.path, lambda content: any(content.find(f".//{tag}") is not None for tag in CHANGED))
+    scene_xml.move_paths(root, session.path.parent, out.parent, values)
     _set_defaults(root, session.define)
     for light in session.lights:
         if light.version:
@@ -77,7 +77,7 @@ def _set_defaults(root: ET.Element, define: dict[str, str]) -> None:
 
 def _element(root: ET.Element, session: Session, light: Light, values: dict[str, str]) -> ET.Element:
     """Return the XML element of `light`. Mitsuba preserves the order of lights of one kind."""
-    elements = [e for e in root.findall("emitter") if swap.substitute(e.get("type", ""), values) == light.kind]
+    elements = [e for e in root.findall("emitter") if scene_xml.substitute(e.get("type", ""), values) == light.kind]
     lights = [other for other in session.lights if other.kind == light.kind]
     if len(elements) != len(lights):
         raise MiNtfError(f"{session.path} has {len(elements)} <emitter> of type {light.kind} at its top level, and the "

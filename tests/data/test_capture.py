@@ -1,6 +1,7 @@
 """The virtual camera: geometry against Mitsuba's own sensor, radiance against closed forms, resuming, errors."""
 
 import json
+from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
@@ -10,8 +11,11 @@ from helpers.variants import VARIANT
 
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.data import capture as cap
-from mi_ntf.data import schema
+from mi_ntf.data import capture_scene, schema
+from mi_ntf.data.poses import camera_to_world, view_directions
 from mi_ntf.data.readers import load_dataset
+
+SCENES = Path(__file__).parents[2] / "scenes"
 
 SPHERE = """<scene version="3.9.0">
     <integrator type="path"/>
@@ -42,6 +46,28 @@ MEDIUM = """<scene version="3.9.0">
         <medium type="homogeneous" name="interior">
             <float name="sigma_t" value="1.5"/> <rgb name="albedo" value="0.8, 0.4, 0.2"/>
         </medium>
+    </shape>
+</scene>"""
+
+ON_FLOOR = """<scene version="3.9.0">
+    <shape type="merge">
+        <shape type="sphere">
+            <point name="center" x="2" y="-1" z="0.5"/> <float name="radius" value="0.7"/>
+            <bsdf type="diffuse" id="clay"/>
+        </shape>
+        <shape type="rectangle" id="lamp"> <emitter type="area"/> </shape>
+    </shape>
+    <default name="half" value="5"/>
+    <shape type="rectangle" id="floor">
+        <transform name="to_world"> <scale value="$half"/> <rotate x="1" angle="-90"/> <translate y="-2"/> </transform>
+        <ref id="clay"/>
+    </shape>
+</scene>"""
+
+BALL = """<scene version="3.9.0">
+    <shape type="shapegroup" id="group"> <shape type="sphere"> <float name="radius" value="0.35"/> </shape> </shape>
+    <shape type="instance">
+        <ref id="group"/> <transform name="to_world"> <scale value="2"/> <translate x="2" y="-1" z="0.5"/> </transform>
     </shape>
 </scene>"""
 
@@ -135,9 +161,9 @@ def test_photographs_of_a_medium_are_the_integral_over_light_dimmed_twice(tmp_pa
 
 
 def test_surface_integrators_do_not_photograph_media(tmp_path):
-    volpath = cap._load(write(tmp_path, MEDIUM))[1]
-    other = cap._load(write(tmp_path, MEDIUM.replace("volpath", "path")))[1]
-    surface = cap._load(write(tmp_path, SPHERE.replace('type="path"', 'type="direct"')))[1]
+    volpath = capture_scene.load(write(tmp_path, MEDIUM)).integrator
+    other = capture_scene.load(write(tmp_path, MEDIUM.replace("volpath", "path"))).integrator
+    surface = capture_scene.load(write(tmp_path, SPHERE.replace('type="path"', 'type="direct"'))).integrator
     assert [x.class_name() for x in (volpath, other, surface)] == [
         "VolumetricPathIntegrator", "VolumetricPathIntegrator", "DirectIntegrator"]
     assert "max_depth = 2" in str(volpath) and "max_depth = 6" in str(other)
@@ -152,7 +178,7 @@ def test_white_surface_at_the_centre_has_radiance_one(sphere_set):
 
 def test_pixel_rays_are_those_of_mitsubas_sensor():
     width, height, angle = 7, 5, 0.8
-    c2w = cap.camera_to_world(np.array([1.0, 2.0, 3.0]), np.array([0.2, -0.1, 0.4]))
+    c2w = camera_to_world(np.array([1.0, 2.0, 3.0]), np.array([0.2, -0.1, 0.4]))
     sensor = mi.load_dict({
         "type": "perspective", "fov": float(np.degrees(angle)), "fov_axis": "x",
         "to_world": mi.ScalarTransform4f(mi.ScalarMatrix4f(schema.mitsuba_to_opengl(c2w).tolist())),
@@ -167,13 +193,13 @@ def test_pixel_rays_are_those_of_mitsubas_sensor():
 
 
 def test_cameras_look_at_the_object_from_all_around():
-    directions = cap.view_directions(200, np.random.default_rng(3))
+    directions = view_directions(200, np.random.default_rng(3))
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1.0, atol=1e-12)
     assert np.linalg.norm(directions.mean(0)) < 0.02  # a lattice is balanced; random points would give 0.07
     nearest = np.sort(np.arccos(np.clip(directions @ directions.T, -1, 1)), axis=1)[:, 1]
     assert nearest.min() > 0.5 * np.sqrt(4 * np.pi / 200)  # no two views fall together
     for direction in [*directions, np.array([0, 1.0, 0]), np.array([0, -1.0, 0])]:
-        c2w = cap.camera_to_world(3 * direction, np.zeros(3))
+        c2w = camera_to_world(3 * direction, np.zeros(3))
         np.testing.assert_allclose(c2w[:3, 2], direction, atol=1e-12)
         np.testing.assert_allclose(c2w[:3, :3].T @ c2w[:3, :3], np.eye(3), atol=1e-12)
         assert np.linalg.det(c2w[:3, :3]) > 0
@@ -181,7 +207,7 @@ def test_cameras_look_at_the_object_from_all_around():
 
 def test_meshes_lie_inside_the_unit_ball_and_inside_the_picture(tmp_path):
     scene = write(tmp_path, MESHES)
-    points = cap._outline(cap._load(scene)[0])
+    points = capture_scene.outline(capture_scene.load(scene).shapes)
     summary = small(scene, tmp_path / "out", views=8)
     reach = np.linalg.norm((points - summary["center"]) / summary["radius"], axis=1).max()
     assert reach == pytest.approx(1 / cap.MARGIN, rel=1e-6)
@@ -275,9 +301,50 @@ def test_missing_scene_and_bad_counts(tmp_path):
         small(write(tmp_path), tmp_path / "out", views=0)
 
 
-@pytest.mark.parametrize("name", cap.POSITIONS)
+@pytest.mark.parametrize("name", capture_scene.POSITIONS)
 def test_meshes_are_measured_by_their_vertices_under_either_name(monkeypatch, name):
     """Mitsuba 3.10 renames the parameter."""
     tetrahedron = np.float32([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     monkeypatch.setattr(mi, "traverse", lambda shape: {name: tetrahedron.ravel()})
-    np.testing.assert_array_equal(cap._outline([None]), tetrahedron)
+    np.testing.assert_array_equal(capture_scene.outline([None]), tetrahedron)
+
+
+def test_a_floor_is_left_out_by_its_name(tmp_path, capsys):
+    """The photographs of the ball are those of the scene without the floor."""
+    small(write(tmp_path, ON_FLOOR), tmp_path / "out", shapes="not:floor")
+    assert "photographed: sphere; left out: lamp (area light), floor (rectangle)" in capsys.readouterr().err
+    split = load_dataset(tmp_path / "out")["train"]
+    np.testing.assert_allclose(split.center, [2, -1, 0.5], atol=0.002 * 0.7)
+    assert split.radius == pytest.approx(0.7 * cap.MARGIN, rel=0.002)
+    with pytest.raises(MiNtfError, match=r"captured with shapes = not:floor, now shapes = sphere; use another folder"):
+        small(tmp_path / "scene.xml", tmp_path / "out", shapes="sphere")
+    with pytest.raises(MiNtfError, match=r"no shape is called 'lamp'; the scene has sphere, floor \(lights are never"):
+        small(tmp_path / "scene.xml", tmp_path / "out", shapes="sphere,lamp")
+
+
+def test_a_floor_that_is_photographed_is_warned_of(tmp_path):
+    """No warning comes when the user has chosen, or where the floor is small."""
+    scene = write(tmp_path, ON_FLOOR)
+    _, warning = capture_scene.load(scene).notes
+    assert "floor (rectangle) is 5.8 times as large" in warning and warning.endswith("--shapes not:floor leaves it out")
+    assert len(capture_scene.load(scene, "sphere,floor").notes) == 1
+    assert len(capture_scene.load(scene, "", {"half": "0.8"}).notes) == 1
+
+
+@pytest.mark.parametrize("name", ["statue", "knot", "globe", "cloud", "animal"])
+def test_parts_of_the_shipped_objects_are_no_floor(name):
+    (note,) = capture_scene.load(SCENES / name / "mesh.xml").notes
+    assert note.startswith("photographed: ") and "left out" not in note
+
+
+def test_an_instance_is_photographed(tmp_path):
+    small(write(tmp_path, BALL), tmp_path / "out", views=1)
+    alpha = load_dataset(tmp_path / "out")["train"].images[0, ..., 3]
+    # Its box is known, so the picture is √3 times as wide as for the sphere, which takes a share of 1/3 of its disk.
+    assert alpha[16, 16] == 1 and alpha.mean() == pytest.approx(np.pi / 4 / 3 / cap.MARGIN**2, rel=0.1)
+
+
+def test_shapes_with_a_sensor_are_not_photographed(tmp_path):
+    meter = '<shape type="cube"><sensor type="irradiancemeter"><film type="hdrfilm"/></sensor></shape></scene>'
+    (note,) = capture_scene.load(write(tmp_path, MESHES.replace("</scene>", meter))).notes
+    assert note == "photographed: cube, rectangle; left out: cube (sensor)"

@@ -95,7 +95,7 @@ def integrator(folder, *elements, version="3.9.0"):
     shape = '<shape type="cube"/>'
     text = f'<scene version="{version}"><default name="i" value="path"/>{"".join(elements)}{shape}</scene>'
     (folder / "mesh.xml").write_text(text)
-    notes = swap(folder / "mesh.xml", folder / "f.safetensors", folder / "scene.xml")
+    notes = swap(folder / "mesh.xml", folder / "f.safetensors", folder / "scene.xml").notes
     (properties,) = ET.parse(folder / "scene.xml").getroot().findall("integrator")
     return {e.get("name"): e.get("value") for e in properties if e.get("name") != "visibility"}, notes
 
@@ -144,6 +144,112 @@ def test_channels_of_aov_stay_where_nrf_has_them(folder):
     assert integrator(folder, with_parameter)[0] == {}
     assert cli.main(["swap", *(str(folder / name) for name in ("mesh.xml", "f.safetensors")), "-o",
                      str(folder / "o.xml")]) == 0
+
+
+OWN = """<scene version="3.9.0">
+    <default name="light" value="point"/> <default name="mat" value="hide"/>
+    <path value="parts"/>
+    <include filename="props.xml"/>
+    <include filename="light_$light.xml"/>
+    <emitter type="area" id="glow"/>
+    <shape type="merge">
+        <shape type="obj"><string name="filename" value="meshes/cow.obj"/>
+            <bsdf type="diffuse" id="hide"><texture type="checkerboard" id="spots" name="reflectance"/></bsdf></shape>
+        <shape type="merge"><shape type="rectangle" id="lamp"><include filename="lamp.xml"/></shape></shape>
+    </shape>
+    <shape type="merge"><shape type="cube"/></shape>
+    <shape type="shapegroup" id="grass"><shape type="cylinder"><ref id="blade"/></shape></shape>
+    <shape type="shapegroup" id="moss"><shape type="sphere"/></shape>
+    <shape type="instance"><ref id="grass"/></shape>
+    <shape type="instance"><ref id="moss"/></shape>
+    <shape type="disk"><ref id="glow"/></shape>
+    <shape type="rectangle" id="floor"><ref id="hide"/></shape>
+    <bsdf type="diffuse" id="blade"/>
+    <bsdf type="diffuse" id="unused"/>
+    <bsdf type="diffuse" id="flame"/>
+</scene>"""
+PARTS = {
+    "parts/props.xml": """<scene version="0.6.0">
+        <shape type="cube" id="table"><bsdf type="diffuse"><texture type="bitmap" name="diffuseReflectance">
+            <string name="filename" value="wood.png"/>
+            <float name="uscale" value="2"/> <float name="voffset" value="0.5"/>
+        </texture></bsdf></shape></scene>""",
+    "parts/lamp.xml": '<emitter version="3.0.0" type="area"/>',
+    "light_point.xml": '<scene version="3.0.0"><emitter type="point" id="sun"/></scene>',
+    "light_fire.xml": """<scene version="3.0.0">
+        <shape type="disk"><ref id="flame"/><emitter type="area"/></shape></scene>""",
+}
+
+
+@pytest.fixture
+def own(folder):
+    """A scene with a floor, lights and groups in a scene whose parts are in many places."""
+    (folder / "parts").mkdir()
+    for name, text in {"mesh.xml": OWN, **PARTS}.items():
+        (folder / name).write_text(text)
+    return folder
+
+
+def _shapes(root):
+    return [s.get("id") or s.get("type") for s in root.iter("shape")]
+
+
+def test_chosen_shapes_are_replaced_and_all_others_stay(own):
+    report = swap(own / "mesh.xml", own / "f.safetensors", own / "scene.xml", "cow,instance2")
+    assert str(report) == (
+        "replaced: cow (obj), instance2; kept: table (cube), cube, instance1, floor (rectangle), lamp (area light), "
+        "disk (area light), glow (area), sun (point)")
+    root = ET.parse(own / "scene.xml").getroot()
+    assert _shapes(root) == ["table", "sphere", "merge", "merge", "lamp", "merge", "cube", "grass", "cylinder",
+                             "instance", "disk", "floor"]
+
+
+def test_all_but_a_floor_is_replaced(own):
+    report = swap(own / "mesh.xml", own / "f.safetensors", own / "scene.xml", "not:floor")
+    assert report.replaced == ["table (cube)", "cow (obj)", "cube", "instance1", "instance2"]
+    root = ET.parse(own / "scene.xml").getroot()
+    assert _shapes(root) == ["sphere", "merge", "merge", "lamp", "disk", "floor"]
+
+
+def test_materials_that_others_refer_to_are_kept_out_of_replaced_shapes(own):
+    """Where the floor's material is a $name, all that it may name stays; light_fire.xml needs the flame."""
+    assert [b.get("id") for b in _swap(own, own / "scene.xml").findall("bsdf")] == ["flame"]
+    for floor, bsdfs, textures in (("hide", ["hide", "flame"], []), ("spots", ["flame"], ["spots"]),
+                                   ("$mat", ["hide", "blade", "unused", "flame"], [])):
+        (own / "mesh.xml").write_text(OWN.replace('floor"><ref id="hide"', f'floor"><ref id="{floor}"'))
+        swap(own / "mesh.xml", own / "f.safetensors", own / "scene.xml", "not:floor")
+        root = ET.parse(own / "scene.xml").getroot()
+        assert [b.get("id") for b in root.findall("bsdf")] == bsdfs
+        assert [t.get("id") for t in root.findall("texture")] == textures
+        assert not any(e.get("name") for e in root.findall("texture"))  # the scene has no property of that name
+
+
+def test_includes_are_found_by_paths_and_old_ones_are_upgraded(own):
+    """Mitsuba's own upgrade is the standard. It is by the version of each file."""
+    swap(own / "mesh.xml", own / "f.safetensors", own / "out" / "scene.xml", "cow")
+    root = ET.parse(own / "out" / "scene.xml").getroot()
+    (texture,) = root.find("shape[@id='table']/bsdf")
+    assert texture.get("name") == "reflectance"
+    assert [(e.tag, e.attrib) for e in texture.find("transform[@name='to_uv']")] == [
+        ("translate", {"y": "0.5"}), ("scale", {"x": "2"})]
+    assert not texture.findall("float")
+    assert root.find(".//shape[@id='lamp']/include").get("filename") == "../parts/lamp.xml"
+
+
+def test_a_wrong_name_of_a_shape_lists_the_names(own):
+    command = ["swap", str(own / "mesh.xml"), str(own / "f.safetensors"), "-o", str(own / "scene.xml"), "--shapes"]
+    with pytest.raises(MiNtfError, match=r"no shape is called 'lawn'; the scene has table, cow, cube, instance1, "):
+        swap(own / "mesh.xml", own / "f.safetensors", own / "scene.xml", "not:lawn")
+    assert cli.main([*command, "not:lawn"]) == 1 and not (own / "scene.xml").exists()
+
+
+def test_the_command_prints_what_is_replaced_and_what_comes_next(own, capsys):
+    out = own / "scene.xml"
+    assert cli.main(["swap", str(own / "mesh.xml"), str(own / "f.safetensors"), "-o", str(out), "--shapes",
+                     "not:floor"]) == 0
+    first, *rest = capsys.readouterr().out.splitlines()
+    assert first.startswith("replaced: table (cube), ") and "; kept: floor (rectangle), " in first
+    assert rest == [f"scene: {out}", f"next: mitsuba -m llvm_ad_rgb {out}"]
 
 
 def test_emitters_includes_and_what_they_use_stay(folder):
