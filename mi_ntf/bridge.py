@@ -21,6 +21,8 @@ environment.
 """
 
 _lock = threading.Lock()
+_started: set[str] = set()
+"""Variants in which :func:`start` has registered the plugins."""
 
 
 def serve(name: str, variant: str, built_for: str = "another version of mi_ntf") -> str:
@@ -51,6 +53,24 @@ def register(name: str, variant: str) -> None:
         from mi_ntf.render import register as register_plugins
 
         register_plugins()
+
+
+def start(variant: str = "") -> None:
+    """Set `variant`, or for "" the first that this machine can run if none is set, and register the plugins in it.
+
+    Raises MiNtfError for a variant that is unknown or that this machine cannot run.
+    """
+    if variant and variant not in mi.variants():
+        raise MiNtfError(f"unknown variant {variant!r}; this Mitsuba has {', '.join(mi.variants())}")
+    if mi.variant() is None or (variant and mi.variant() != variant):
+        try:
+            mi.set_variant(*([variant] if variant else VARIANTS))
+        except ImportError as error:
+            raise MiNtfError(f"this machine cannot run {variant or 'any of ' + ', '.join(VARIANTS)}: `mi-ntf doctor` "
+                             f"names the remedy ({error})") from error
+    if mi.variant() not in _started:
+        _started.add(str(mi.variant()))
+        register_all(str(mi.variant()))
 
 
 def register_all(variant: str) -> None:

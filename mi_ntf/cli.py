@@ -1,20 +1,27 @@
-"""Command line of mi-ntf: capture, train and render neural reflectance fields.
+"""The command line `mi-ntf`.
 
 Exit code 0: done, 1: the work failed, 2: bad usage. An error is one sentence. The environment variable MI_NTF_DEBUG=1
 adds Python's traceback.
 """
 
+import difflib
+import io
+import re
+import shutil
 import sys
+import textwrap
 import traceback
-from collections.abc import Callable, Sequence
-from typing import Protocol, cast
+from collections.abc import Sequence
+from contextlib import redirect_stdout, suppress
+from typing import Protocol
 
+import tyro
 from tyro.conf import FlagCreatePairsOff
-from tyro.extras import subcommand_cli_from_dict
 
+from mi_ntf import __version__
 from mi_ntf.commands import analysis, fields, machine, scenes
 from mi_ntf.commands.options import UsageError
-from mi_ntf.core import errors
+from mi_ntf.core import errors, interruption, progress
 
 
 class Command(Protocol):
@@ -24,25 +31,35 @@ class Command(Protocol):
         """Do the work and return the exit code. None stands for 0."""
 
 
-COMMANDS: dict[str, Callable[..., Command]] = {
-    "capture": fields.Capture, "inspect": fields.Inspect, "train": fields.Train, "swap": scenes.Swap,
-    "render": scenes.Render, "compare": analysis.Compare, "explain": analysis.Explain, "tradeoff": analysis.Tradeoff,
-    "view": scenes.View, "bake": scenes.Bake, "cache": scenes.Cache, "export": fields.Export,
-    "sequence": scenes.RenderSequence, "info": fields.Info, "bridge": machine.Bridge, "doctor": machine.Doctor,
+GROUPS: dict[str, dict[str, type[Command]]] = {
+    "From an object to a field": {
+        "capture": fields.Capture, "inspect": fields.Inspect, "train": fields.Train, "info": fields.Info,
+        "swap": scenes.Swap, "export": fields.Export},
+    "Pictures": {
+        "render": scenes.Render, "view": scenes.View, "sequence": scenes.RenderSequence, "bake": scenes.Bake},
+    "Accuracy and time": {
+        "explain": analysis.Explain, "compare": analysis.Compare, "tradeoff": analysis.Tradeoff},
+    "This machine": {"doctor": machine.Doctor, "bridge": machine.Bridge, "cache": scenes.Cache},
 }
+"""The commands by name, in the groups of `mi-ntf --help`."""
+COMMANDS = {name: command for group in GROUPS.values() for name, command in group.items()}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command line (default: sys.argv) and return the exit code."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        return parse(words).run() or 0
+        with interruption.noticed():
+            command = parse(words)
+            with progress.silent(bool(getattr(command, "json", False))):
+                return command.run() or 0
     except SystemExit as leave:  # argument parsers end this way, with 0 after help and 2 on bad usage
         return leave.code if isinstance(leave.code, int) else 2
     except UsageError as error:
         print(f"mi-ntf: error: {error}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as error:
+        print(f"mi-ntf: {str(error) or 'stopped'}", file=sys.stderr)
         return 130
     except Exception as error:
         if errors.debug():
@@ -53,11 +70,53 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def parse(words: list[str]) -> Command:
-    """Return the command of a command line. Raises SystemExit as argparse does."""
-    if words[:1] == ["render"]:  # its flags belong to another parser
+    """Return the command of a command line. Raises UsageError, or SystemExit as argparse does."""
+    name = words[0] if words else ""
+    if name in ("", "-h", "--help"):
+        print(overview(), file=sys.stdout if name else sys.stderr)
+        raise SystemExit(0 if name else 2)
+    if name == "--version":
+        print(f"mi-ntf {__version__}")
+        raise SystemExit(0)
+    if name not in COMMANDS:
+        near = difflib.get_close_matches(name, COMMANDS, 1)
+        raise UsageError(f"there is no command {errors.shown(name)}; " +
+                         (f"did you mean {near[0]}?" if near else "`mi-ntf --help` lists them"))
+    if name == "render":  # its flags belong to another parser
         return scenes.Render(tuple(words[1:]))
-    return cast(Command, subcommand_cli_from_dict(COMMANDS, prog="mi-ntf", description=__doc__, args=words,
-                                                  config=(FlagCreatePairsOff,)))
+    if {"-h", "--help"} & set(words):
+        print(description(name))
+        raise SystemExit(0)
+    return _parsed(name, words[1:])
+
+
+def overview() -> str:
+    """Return the text of `mi-ntf --help`."""
+    lines = ["usage: mi-ntf COMMAND [options]", "",
+             "Relight captured objects in Mitsuba 3. `mi-ntf COMMAND -h` describes a command."]
+    for title, group in GROUPS.items():
+        lines += ["", title]
+        for name, command in group.items():
+            text = (command.__doc__ or "").partition("\n")[0]
+            lines += textwrap.wrap(f"  {name:<9} {text}", shutil.get_terminal_size().columns,
+                                   subsequent_indent=" " * 12)
+    return "\n".join([*lines, "", "`mi-ntf --version` prints the version, `mi-ntf doctor` checks the installation."])
+
+
+def description(name: str) -> str:
+    """Return the help of a command, whose line of usage is wrapped: tyro does not wrap it."""
+    text = io.StringIO()
+    with suppress(SystemExit), redirect_stdout(text):
+        _parsed(name, ["-h"])
+    usage, _, rest = text.getvalue().partition("\n\n")
+    whole = re.sub(r"\[[^]]*\]", lambda part: part[0].replace(" ", "\xa0"), usage)  # no break within an option
+    wrapped = textwrap.fill(whole, shutil.get_terminal_size().columns, subsequent_indent=" " * 7,
+                            break_on_hyphens=False)
+    return wrapped.replace("\xa0", " ") + "\n\n" + re.sub(" +$", "", rest.rstrip(), flags=re.M)
+
+
+def _parsed(name: str, words: list[str]) -> Command:
+    return tyro.cli(COMMANDS[name], prog=f"mi-ntf {name}", args=words, config=(FlagCreatePairsOff,))
 
 
 if __name__ == "__main__":

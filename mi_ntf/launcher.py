@@ -1,7 +1,7 @@
 """`mi-ntf render`: the stock program `mitsuba` in Python, for machines without a C++ compiler.
 
 It follows `src/mitsuba/mitsuba.cpp` of Mitsuba 3.9.1: parse, instantiate, render without developing, let the film write
-the file. The stock program has no ``--watch``, and no options for the environment
+the file. The stock program has no ``--watch``, no PNG files, and no options for the environment
 (:mod:`mi_ntf.render.scene.environment_option`).
 """
 
@@ -10,54 +10,60 @@ from __future__ import annotations
 import argparse
 import ctypes
 import json
-import time
+import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 import OpenEXR
 
-from mi_ntf import bridge
-from mi_ntf.core import files
+from mi_ntf.commands.options import SCENE_HELP, SceneOptions
+from mi_ntf.core import files, ops, srgb
 from mi_ntf.core.errors import MiNtfError
-from mi_ntf.core.variants import VARIANTS, enough_threads
+from mi_ntf.core.variants import enough_threads
 from mi_ntf.render import log
 from mi_ntf.render.scene import scene_file
 from mi_ntf.render.scene.environment_option import Environment
 from mi_ntf.watch import TEV, Tev, printed, watch
 
-CLOCK_DELAY = 2.0
-"""Seconds that a file system's clock may be behind."""
+SUFFIXES = {"OpenEXR": ".exr", "RGBE": ".rgbe", "PFM": ".pfm"}
+"""Suffix of the files that a film writes, by its ``file_format``."""
 
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the stock program's command line and of further options."""
     p = argparse.ArgumentParser("mi-ntf render", description="Render Mitsuba scenes with the flags of the program "
                                 "`mitsuba` and some more.")
-    p.add_argument("scenes", nargs="+", metavar="SCENE.xml")
-    p.add_argument("-m", "--mode", metavar="VARIANT", help="default: the first available of " + ", ".join(VARIANTS))
-    p.add_argument("-v", "--verbose", action="count", default=0, help="more messages; may be given twice")
-    p.add_argument("-t", "--threads", type=int, metavar="COUNT", help="number of CPU threads (1 counts as 2)")
+    p.add_argument("scenes", nargs="+", metavar="SCENE.xml", help="Scenes to render, one after the other.")
+    p.add_argument("-m", "--mode", default="", metavar="VARIANT", help=SCENE_HELP["mode"])
+    p.add_argument("-v", "--verbose", action="count", default=0, help="More messages; may be given twice.")
+    p.add_argument("-t", "--threads", type=int, metavar="COUNT", help="Number of CPU threads (1 counts as 2).")
     p.add_argument("-D", "--define", action="append", default=[], metavar="KEY=VALUE",
-                   help="value of $KEY in the scene")
-    p.add_argument("-s", "--sensor", type=int, default=0, metavar="INDEX", help="sensor to render (default 0)")
-    p.add_argument("-a", "--append", default="", metavar="PATH;PATH", help="folders to search for resources")
-    p.add_argument("-o", "--output", metavar="FILE", help="image to write (default: beside the scene)")
-    p.add_argument("-O", type=int, choices=range(6), dest="optimise", metavar="0-5", help="Dr.Jit optimisation level")
-    p.add_argument("-S", action="store_true", dest="print_ir", help="print the intermediate representation")
-    p.add_argument("-V", type=int, dest="width", metavar="WIDTH", help="vector width of LLVM kernels, a power of two")
-    p.add_argument("-W", action="count", default=0, dest="wavefront", help="wavefronts in place of a megakernel")
+                   help=SCENE_HELP["define"])
+    p.add_argument("-s", "--sensor", type=int, default=0, metavar="INDEX", help="Sensor to render (default 0).")
+    p.add_argument("-a", "--append", default="", metavar="PATH;PATH", help="Folders to search for resources.")
+    p.add_argument("-o", "--output", metavar="FILE",
+                   help="Image to write: .exr, or .png, which has 8 bits, sRGB's curve and a black background. The "
+                        "default is an EXR file beside the scene.")
+    p.add_argument("-O", type=int, choices=range(6), dest="optimise", metavar="0-5",
+                   help="Optimisation level of Dr.Jit.")
+    p.add_argument("-S", action="store_true", dest="print_ir", help="Print the intermediate representation.")
+    p.add_argument("-V", type=int, dest="width", metavar="WIDTH", help="Vector width of LLVM kernels, a power of two.")
+    p.add_argument("-W", action="count", default=0, dest="wavefront", help="Wavefronts in place of a megakernel.")
     extra = p.add_argument_group("options that the program `mitsuba` does not have")
     extra.add_argument("--env", type=Path, metavar="FILE",
-                       help="latitude-longitude image in place of the environment's")
+                       help=SCENE_HELP["env"])
     extra.add_argument("--env-rotate", type=float, default=0.0, metavar="DEG",
-                       help="turn the environment about the world's up axis, in addition to the scene")
-    extra.add_argument("--env-scale", type=float, default=1.0, metavar="S", help="factor of the environment's radiance")
+                       help=SCENE_HELP["env_rotate"])
+    extra.add_argument("--env-scale", type=float, default=1.0, metavar="S", help=SCENE_HELP["env_scale"])
+    extra.add_argument("--exposure", type=float, default=0.0, metavar="STOPS",
+                       help="Exposure of a PNG image (default 0).")
     extra.add_argument("--watch", action="store_true",
-                       help="render again when a file of the scene changes, until Ctrl-C; sends pictures to tev")
-    extra.add_argument("--tev", default=TEV, metavar="HOST:PORT", help=f"address of tev (default {TEV})")
+                       help="Render again when a file of the scene changes, until Ctrl-C, and send pictures to tev.")
+    extra.add_argument("--tev", default=TEV, metavar="HOST:PORT", help=f"Address of tev (default {TEV}).")
     return p
 
 
@@ -68,20 +74,18 @@ def main(arguments: Sequence[str]) -> None:
     """
     p = parser()
     args = p.parse_args(arguments)
-    parameters = {}
-    for item in args.define:
-        key, separator, value = item.partition("=")
-        if not separator:
-            p.error(f"-D {item}: expected KEY=VALUE")
-        parameters[key] = value
-
+    options = SceneOptions(args.mode, tuple(args.define), args.env, args.env_rotate, args.env_scale)
+    parameters = options.parameters()
+    output = Path(args.output) if args.output else None
+    if args.exposure and (output is None or output.suffix.lower() != ".png"):
+        p.error("--exposure is for PNG images: give -o IMAGE.png")
     if args.watch and len(args.scenes) > 1:
         p.error(f"--watch takes one scene, found {len(args.scenes)}")
+    _set_log_level(args.verbose)
+    environment = options.environment()
     _apply_settings(args)
-    environment = Environment(args.env, args.env_rotate, args.env_scale)
-    output = Path(args.output) if args.output else None
     render = partial(render_file, parameters=parameters, sensor_index=args.sensor, output=output,
-                     environment=environment)
+                     environment=environment, exposure=args.exposure)
     if args.watch:
         _watch(Path(args.scenes[0]), output, render, args.tev)
         return
@@ -103,12 +107,13 @@ def _watch(scene: Path, output: Path | None, render: Callable[..., mi.Film], add
 
 
 def render_file(path: Path, parameters: dict[str, str], *, sensor_index: int = 0, output: Path | None = None,
-                environment: Environment | None = None, note: Callable[[Path], None] | None = None) -> mi.Film:
+                environment: Environment | None = None, note: Callable[[Path], None] | None = None,
+                exposure: float = 0.0) -> mi.Film:
     """Render a scene file in the current variant, write the image, and return the film.
 
     `parameters` are values of $names, `environment` changes the scene's, and `note` is called with each file before it
-    is read. The image is `output`, or lies beside the scene; the film sets the extension. Raises MiNtfError if the
-    scene cannot be rendered.
+    is read. The image is `output`, a PNG file with an `exposure` in stops or a file of the film's format, and lies
+    beside the scene by default. Raises MiNtfError if the scene cannot be rendered or the image not be written.
     """
     scene = scene_file.load(path, parameters, environment, note)
     if not 0 <= sensor_index < len(scene.sensors()):
@@ -117,14 +122,36 @@ def render_file(path: Path, parameters: dict[str, str], *, sensor_index: int = 0
         raise MiNtfError(f"{path}: no integrator specified")
 
     sensor = scene.sensors()[sensor_index]
-    scene_file.render_to_film(scene, sensor)
-    begin = time.time()
-    sensor.film().write(str(output or path))
-    written = (output or path).with_suffix(".exr")  # of EXR films
-    if written.is_file() and written.stat().st_mtime > begin - CLOCK_DELAY:
-        _annotate(written, getattr(scene.integrator(), "achieved", {}))
     film: mi.Film = sensor.film()
+    image = _destination(film, path, output)
+    scene_file.render_to_film(scene, sensor)
+    if image.suffix.lower() == ".png":
+        _write_png(film, image, exposure)
+    else:
+        film.write(str(image))
+    if image.suffix.lower() == ".exr":
+        _annotate(image, getattr(scene.integrator(), "achieved", {}))
     return film
+
+
+def _destination(film: mi.Film, scene: Path, output: Path | None) -> Path:
+    """Return the image file of a scene file. Raises MiNtfError if it cannot be written."""
+    file_format = re.search(r"file_format = (\w+)", str(film))
+    suffix = SUFFIXES.get(file_format[1] if file_format else "", ".exr")
+    image = scene.with_suffix(suffix) if output is None else output if output.suffix else output.with_suffix(suffix)
+    files.check(image, (suffix, ".png"))
+    return image
+
+
+def _write_png(film: mi.Film, path: Path, exposure: float) -> None:
+    """Write the colours of a film, without other channels, as 8 bits a channel in sRGB."""
+    bitmap = film.bitmap()
+    names = [field.name for field in bitmap.struct_()]  # type: ignore[attr-defined]  # not in the stub
+    chosen = [names.index(name) for name in ("RGB" if set("RGB") <= set(names) else "YYY")]
+    pixels = np.array(bitmap, np.float32).reshape(bitmap.height(), bitmap.width(), len(names))[..., chosen]
+    levels = np.round(255 * srgb.encode(ops, np.nan_to_num(pixels) * 2.0**exposure)).astype(np.uint8)
+    with files.replacing(path) as temporary:
+        mi.Bitmap(levels).write(str(temporary), mi.Bitmap.FileFormat.PNG)
 
 
 def _annotate(path: Path, achieved: Mapping[str, object]) -> None:
@@ -139,23 +166,15 @@ def _annotate(path: Path, achieved: Mapping[str, object]) -> None:
             OpenEXR.File(header | {"mi_ntf": text}, file.channels()).write(str(temporary))
 
 
-def _apply_settings(args: argparse.Namespace) -> None:
-    """Set log level, variant, plugins, threads, search path, Dr.Jit flags and vector width."""
-    level = min(args.verbose, 2)
+def _set_log_level(verbose: int) -> None:
+    level = min(verbose, 2)
     mi.set_log_level((mi.LogLevel.Info, mi.LogLevel.Debug, mi.LogLevel.Trace)[level])
     dr.set_log_level((dr.LogLevel.Error, dr.LogLevel.Warn, dr.LogLevel.Info)[level])
 
-    if args.mode and args.mode not in mi.variants():
-        raise MiNtfError(f"unknown variant {args.mode!r}; this Mitsuba has {', '.join(mi.variants())}")
-    try:
-        mi.set_variant(*([args.mode] if args.mode else VARIANTS))
-    except ImportError as error:
-        raise MiNtfError(f"this machine cannot run {args.mode or 'any of ' + ', '.join(VARIANTS)}: `mi-ntf doctor` "
-                         f"names the remedy ({error})") from error
-    variant = str(mi.variant())
-    log.info(f'Rendering using the "{variant}" variant.')
-    bridge.register_all(variant)
 
+def _apply_settings(args: argparse.Namespace) -> None:
+    """Set threads, search path, Dr.Jit flags and vector width."""
+    log.info(f'Rendering using the "{mi.variant()}" variant.')
     if args.threads is not None:
         if args.threads < 1:
             raise MiNtfError(f"-t {args.threads}: at least one thread is needed")

@@ -1,17 +1,22 @@
 """Exit codes, messages and JSON of `mi-ntf`."""
 
 import json
+import re
 import sys
 import types
+import typing
 from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 from helpers.programs import run_on_one_core, run_program
 
+import mi_ntf
 from mi_ntf import cli, doctor
+from mi_ntf.commands import fields
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.jobs import Workers
+from mi_ntf.render.scene.environment_option import Environment
 
 
 @pytest.fixture
@@ -30,15 +35,15 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list:
         monkeypatch.setitem(sys.modules, module, types.SimpleNamespace(**functions))
 
     table = {"psnr": 30.5, "inner": {"a": 1}}
-    stand_in("mi_ntf.data.capture", capture=note())
+    stand_in("mi_ntf.data.capture", capture=note({"rendered": 1, "kept": 0}))
     stand_in("mi_ntf.data.inspect", inspect=note(table), print_table=lambda values: print("table", values["psnr"]))
     stand_in("mi_ntf.train", train=note(table))
-    stand_in("mi_ntf.swap", swap=note([]))
+    stand_in("mi_ntf.swap", swap=note(types.SimpleNamespace(notes=[])))
     stand_in("mi_ntf.view", view=note())
     stand_in("mi_ntf.evaluate.compare", compare=note(table), print_table=lambda values: print("table", values["psnr"]))
     stand_in("mi_ntf.render.commands.explain", explain=note(table),
              print_table=lambda values: print("table", values["psnr"]))
-    stand_in("mi_ntf.core.field_file", describe=note(table))
+    stand_in("mi_ntf.core.field_file", describe=note(table), print_summary=lambda values: None)
     stand_in("mi_ntf.evaluate.tradeoff", study=types.SimpleNamespace(
         tradeoff=note(table), print_table=lambda values: print("table", values["psnr"])))
     return calls
@@ -51,13 +56,13 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list:
             "capture s.xml data --views 7 --size 32",
             (Path("s.xml"), Path("data")),
             {"views": 7, "size": 32, "test_views": 20, "spp": 64, "seed": 0, "flash_offset": (0.0, 0.0, 0.0),
-             "workers": Workers()},
+             "shapes": "", "parameters": {}, "workers": Workers()},
         ),
         (
             "capture s.xml data --flash-offset=-1,2e-1,0",
             (Path("s.xml"), Path("data")),
             {"views": 100, "size": 128, "test_views": 20, "spp": 64, "seed": 0, "flash_offset": (-1.0, 0.2, 0.0),
-             "workers": Workers()},
+             "shapes": "", "parameters": {}, "workers": Workers()},
         ),
         (
             "train data -o f.safetensors --minutes 2.5",
@@ -68,25 +73,25 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list:
              "reading": {"size": None, "masks": None, "background": None, "flash_offset": None}},
         ),
         (
-            "train data -o f --steps 9 --field g --ntf ray --no-augmentation --no-colour-loss --no-bounces "
+            "train data -o f.safetensors --steps 9 --field g --ntf ray --no-augmentation --no-colour-loss --no-bounces "
             "--no-fresnel --visibility-mlp",
-            (Path("data"), Path("f")),
+            (Path("data"), Path("f.safetensors")),
             {"preset": "fast", "minutes": None, "steps": 9, "seed": 0, "tensorboard": None, "field": Path("g"),
              "ntf": "ray", "augmentation": False, "colour_loss": False, "visibility_mlp": True,
              "bounces": False, "fresnel": False, "gains": True, "estimate": False, "view": False,
              "reading": {"size": None, "masks": None, "background": None, "flash_offset": None}},
         ),
         (
-            "train data -o f --size 768 --background black --flash-offset estimate --no-gains",
-            (Path("data"), Path("f")),
+            "train data -o f.safetensors --size 768 --background black --flash-offset estimate --no-gains",
+            (Path("data"), Path("f.safetensors")),
             {"preset": "fast", "minutes": None, "steps": None, "seed": 0, "tensorboard": None, "field": None,
              "ntf": None, "augmentation": True, "colour_loss": True, "visibility_mlp": False,
              "bounces": True, "fresnel": True, "gains": False, "estimate": True, "view": False,
              "reading": {"size": 768, "masks": None, "background": "black", "flash_offset": None}},
         ),
         (
-            "train data -o f --masks m --flash-offset 0.1,0.2,-0.3",
-            (Path("data"), Path("f")),
+            "train data -o f.safetensors --masks m --flash-offset 0.1,0.2,-0.3",
+            (Path("data"), Path("f.safetensors")),
             {"preset": "fast", "minutes": None, "steps": None, "seed": 0, "tensorboard": None, "field": None,
              "ntf": None, "augmentation": True, "colour_loss": True, "visibility_mlp": False,
              "bounces": True, "fresnel": True, "gains": True, "estimate": False, "view": False,
@@ -94,7 +99,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list:
         ),
         (
             "view s.xml -D light=env -D spp=2 --size 128 --samples 8 --port 9000",
-            (Path("s.xml"), {"light": "env", "spp": "2"}, 128, 8, "127.0.0.1", 9000),
+            (Path("s.xml"), {"light": "env", "spp": "2"}, 128, 8, "127.0.0.1", 9000, Environment()),
             {},
         ),
         (
@@ -107,13 +112,16 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list:
             (Path("data"), Path("p.html")),
             {"size": 64, "masks": Path("m"), "background": "black", "flash_offset": (-1.0, 0.0, 2.0)},
         ),
-        ("swap s.xml f.safetensors -o out.xml", (Path("s.xml"), Path("f.safetensors"), Path("out.xml")), {}),
+        ("swap s.xml f.safetensors -o out.xml", (Path("s.xml"), Path("f.safetensors"), Path("out.xml"), ""), {}),
         ("compare a.exr b.exr", (Path("a.exr"), Path("b.exr"), None), {}),
         ("compare a.exr b.exr -o c.png", (Path("a.exr"), Path("b.exr"), Path("c.png")), {}),
-        ("explain s.xml -D spp=4 -D light=env", (Path("s.xml"), {"spp": "4", "light": "env"}, False), {}),
-        ("explain s.xml --measure", (Path("s.xml"), {}, True), {}),
-        ("tradeoff s.xml -D a=4 --budget 2m", (Path("s.xml"), Path("tradeoff"), {"a": "4"}, 120.0, None, False), {}),
-        ("tradeoff s.xml -o d --reference m.xml", (Path("s.xml"), Path("d"), {}, 300.0, Path("m.xml"), False), {}),
+        ("explain s.xml -D spp=4 -D light=env", (Path("s.xml"), {"spp": "4", "light": "env"}, False,
+                                                Environment()), {}),
+        ("explain s.xml --measure --env-rotate 90", (Path("s.xml"), {}, True, Environment(rotate=90.0)), {}),
+        ("tradeoff s.xml -D a=4 --budget 2m --env-scale 0.5",
+         (Path("s.xml"), Path("tradeoff"), {"a": "4"}, 120.0, None), {"environment": Environment(scale=0.5)}),
+        ("tradeoff s.xml -o d --reference m.xml", (Path("s.xml"), Path("d"), {}, 300.0, Path("m.xml")),
+         {"environment": Environment()}),
         ("info f.safetensors", (Path("f.safetensors"),), {}),
     ],
 )
@@ -122,8 +130,8 @@ def test_commands_pass_their_arguments_on(calls: list, line: str, args: tuple, k
     assert calls == [(args, kwargs)]
 
 
-@pytest.mark.parametrize("line", ["compare a b --json", "train d -o f --json", "explain s.xml --json", "info f --json",
-                                  "inspect d --json", "tradeoff s.xml --json"])
+@pytest.mark.parametrize("line", ["compare a b --json", "train d -o f.safetensors --json", "explain s.xml --json",
+                                  "info f --json", "inspect d --json", "tradeoff s.xml --json"])
 def test_json(calls: list, line: str, capsys: pytest.CaptureFixture[str]):
     assert cli.main(line.split()) == 0
     assert json.loads(capsys.readouterr().out) == {"psnr": 30.5, "inner": {"a": 1}}
@@ -152,9 +160,9 @@ def test_limits_of_compare_decide_the_exit_code(calls: list, capsys: pytest.Capt
         "nonsense",
         "train",
         "capture s.xml data --views many",
-        "train data -o f --minutes 1 --steps 5",
-        "train data -o f --flash-offset 1,2",
-        "train data -o f --flash-offset up",
+        "train data -o f.safetensors --minutes 1 --steps 5",
+        "train data -o f.safetensors --flash-offset 1,2",
+        "train data -o f.safetensors --flash-offset up",
         "capture s.xml data --flash-offset estimate",
         "inspect data --flash-offset estimate",
         "compare a.exr b.exr --masked",
@@ -172,9 +180,112 @@ def test_bad_usage_is_2(calls: list, line: str):
     assert calls == []
 
 
-@pytest.mark.parametrize("line", ["-h", "train -h", "render -h"])
-def test_help_is_0(line: str):
-    assert cli.main(line.split()) == 0
+HELP = re.compile(r"^  (?:--?\w|SCENE\.xml|[A-Z]{3,}\b)")
+"""Beginning of the lines of a help that name an argument."""
+
+
+@pytest.mark.parametrize("command", ["", *cli.COMMANDS])
+def test_help_fits_a_terminal_and_describes_every_argument(command: str, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    assert cli.main([*command.split(), "-h"]) == 0
+    text = capsys.readouterr().out
+    assert max(map(len, text.splitlines())) <= 80
+    assert "None" not in text and "PATH PATH" not in text and "False" not in text
+    lines = text.partition("\n\n")[2].splitlines()
+    named = [i for i, line in enumerate(lines) if command and HELP.match(line)]
+    assert bool(named) == bool(command)
+    for i in named:  # a description beside the name, or below it
+        assert re.match(r" +\S.*? {2,}\S", lines[i]) or re.match(r" {5,}[A-Za-z.]", lines[i + 1]), lines[i]
+
+
+def test_help_of_the_program_names_every_command(capsys):
+    assert cli.main(["--help"]) == 0
+    whole = capsys.readouterr().out
+    assert all(re.search(rf"^  {name} +\S", whole, re.M) for name in cli.COMMANDS)
+    assert cli.main([]) == 2
+    assert capsys.readouterr().err == whole
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"mi-ntf {mi_ntf.__version__}\n"
+    assert cli.main(["tradoff"]) == 2
+    assert "there is no command 'tradoff'; did you mean tradeoff?" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["render", "sequence", "view", "explain", "tradeoff", "bake"])
+def test_commands_that_render_a_scene_have_the_same_options_for_it(command: str, capsys):
+    assert cli.main([command, "-h"]) == 0
+    text = capsys.readouterr().out
+    for option in ("-m VARIANT, --mode VARIANT", "-D KEY=VALUE, --define KEY=VALUE", "--env FILE", "--env-rotate DEG",
+                   "--env-scale S"):
+        assert option in text
+
+
+@pytest.mark.parametrize("command", ["explain s.xml", "bake s.xml -o m.exr", "sequence s.xml -o d", "render s.xml",
+                                     "capture s.xml d", "view s.xml", "tradeoff s.xml"])
+def test_an_unknown_variant_is_named_by_every_command(command: str, calls: list, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main([*command.split(), "-m", "llvm_rgb"]) == 1
+    assert "unknown variant 'llvm_rgb'; this Mitsuba has scalar_rgb" in capsys.readouterr().err
+    assert calls == []
+
+
+def test_choices_of_the_training_are_those_of_the_help():
+    pytest.importorskip("torch")
+    from mi_ntf.train import config
+
+    hints = typing.get_type_hints(fields.Train)
+    assert typing.get_args(hints["preset"]) == tuple(config.PRESETS)
+    assert typing.get_args(typing.get_args(hints["ntf"])[0]) == tuple(config.NTF)
+
+
+@pytest.mark.parametrize(("line", "name", "right"), [
+    ("train d -o f.png", "f.png", ".safetensors"),
+    ("export f.safetensors -o m.png", "m.png", ".ply, .obj, .glb or .stl"),
+    ("swap s.xml f.safetensors -o n.exr", "n.exr", ".xml"),
+    ("bake s.xml -o m.png", "m.png", ".exr"),
+    ("inspect d -o p.txt", "p.txt", ".html"),
+    ("compare a.exr b.exr -o c.exr", "c.exr", ".png"),
+])
+def test_a_wrong_suffix_is_an_error_before_the_work(line, name, right, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(line.split()) == 1
+    assert f"{name}: the name ends in '.{name[-3:]}', expected {right}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("line", ["export f.safetensors -o new/m.ply", "swap s.xml f.safetensors -o new/n.xml",
+                                  "bake s.xml -o new/m.exr"])
+def test_a_finished_file_is_replaced_only_on_request(line, tmp_path, monkeypatch, capsys):
+    """The folder is made; then the scene or field that does not exist ends the work."""
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / line.split()[-1]
+    assert cli.main(line.split()) == 1
+    assert "does not exist" in capsys.readouterr().err and path.parent.is_dir()
+    path.write_text("finished")
+    assert cli.main(line.split()) == 1
+    assert f"new/{path.name} exists; choose another name, or add --overwrite to replace it" in capsys.readouterr().err
+    assert cli.main([*line.split(), "--overwrite"]) == 1
+    assert "does not exist" in capsys.readouterr().err and path.read_text() == "finished"
+
+
+@pytest.mark.parametrize(("line", "module", "extra"), [
+    ("train d -o f.safetensors", "torch", "train"),
+    ("train d -o f.safetensors --view", "viser", "view"),
+    ("inspect d", "matplotlib", "train"),
+    ("view s.xml", "viser", "view"),
+    ("export f.safetensors -o m.ply", "trimesh", "mesh"),
+    ("compare a.exr b.exr -o c.png", "matplotlib", "eval"),
+    ("tradeoff s.xml", "matplotlib", "eval"),
+    ("sequence s.xml -o d --film f.mp4", "imageio_ffmpeg", "video"),
+    ("sequence s.xml -o d --engine dask --workers 2", "distributed", "cluster"),
+    ("capture s.xml d --engine submitit --workers 2", "submitit", "cluster"),
+])
+def test_a_missing_extra_is_named_before_the_work(line, module, extra, tmp_path, monkeypatch, capsys):
+    """None of the scenes, fields and photographs exists, which would be the next error."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, module, None)
+    assert cli.main(line.split()) == 1
+    message = capsys.readouterr().err
+    assert message.endswith(f"needs the extra `{extra}` ({module} missing): run pip install 'mi-ntf[{extra}]'\n")
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("error", [MiNtfError("the field is bad"), OSError("the field is bad")])
@@ -193,7 +304,7 @@ def test_failed_work_is_1_and_one_line(calls: list, monkeypatch, capsys, error: 
 
 def test_missing_extra_points_to_doctor(calls: list, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "mi_ntf.train", None)
-    assert cli.main(["train", "data", "-o", "f"]) == 1
+    assert cli.main(["train", "data", "-o", "f.safetensors"]) == 1
     assert "`mi-ntf doctor` names the package" in capsys.readouterr().err
 
 

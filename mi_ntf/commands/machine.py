@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 
 from mi_ntf.commands import options
-from mi_ntf.commands.options import Json
+from mi_ntf.commands.options import Flag, Json
 
 
 @dataclass
 class Doctor:
-    """Check Python, Mitsuba, LLVM, CUDA, the bridge and the extras, and name the remedy of each fault."""
+    """Check Python, Mitsuba, LLVM, CUDA, bridge and extras, and name remedies."""
 
     json: Json = False
 
@@ -23,9 +23,9 @@ class Doctor:
 
 @dataclass
 class Bridge:
-    """Compile the bridge for the installed Mitsuba, so that its stock program finds the plugins `nrf` and `ntf`."""
+    """Compile the bridge, by which the program `mitsuba` finds the plugins."""
 
-    remove: bool = False
+    remove: Flag = False
     """Delete the installed bridge instead."""
 
     def run(self) -> None:
@@ -35,3 +35,5 @@ class Bridge:
         files = build_bridge.remove() if self.remove else build_bridge.build()
         for file in files:
             print(f"{'removed' if self.remove else 'installed'} {file}")
+        if not self.remove:
+            print("next: mitsuba SCENE.xml")

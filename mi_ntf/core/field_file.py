@@ -7,8 +7,8 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from . import files
-from .architecture import Header, Network, header_from_json
+from . import files, quantities
+from .architecture import Header, Json, Network, header_from_json
 from .errors import MiNtfError
 from .ops import Tensors
 
@@ -26,10 +26,13 @@ def save(path: str | Path, header: Header, tensors: Tensors, dtype: type = np.fl
     the file; interpolation and the perceptron smooth its rounding.
     """
     _check(str(path), header, tensors)
-    data: dict[str, np.ndarray] = {
-        k: np.ascontiguousarray(v, _fitting(v, dtype) if ".planes." in k else np.float32) for k, v in tensors.items()
-    }
-    files.write(path, safetensors.numpy.save(data, metadata={_KEY: json.dumps(header.to_json())}))
+    files.write(path, safetensors.numpy.save(rounded(tensors, dtype), metadata={_KEY: json.dumps(header.to_json())}))
+
+
+def rounded(tensors: Tensors, dtype: type = np.float16) -> Tensors:
+    """Return `tensors` in the number formats in which :func:`save` stores them."""
+    return {k: np.ascontiguousarray(v, _fitting(v, dtype) if ".planes." in k else np.float32)
+            for k, v in tensors.items()}
 
 
 def load(path: str | Path) -> tuple[Header, Tensors]:
@@ -85,12 +88,41 @@ def load_header(path: str | Path) -> Header:
     return header_from_json(data, str(path))
 
 
-def describe(path: str | Path) -> dict[str, object]:
+def describe(path: str | Path) -> Json:
     """Return the table of `mi-ntf info`: header, parameter counts, file size in bytes."""
     header, tensors = load(path)
     counts = {name: sum(v.size for k, v in tensors.items() if k.startswith(name + ".")) for name in
               header.architecture.networks()}
     return {"file": str(path), "bytes": Path(path).stat().st_size, "parameters": counts} | header.to_json()
+
+
+def print_summary(description: Json) -> None:
+    """Print the result of :func:`describe` in six lines; the sphere is XML to paste into a scene."""
+    sphere, record = description["similarity"], description["provenance"]
+    x, y, z = (f"{value:.7g}" for value in sphere["center"])
+    parameters = sum(description["parameters"].values())
+    print(f"field     {description['file']}, {quantities.size(description['bytes'])}, "
+          f"{quantities.count(parameters)} parameters")
+    print(f'sphere    <point name="center" x="{x}" y="{y}" z="{z}"/>')
+    print(f'          <float name="radius" value="{sphere["radius"]:.7g}"/>')
+    print(f"networks  {', '.join(description['parameters'])}")
+    scores = [f"{record[split]['srgb']:.1f} dB on {name} photographs" for split, name in
+              (("val", "validation"), ("test", "test")) if "srgb" in record.get(split, {})]
+    print(f"PSNR      {', '.join(scores) or 'not known'}")
+    print(f"trained   {_training(record) or 'not known'}")
+
+
+def _training(record: Json) -> str:
+    """Return what a field's provenance says of its training."""
+    words = [f"preset {record['preset']}"] if "preset" in record else []
+    first, alone = (record["field"], record) if "field" in record else (record, {})
+    if "steps_done" in first and "seconds" in first:
+        words.append(f"{first['steps_done']} steps in {quantities.duration(first['seconds'])}")
+    if "steps_done" in alone:
+        words.append(f"{alone['steps_done']} of transmittance alone")
+    if "train" in record.get("views", {}):
+        words.append(f"{record['views']['train']} photographs")
+    return ", ".join(words)
 
 
 def _check(source: str, header: Header, tensors: Tensors) -> None:

@@ -44,7 +44,8 @@ def _option(name: str) -> str:
 
 def _field(name: str, metric: Metric) -> tuple[str, object, float | None]:
     text = f"Fail where the {metric.title} is {'less' if metric.more_is_better else 'more'}."
-    return _option(name), Annotated[float | None, arg(metavar="VALUE", help=text)], field(default=None)
+    option = arg(metavar="VALUE", help=text, help_behavior_hint="")
+    return _option(name), Annotated[float | None, option], field(default=None)
 
 
 Limits = make_dataclass("Limits", [_field(name, metric) for name, metric in METRICS.items()])

@@ -11,6 +11,7 @@ from xml.sax.saxutils import quoteattr
 import mitsuba as mi
 
 from ..render.scene import changed
+from ..render.scene.environment_option import Environment
 
 Value: TypeAlias = bool | int | float | str
 Properties: TypeAlias = dict[str, Value]
@@ -26,7 +27,8 @@ def integrator_xml(plugin: str, properties: Properties) -> str:
     return "\n".join([f'<integrator type="{plugin}">', *lines, "</integrator>"]) + "\n"
 
 
-def render_command(scene: Path, parameters: dict[str, str], properties: Properties, samples: int) -> str:
+def render_command(scene: Path, parameters: dict[str, str], properties: Properties, samples: int,
+                   environment: Environment | None = None) -> str:
     """Return the shell command that renders a scene whose integrator is ``nrf``.
 
     Parameters
@@ -37,6 +39,8 @@ def render_command(scene: Path, parameters: dict[str, str], properties: Properti
         Properties of the integrator. All others must have their defaults, so that no limits apply.
     samples
         Samples a pixel, if the scene takes them from $spp.
+    environment
+        Changes of the scene's environment.
 
     Returns
     -------
@@ -52,7 +56,8 @@ def render_command(scene: Path, parameters: dict[str, str], properties: Properti
     for more, count in (({"spp": str(samples)}, samples), ({}, 0)):
         if _sets(scene, known | more, properties, count):
             defined = [word for name, value in (known | more).items() for word in ("-D", f"{name}={value}")]
-            return shlex.join(["mi-ntf", "render", *defined, "-o", "picture.exr", str(scene)])
+            changes = environment.words() if environment else []
+            return shlex.join(["mi-ntf", "render", *defined, *changes, "-o", "picture.exr", str(scene)])
     return ""
 
 

@@ -19,7 +19,6 @@ from numpy.typing import DTypeLike
 
 from .. import __version__, bridge
 from ..core.errors import MiNtfError, sentence
-from ..core.variants import VARIANTS
 from ..render import log, user_cache
 from ..render.maps import map_cache
 from ..render.scene import changed, environment_option, scene_file
@@ -54,7 +53,7 @@ def render(task: Task) -> float:
     """Render a task's frame, write its file, and return the seconds. Raises MiNtfError that names the frame."""
     begin = time.perf_counter()
     try:
-        prepare(task.variant)
+        bridge.start(task.variant)
         state, name = _parsed(task)
         scene = changed.instantiated(Path(task.scene), _for_many(state, task.count))
         with user_cache.film():
@@ -74,24 +73,10 @@ def key(task: Task) -> str:
     MiNtfError.
     """
     try:
-        prepare(task.variant)
+        bridge.start(task.variant)
         return _parsed(task)[1]
     except (MiNtfError, RuntimeError, OSError) as error:
         raise MiNtfError(f"frame {task.frame.number}: {sentence(error)}") from None
-
-
-def prepare(variant: str = "") -> None:
-    """Set `variant`, or for "" any that this machine can run if none is set, and register the plugins in it."""
-    if variant and variant not in mi.variants():
-        raise MiNtfError(f"unknown variant {variant!r}; this Mitsuba has {', '.join(mi.variants())}")
-    if (variant and mi.variant() != variant) or mi.variant() is None:
-        mi.set_variant(*([variant] if variant else VARIANTS))
-    if mi.variant() not in _registered:
-        _registered.add(str(mi.variant()))
-        bridge.register_all(str(mi.variant()))
-
-
-_registered: set[str] = set()
 
 
 _last_frame: dict[str, Patches | None] = {}

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...core.errors import MiNtfError
-from ...render.scene import changed
+from ...render.scene import scene_file
 from ..compare import read_image
 from .errors import Truth
 from .measure import LARGEST_PASS, Renderer
@@ -107,7 +107,7 @@ def captured(subject: Subject, path: Path, shrink: int, seconds: float) -> Truth
     Raises MiNtfError where the size of the file is no whole multiple of that of the study's pictures.
     """
     if path.suffix.lower() == ".xml":
-        images = _traced(path, subject.parameters, shrink, seconds)
+        images = _traced(path, subject, shrink, seconds)
         return Truth(images.mean(0), float(images.var(0, ddof=1).mean()) / len(images),
                      f"{path.name}, path-traced with {MESH_SAMPLES * len(images)} samples a pixel")
     image, (width, height) = read_image(path)[..., :3], subject.pixels(shrink)
@@ -119,12 +119,13 @@ def captured(subject: Subject, path: Path, shrink: int, seconds: float) -> Truth
     return Truth(means, 0.0, f"{path.name}, whose own noise is not known")
 
 
-def _traced(path: Path, parameters: dict[str, str], shrink: int, seconds: float) -> np.ndarray:
+def _traced(path: Path, subject: Subject, shrink: int, seconds: float) -> np.ndarray:
     """Return four or more pictures (n, h, w, 3) of a scene file by independent seeds and its own integrator.
 
     Values for $names that the file lacks are ignored.
     """
-    start, scene = time.perf_counter(), changed.load(path, parameters, shrinker(shrink), strict=False)
+    start = time.perf_counter()
+    scene = scene_file.load(path, subject.parameters, subject.env, change=shrinker(shrink), strict=False)
     images: list[np.ndarray] = []
     while len(images) < 4 or time.perf_counter() - start < seconds:
         image, _ = Renderer(scene, scene.integrator())(MESH_SAMPLES, 2 * len(images) + 1)

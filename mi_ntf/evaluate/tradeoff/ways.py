@@ -12,7 +12,8 @@ from ...core.errors import MiNtfError
 from ...infer.visibility import REGISTRY
 from ...render.lights import scene_lights
 from ...render.plugins.registration import load_scene
-from ...render.scene import changed
+from ...render.scene import changed, environment_option, scene_file
+from ...render.scene.environment_option import Environment
 from ...render.scene.media import find_media
 from ...render.scene.settings import Settings
 from ..recipes import Properties, Value
@@ -39,8 +40,9 @@ _WORDS = {"samples": "{} steps", "light_samples": "{} lights sampled at each poi
 
 
 class Subject:
-    """A scene file and the values of its $names.
+    """A scene file, the values of its $names, and the changes of its environment.
 
+    - env: changes of the environment
     - size: width and height of the scene's film
     - media: the ``nrf`` media
     - lights: number of lights with the scene's own dials
@@ -51,11 +53,11 @@ class Subject:
     Raises MiNtfError where the scene cannot be rendered.
     """
 
-    def __init__(self, path: Path, parameters: dict[str, str]):
-        self.path, self.parameters = Path(path), dict(parameters)
+    def __init__(self, path: Path, parameters: dict[str, str], environment: Environment | None = None):
+        self.path, self.parameters, self.env = Path(path), dict(parameters), environment or Environment()
         if not self.path.is_file():
             raise MiNtfError(f"scene {path} does not exist; give the XML file of a scene with an nrf medium")
-        scene = load_scene(self.path, self.parameters)
+        scene = load_scene(self.path, self.parameters, self.env)
         integrator: Any = scene.integrator()
         settings: Settings = integrator.context.settings
         self.media = find_media(scene)
@@ -75,7 +77,7 @@ class Subject:
     def scene(self, shrink: int) -> "mi.Scene":
         """Return the scene, loaded once, with one pixel for `shrink` of its own along each side."""
         if shrink not in self._scenes:
-            self._scenes[shrink] = changed.load(self.path, self.parameters, shrinker(shrink))
+            self._scenes[shrink] = scene_file.load(self.path, self.parameters, self.env, change=shrinker(shrink))
         return self._scenes[shrink]
 
     def pixels(self, shrink: int) -> tuple[int, int]:
@@ -85,12 +87,14 @@ class Subject:
 
     def key(self) -> str:
         """Return a hash of the scene's text, with includes and $names inserted, and of its fields."""
-        text = mi.parser.write_string(changed.parsed(self.path, self.parameters))
+        state = changed.parsed(self.path, self.parameters)
+        environment_option.apply(self.env, state, self.path)
+        text = mi.parser.write_string(state)
         return hashlib.sha256(repr((text, [m.field.digest for m in self.media])).encode()).hexdigest()
 
 
 def shrinker(shrink: int) -> Callable[["Node"], None]:
-    """Return a function for :func:`mi_ntf.render.scene.changed.load` that shrinks the film."""
+    """Return a function for :func:`mi_ntf.render.scene.scene_file.load` that shrinks the film."""
 
     def change(node: "Node") -> None:
         if node.type == mi.ObjectType.Film:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TypedDict, cast
 
 import mitsuba as mi
 
-from ...core import files
+from ...core import files, progress
 from ...core.errors import MiNtfError
 from ...core.variants import VARIANTS
 from ...infer.lights import LightTable
@@ -21,6 +21,7 @@ from ..lights import scene_lights
 from ..maps import building, map_cache, map_file
 from ..plugins.registration import load_scene
 from ..scene import loaded
+from ..scene.environment_option import Environment
 from ..scene.media import NRFMedium, find_media
 from ..scene.settings import Settings
 from ..transport.context import context_of
@@ -36,44 +37,78 @@ class MapFile(TypedDict):
     bytes: int
 
 
-def bake(scene: Path, output: Path, parameters: dict[str, str]) -> MapFile:
+def bake(scene: Path, output: Path, parameters: dict[str, str], environment: Environment | None = None) -> MapFile:
     """Write the maps of all lights of a scene, made with the settings of its ``nrf`` integrator.
 
     If its `visibility` is ``transmittance_atlas`` or ``neural_transmittance``, the maps are those of the field's own
-    directions. `parameters`: values of the scene's $names. Raises MiNtfError if the scene has several media, or no
-    lights for which maps can be made.
+    directions. `parameters`: values of the scene's $names; `environment`: changes of its environment. Raises MiNtfError
+    if the scene has several media, or no lights for which maps can be made.
     """
     files.check(output)
-    loaded_scene = load_scene(scene, parameters)
+    with progress.Stage(f"reading {scene}"):
+        loaded_scene = load_scene(scene, parameters, environment)
     settings, media = context_of(loaded_scene).settings, find_media(loaded_scene)
     if len(media) != 1:
         raise MiNtfError(f"{scene} has {len(media)} nrf media, and a map file belongs to one; bake them one by one")
+    with progress.Stage(f"baking {output}") as stage:
+        return _bake(output, loaded_scene, settings, media, stage)
+
+
+def _bake(output: Path, scene: mi.Scene, settings: Settings, media: list[NRFMedium], stage: progress.Stage) -> MapFile:
     (medium,) = media
     method = REGISTRY.get(settings.visibility)
     if method and method.per_field:
         atlas = cast(TransmittanceAtlas, building.build(method.name, medium, None, _options(settings)))
         return _write(output, medium, atlas.maps.lights, atlas.options, [atlas.maps])
-    table = scene_lights.Lights(loaded_scene, media, 0, settings.environment_lights).table(medium.frame)
+    table = scene_lights.Lights(scene, media, 0, settings.environment_lights).table(medium.frame)
     if not table.count:
-        raise MiNtfError(f"{scene} has no lights that maps can be made for (point, spot, directional, environment)")
+        raise MiNtfError("the scene has no lights that maps can be made for (point, spot, directional, environment)")
     options = _options(building.resolved(settings, table.count, media))
     runs = [table.part(*run) for run in building.parts("transmittance_map", media, table, options)]
-    return _write(output, medium, table, options,
-                  (cast(TransmittanceMap, building.build("transmittance_map", medium, run, options)) for run in runs))
+
+    def maps() -> Iterator[TransmittanceMap]:
+        for number, run in enumerate(runs):
+            stage.update(number / len(runs))
+            yield cast(TransmittanceMap, building.build("transmittance_map", medium, run, options))
+
+    return _write(output, medium, table, options, maps())
 
 
-def bake_fields(path: Path, parameters: dict[str, str]) -> dict[str, dict[str, str | int]]:
+def print_maps(report: MapFile) -> None:
+    """Print the file of :func:`bake`, and the use of it."""
+    lights = f"{report['lights']} light{'s' if report['lights'] > 1 else ''}"
+    print(f"map file: {report['file']} ({lights} of {report['resolution']}² texels, "
+          f"{report['bytes'] / 2**20:.1f} MiB)",
+          f'next: <string name="map_file" value="{report["file"]}"/> in the integrator of the scene', sep="\n")
+
+
+def print_fields(report: dict[str, dict[str, str | int]]) -> None:
+    """Print the files of :func:`bake_fields`, and the use of them."""
+    for file, about in report.items():
+        print(f"field: {file} ({about['voxels']}³ voxels, {int(about['bytes']) / 2**20:.1f} MiB)")
+    print("next: render as before; the voxels are read from the file")
+
+
+def bake_fields(path: Path, parameters: dict[str, str], environment: Environment | None = None
+                ) -> dict[str, dict[str, str | int]]:
     """Write the voxels of a field file, or of all field files of a scene, into the files (`mi-ntf bake --baked`).
 
     Returns file → ``voxels`` and ``bytes``. Raises MiNtfError.
     """
     if path.suffix != ".safetensors":
-        media = find_media(load_scene(path, parameters))
-        resolutions = {m.path: m.field.grid.resolution for m in media}
-        return {file: loaded.add_baked(Path(file), n) for file, n in resolutions.items()}
-    if mi.variant() is None:
-        mi.set_variant(*VARIANTS)
-    return {str(path): loaded.add_baked(path)}
+        with progress.Stage(f"reading {path}"):
+            media = find_media(load_scene(path, parameters, environment))
+        resolutions: dict[str, int | None] = {m.path: m.field.grid.resolution for m in media}
+    else:
+        if mi.variant() is None:
+            mi.set_variant(*VARIANTS)
+        resolutions = {str(path): None}
+    result = {}
+    with progress.Stage("baked fields", len(resolutions), then="the same command bakes the others") as stage:
+        for file, resolution in resolutions.items():
+            result[file] = loaded.add_baked(Path(file), resolution)
+            stage.advance()
+    return result
 
 
 def _options(settings: Settings) -> Options:

@@ -11,12 +11,14 @@ import mitsuba as mi
 from rich.console import Console
 from rich.table import Table
 
+from ...core import progress
 from ...infer.visibility import REGISTRY
 from .. import timing, user_cache
 from ..lights import environment
 from ..lights.light_rows import Discrete
 from ..maps import building
 from ..plugins.registration import load_scene
+from ..scene.environment_option import Environment
 from ..scene.media import find_media, ordinary_shapes
 from ..scene.settings import Settings
 from ..transport import candidates, choosing, effects
@@ -27,7 +29,8 @@ Report: TypeAlias = dict[str, Any]
 """Part of the report, as it is written to JSON."""
 
 
-def explain(scene: Path, parameters: dict[str, str], measure: bool = False) -> Report:
+def explain(scene: Path, parameters: dict[str, str], measure: bool = False, environment: Environment | None = None
+            ) -> Report:
     """Load `scene` (with `parameters` for its $names) and describe its render.
 
     Parameters
@@ -38,6 +41,8 @@ def explain(scene: Path, parameters: dict[str, str], measure: bool = False) -> R
         Values of its $names.
     measure
         Render the scene as well.
+    environment
+        Changes of the scene's environment.
 
     Returns
     -------
@@ -53,12 +58,13 @@ def explain(scene: Path, parameters: dict[str, str], measure: bool = False) -> R
     MiNtfError
         If rendering would raise it.
     """
-    loaded = load_scene(scene, parameters)
+    with progress.Stage(f"reading {scene}"):
+        loaded = load_scene(scene, parameters, environment)
     sensor, media, context = loaded.sensors()[0], find_media(loaded), context_of(loaded)
     whole = context.settings
     width, height = (int(v) for v in sensor.film().crop_size())
     spp = sensor.sampler().sample_count()
-    with user_cache.switched("off"):
+    with progress.Stage("predicting the render by a pilot"), user_cache.switched("off"):
         composition, choice = choosing.Chooser(loaded, whole, context.limits, sensor, spp).explain()
     active = replace(composition.effects, reason=choice.best.why) if choice.best else composition.effects
     settings, light, count = composition.settings, composition.lights, len(composition.lights.rows.power)
@@ -85,8 +91,9 @@ def explain(scene: Path, parameters: dict[str, str], measure: bool = False) -> R
 
 def _measured(scene: mi.Scene, context: RenderContext, spp: int) -> timing.RenderCost:
     """Render twice, since the first time may compile kernels, and build everything anew each time."""
-    with user_cache.switched("off"):
+    with progress.Stage("renders to measure", 2) as stage, user_cache.switched("off"):
         timing.once(scene, scene.integrator(), spp, 1)
+        stage.advance()
         context.patches = None
         return timing.once(scene, scene.integrator(), spp, 0)[1]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeAlias
@@ -13,18 +13,6 @@ from ...core.errors import MiNtfError
 
 Node: TypeAlias = "mi.parser.SceneNode"
 ParsedScene: TypeAlias = "mi.parser.ParserState"
-
-
-def load(path: Path, parameters: dict[str, str], change: Callable[[Node], None], strict: bool = True) -> mi.Scene:
-    """Return the scene of an XML file after a call of `change` for each node, which has a ``type`` and ``props``.
-
-    `strict`: values for $names that the file does not contain are an error.
-    """
-    with beside(path):
-        state = parsed(path, parameters, strict)
-        for node in state.nodes:
-            change(node)
-        return instantiated(path, state, strict)
 
 
 def shrink_film(props: mi.Properties, shrink: int) -> None:

@@ -55,6 +55,11 @@ class Environment:
     def __bool__(self) -> bool:
         return self != Environment()
 
+    def words(self) -> list[str]:
+        """Return the options of the command line that stand for these changes."""
+        changes = {"--env": (self.file, None), "--env-rotate": (self.rotate, 0), "--env-scale": (self.scale, 1)}
+        return [f"{name}={value}" for name, (value, default) in changes.items() if value != default]
+
 
 def apply(environment: Environment, state: ParsedScene, path: Path) -> None:
     """Change the environment in the parsed scene `state` of the file `path`, before references are resolved.

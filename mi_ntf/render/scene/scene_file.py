@@ -17,7 +17,8 @@ FILES = ("filename", "map_file")
 
 
 def load(path: Path, parameters: dict[str, str], environment: Environment | None = None,
-         on_file: Callable[[Path], None] | None = None) -> mi.Scene:
+         on_file: Callable[[Path], None] | None = None, change: Callable[[changed.Node], None] | None = None,
+         strict: bool = True) -> mi.Scene:
     """Return the scene of an XML file in the current variant.
 
     Parameters
@@ -31,6 +32,10 @@ def load(path: Path, parameters: dict[str, str], environment: Environment | None
     on_file
         Function called with each file that the scene reads, in most cases before it is read: the XML file, its
         includes, fields, images, meshes.
+    change
+        Function called with each node of the parsed scene, which has a ``type`` and ``props``.
+    strict
+        Values for $names that the file does not contain are an error.
 
     Raises
     ------
@@ -44,13 +49,16 @@ def load(path: Path, parameters: dict[str, str], environment: Environment | None
     if not path.is_file():
         raise MiNtfError(f"scene {path} does not exist")
     with changed.beside(path):
-        state = changed.parsed(path, parameters)
+        state = changed.parsed(path, parameters, strict)
         for name in state.files:
             on_file(Path(str(name)).resolve())
         environment_option.apply(environment or Environment(), state, path)
         for file in _named(state):
             on_file(file)
-        return changed.instantiated(path, state)
+        if change:
+            for node in state.nodes:
+                change(node)
+        return changed.instantiated(path, state, strict)
 
 
 def render_to_film(scene: mi.Scene, sensor: mi.Sensor) -> None:
