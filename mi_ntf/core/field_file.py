@@ -100,29 +100,37 @@ def print_summary(description: Json) -> None:
     """Print the result of :func:`describe` in six lines; the sphere is XML to paste into a scene."""
     sphere, record = description["similarity"], description["provenance"]
     x, y, z = (f"{value:.7g}" for value in sphere["center"])
-    parameters = sum(description["parameters"].values())
     print(f"field     {description['file']}, {quantities.size(description['bytes'])}, "
-          f"{quantities.count(parameters)} parameters")
+          f"{quantities.count(sum(description['parameters'].values()))} parameters")
     print(f'sphere    <point name="center" x="{x}" y="{y}" z="{z}"/>')
     print(f'          <float name="radius" value="{sphere["radius"]:.7g}"/>')
     print(f"networks  {', '.join(description['parameters'])}")
-    scores = [f"{record[split]['srgb']:.1f} dB on {name} photographs" for split, name in
-              (("val", "validation"), ("test", "test")) if "srgb" in record.get(split, {})]
-    print(f"PSNR      {', '.join(scores) or 'not known'}")
+    scores = {name: _number(record, split, "srgb") for split, name in (("val", "validation"), ("test", "test"))}
+    words = [f"{score:.1f} dB on {name} photographs" for name, score in scores.items() if score is not None]
+    print(f"PSNR      {', '.join(words) or 'not known'}")
     print(f"trained   {_training(record) or 'not known'}")
 
 
 def _training(record: Json) -> str:
-    """Return what a field's provenance says of its training."""
+    """Return what a field's provenance says of its training; that of ``field`` came before, of transmittance alone."""
     words = [f"preset {record['preset']}"] if "preset" in record else []
-    first, alone = (record["field"], record) if "field" in record else (record, {})
-    if "steps_done" in first and "seconds" in first:
-        words.append(f"{first['steps_done']} steps in {quantities.duration(first['seconds'])}")
-    if "steps_done" in alone:
-        words.append(f"{alone['steps_done']} of transmittance alone")
-    if "train" in record.get("views", {}):
-        words.append(f"{record['views']['train']} photographs")
+    whole = record.get("field", record)
+    steps, seconds, photographs = (_number(data, *keys) for data, *keys in (
+        (whole, "steps_done"), (whole, "seconds"), (record, "views", "train")))
+    if steps is not None and seconds is not None:
+        words.append(f"{steps:.0f} steps in {quantities.duration(seconds)}")
+    if whole is not record and (alone := _number(record, "steps_done")) is not None:
+        words.append(f"{alone:.0f} of transmittance alone")
+    if photographs is not None:
+        words.append(f"{photographs:.0f} photographs")
     return ", ".join(words)
+
+
+def _number(data: object, *keys: str) -> float | None:
+    """Return a number of JSON that may have any form, None if it is not there."""
+    for key in keys:
+        data = data.get(key) if isinstance(data, dict) else None
+    return float(data) if isinstance(data, int | float) else None
 
 
 def _check(source: str, header: Header, tensors: Tensors) -> None:

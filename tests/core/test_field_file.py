@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import struct
 
 import numpy as np
@@ -72,6 +73,25 @@ def test_describe_counts_parameters(saved):
     assert info["parameters"]["reflectance"] == 15 * 4 + 4 + 4 * 3 + 3 + 3 * 8 + 8
     assert info["bytes"] == path.stat().st_size and info["similarity"]["radius"] == 3.0
     json.dumps(info)
+
+
+@pytest.mark.parametrize(("provenance", "last"), [
+    ({"preset": "fast", "views": {"train": 57}, "steps_done": 4654, "seconds": 1080.1, "val": {"srgb": 31.42},
+      "test": {"srgb": 33.0}}, ["31.4 dB on validation photographs, 33.0 dB on test photographs",
+                                "preset fast, 4654 steps in 18 min, 57 photographs"]),
+    ({"field": {"steps_done": 900, "seconds": 60}, "steps_done": 8, "seconds": 3},
+     ["not known", "900 steps in 60 s, 8 of transmittance alone"]),
+    ({"views": 7, "val": None, "field": []}, ["not known", "not known"]),
+])
+def test_summary_has_six_lines_and_the_sphere_as_xml(tmp_path, capsys, provenance, last):
+    header = Header(SMALL, Similarity((0.5, -1.0, 1 / 3), 3.0), provenance)
+    field_file.save(tmp_path / "f", header, make_tensors(SMALL))
+    field_file.print_summary(field_file.describe(tmp_path / "f"))
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 6 and re.search(r"/f, \d.* kB, \d.* parameters$", lines[0])
+    assert lines[1:4] == ['sphere    <point name="center" x="0.5" y="-1" z="0.3333333"/>',
+                          '          <float name="radius" value="3"/>', "networks  density, reflectance, transmittance"]
+    assert [line[10:] for line in lines[4:]] == last
 
 
 def test_fields_with_a_visibility_network_and_fresnel_effect_and_old_ones_without(tmp_path):
