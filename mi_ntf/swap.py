@@ -153,12 +153,12 @@ class _Content:
         while True:
             used = self._references()
             there = {e.get("id") for e in self.root.iter() if e.tag not in REFERENCES}
-            referenced = next((e for shape in removed for e in shape.iter() if e is not shape and e.tag not in REFERENCES
-                           and e.get("id") not in there and used(e.get("id", ""))), None)
-            if referenced is None:
+            parts = [e for shape in removed for e in shape.iter() if e is not shape and e.tag not in REFERENCES]
+            missing = [e for e in parts if used(e.get("id", "")) and e.get("id") not in there]
+            if not missing:
                 return
-            referenced.attrib.pop("name", None)
-            self.root.insert(index, referenced)
+            missing[0].attrib.pop("name", None)
+            self.root.insert(index, missing[0])
 
     def _references(self) -> Callable[[str], bool]:
         """Return a function that is true of the ids that a <ref> or <alias> may name, with any $parameters."""

@@ -11,6 +11,7 @@ from mi_ntf import cli
 from mi_ntf.core import field_file
 from mi_ntf.core.architecture import Architecture, Encoding, Header, Network, Similarity
 from mi_ntf.core.errors import MiNtfError
+from mi_ntf.data import capture_scene
 from mi_ntf.render.transport import aovs
 from mi_ntf.swap import _DEPTHS, swap
 
@@ -241,6 +242,24 @@ def test_a_wrong_name_of_a_shape_lists_the_names(own):
     with pytest.raises(MiNtfError, match=r"no shape is called 'lawn'; the scene has table, cow, cube, instance1, "):
         swap(own / "mesh.xml", own / "f.safetensors", own / "scene.xml", "not:lawn")
     assert cli.main([*command, "not:lawn"]) == 1 and not (own / "scene.xml").exists()
+
+
+def test_capture_and_swap_give_shapes_the_same_names(folder):
+    """One reads Mitsuba's own parse, the other the XML."""
+    mi = pytest.importorskip("mitsuba")
+    mi.set_variant(VARIANT)
+    (folder / "mesh.xml").write_text("""<scene version="3.9.0"> <default name="name" value="b"/>
+        <shape type="cube"/> <include filename="part.xml"/> <shape type="sphere" id="$name"/>
+        <shape type="rectangle"><emitter type="area"/></shape>
+        <shape type="merge"><shape type="cube"/> <shape type="rectangle"/></shape>
+        <shape type="shapegroup" id="g"><shape type="cube"/></shape> <shape type="instance"><ref id="g"/></shape>
+        <shape type="instance"><ref id="g"/></shape></scene>""")
+    (folder / "part.xml").write_text('<scene version="2.0.0"><shape type="cube"/> <shape type="disk" id="d"/></scene>')
+    (note,) = capture_scene.load(folder / "mesh.xml", "not:b").notes
+    report = swap(folder / "mesh.xml", folder / "f.safetensors", folder / "scene.xml", "not:b")
+    names = "cube1, cube2, d (disk), cube3, rectangle, instance1, instance2"
+    assert note == f"photographed: {names}; left out: b (sphere), rectangle (area light)"
+    assert str(report) == f"replaced: {names}; kept: b (sphere), rectangle (area light)"
 
 
 def test_the_command_prints_what_is_replaced_and_what_comes_next(own, capsys):
