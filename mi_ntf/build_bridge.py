@@ -13,6 +13,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from .bridge import PLUGIN_NAMES
+from .core import progress
 from .core.errors import MiNtfError
 
 SOURCES = Path(__file__).parent / "bridge_source"
@@ -48,7 +49,8 @@ def build() -> list[Path]:
         command = [*compiler.split(), *FLAGS, f'-DMI_NTF_MITSUBA_VERSION="{version("mitsuba")}"',
                    *(f"-isystem{path}" for path in headers), *map(str, sorted(SOURCES.glob("*.cpp"))),
                    str(mitsuba / "libmitsuba.so"), str(drjit / "libdrjit-core.so"), "-ldl", "-o", str(library)]
-        compilation = subprocess.run(command, capture_output=True, text=True)
+        with progress.Stage("compiling the bridge", then="nothing was installed"):
+            compilation = subprocess.run(command, capture_output=True, text=True)
         if compilation.returncode:
             raise MiNtfError(f"the bridge did not compile:\n{compilation.stderr.strip()}\nThe command was: "
                              + " ".join(command))

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_ntf.core import extras, field_file, files
+from mi_ntf.core import extras, field_file, files, progress
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.core.srgb import encode
 from mi_ntf.infer.backend import module
@@ -78,13 +78,22 @@ def export(field: Path, output: Path, resolution: int = 256, level: float | None
         raise MiNtfError(f"--level is {level:g}, expected a positive density, 1/(radius of the field's sphere)")
     extras.need("mesh", "a mesh")
     files.check(output, SUFFIXES)
-    header, tensors = field_file.load(field)
-    dj = module("llvm_ad_rgb")
-    mesh = surface(NetworkField(header, tensors, dj), resolution, level, dj)
-    vertices = mesh.vertices * header.similarity.radius + np.array(header.similarity.center)
-    files.write(output, _encoded(mesh, vertices, output.suffix.lower()))
+    with progress.Stage(f"making {output}") as stage:
+        header, tensors = field_file.load(field)
+        dj = module("llvm_ad_rgb")
+        mesh = surface(NetworkField(header, tensors, dj), resolution, level, dj, stage.update)
+        vertices = mesh.vertices * header.similarity.radius + np.array(header.similarity.center)
+        files.write(output, _encoded(mesh, vertices, output.suffix.lower()))
     return MeshFile(str(output), len(vertices), len(mesh.faces), mesh.level, np.ptp(vertices, axis=0).round(6).tolist(),
                     float(mesh.roughness.mean()), float(mesh.specular.mean()))
+
+
+def print_summary(mesh: MeshFile) -> None:
+    """Print the file, the figures of the mesh, and the use of it."""
+    size = " × ".join(f"{length:.3g}" for length in mesh.size)
+    print(f"mesh: {mesh.file} ({mesh.vertices} vertices, {mesh.faces} faces, {size} in scene units)",
+          f"surface: at density {mesh.level:.3g}; mean roughness {mesh.roughness:.2f}, specular {mesh.specular:.2f}",
+          f"next: import {mesh.file} in Blender or another program", sep="\n")
 
 
 def mitsuba_shape(path: Path, mesh: MeshFile, to_world: np.ndarray) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..core.architecture import LOG_FLOOR, MAX_LOG_DENSITY
 from ..core.errors import MiNtfError
-from .bake import sampled_bricks
+from .bake import Progress, sampled_bricks
 from .bricks import SIDE
 from .network import NetworkField
 from .types import Array
@@ -50,16 +50,17 @@ class Surface:
     specular: np.ndarray
 
 
-def surface(field: NetworkField, resolution: int, level: float | None, dj: ModuleType) -> Surface:
+def surface(field: NetworkField, resolution: int, level: float | None, dj: ModuleType,
+            progress: Progress = lambda done: None) -> Surface:
     """Return the surface of `field` at density `level`, from `resolution`³ voxels.
 
-    `level` None: ``LEVEL``, or half of the highest density where that is less. Raises MiNtfError if the field has no
-    such density.
+    `level` None: ``LEVEL``, or half of the highest density where that is less. `progress` receives about the fraction
+    of the time. Raises MiNtfError if the field has no such density.
     """
     from skimage import measure
 
     marching_cubes: Callable[..., Array] = measure.marching_cubes
-    values = _log_density(field, resolution, dj)
+    values = _log_density(field, resolution, dj, lambda done: progress(done / 2))
     highest = float(np.exp(values.max()))
     level = min(LEVEL, highest / 2) if level is None else level
     if not level < highest:
@@ -70,13 +71,14 @@ def surface(field: NetworkField, resolution: int, level: float | None, dj: Modul
     del values
     vertices = (places[:, ::-1] + corner[::-1] + 0.5) * (2 / resolution) - 1
     normals = _from_faces(vertices, faces)
-    return Surface(level, vertices, faces, *_reflectance(field, vertices, normals, dj))
+    return Surface(level, vertices, faces, *_reflectance(field, vertices, normals, dj,
+                                                         lambda done: progress(0.7 + 0.3 * done)))
 
 
-def _log_density(field: NetworkField, n: int, dj: ModuleType) -> np.ndarray:
+def _log_density(field: NetworkField, n: int, dj: ModuleType, progress: Progress) -> np.ndarray:
     """Return ln σ at the centres of n³ voxels (z, y, x), ``LOG_FLOOR`` at least and away from density."""
     values = np.full((n, n, n), LOG_FLOOR, np.float32)
-    for places, samples in sampled_bricks(field, n, (0, SIDE), dj):
+    for places, samples in sampled_bricks(field, n, (0, SIDE), dj, progress):
         for (z, y, x), brick in zip(SIDE * places, samples, strict=True):
             part = values[z : z + SIDE, y : y + SIDE, x : x + SIDE]
             part[:] = brick[tuple(slice(size) for size in part.shape)]
@@ -115,14 +117,15 @@ def _from_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return unit
 
 
-def _reflectance(field: NetworkField, vertices: np.ndarray, normals: np.ndarray,
-                 dj: ModuleType) -> tuple[np.ndarray, ...]:
+def _reflectance(field: NetworkField, vertices: np.ndarray, normals: np.ndarray, dj: ModuleType, progress: Progress
+                 ) -> tuple[np.ndarray, ...]:
     """Return normals, albedo, roughness and specular weight, as a camera that looks along each normal sees them.
 
     They are means weighted by opacity, as in rendering.
     """
     result = np.empty((len(vertices), 8), np.float32)
     for first in range(0, len(vertices), PART):
+        progress(first / len(vertices))
         part = slice(first, first + PART)
         p, n = (tuple(dj.Float(np.ascontiguousarray(column, np.float32)) for column in array[part].T)
                 for array in (vertices, normals))

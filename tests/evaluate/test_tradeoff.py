@@ -263,7 +263,7 @@ def test_a_way_that_fails_is_a_row_that_says_why(folder, tmp_path, monkeypatch):
     rows = {row["way"]: row for row in result_of(tmp_path)["ways"]}
     assert rows["transmittance_map"]["reason"] == "no room for maps" and rows["raymarch"]["points"]
     assert "failed: no room for maps" in outline((tmp_path / "index.html").read_text()).texts
-    report.print_table(result_of(tmp_path))
+    report.print_table(result_of(tmp_path), tmp_path)
 
 
 def test_what_is_built_is_built_anew_for_each_way(folder, tmp_path, monkeypatch):

@@ -217,7 +217,9 @@ def test_bake_command(path, tmp_path, capsys):
         <bsdf type="null"/><medium type="nrf" name="interior"><string name="filename" value="{path}"/>
         <integer name="resolution" value="64"/></medium></shape></scene>""")
     assert cli.main(["bake", str(scene), "-o", str(tmp_path / "maps.exr"), "-D", "m=20"]) == 0
-    assert "resolution  20" in capsys.readouterr().out.replace("components", "")
+    printed = capsys.readouterr().out
+    assert f"{tmp_path / 'maps.exr'} (2 lights of 20² texels, " in printed
+    assert f'next: <string name="map_file" value="{tmp_path / "maps.exr"}"/> in the integrator' in printed
     parts = OpenEXR.File(str(tmp_path / "maps.exr")).parts
     assert [p.header["name"] for p in parts] == ["light 0", "light 1"]
     assert 300 < parts[0].channels["b"].pixels.size <= 400

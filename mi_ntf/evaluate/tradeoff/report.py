@@ -185,8 +185,21 @@ def check(result: Json) -> str:
     return f"{text}, {'no' if abs(gap) < 2 * sigma else 'perhaps a' if abs(gap) < 3 * sigma else 'a'} difference."
 
 
-def print_table(result: Json) -> None:
-    """Print the seconds to each error."""
+def verdict(result: Json) -> str:
+    """Return a sentence on the fastest way to the least of the errors of the report that is reached."""
+    ways = [row for row in result["ways"] if row["points"] and row["method"] != BOUND]
+    for limit in sorted(ERRORS):
+        times = {row["title"]: errors.crossing([p["seconds"] for p in row["points"]],
+                                               [p["error"] for p in row["points"]], limit) for row in ways}
+        reached = {title: seconds for title, seconds in times.items() if seconds is not None}
+        if reached:
+            title = min(reached, key=lambda title: reached[title])
+            return f"{title} is the fastest to an error of {limit:.0%}, after {reached[title]:.2g} s"
+    return f"no way reached an error of {max(ERRORS):.0%}; give a longer --budget"
+
+
+def print_table(result: Json, out: Path) -> None:
+    """Print the seconds to each error, the verdict, and the page in the folder `out`."""
     from rich.console import Console
     from rich.table import Table
 
@@ -194,3 +207,5 @@ def print_table(result: Json) -> None:
     for row in result["ways"]:
         table.add_row(*cells(row)[:7])
     Console(width=None if sys.stdout.isatty() else 150).print(table, unsteady(result))
+    print(f"page: {out / 'index.html'}", f"verdict: {verdict(result)}",
+          f"next: open {out / 'index.html'} in a browser; it has the recipe of every way", sep="\n")
