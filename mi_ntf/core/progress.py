@@ -34,6 +34,7 @@ from types import TracebackType
 from typing import TypeVar
 
 from . import interruption
+from .quantities import duration
 
 S = TypeVar("S", bound="Stage")
 
@@ -187,9 +188,9 @@ class _Shown:
             for i, stage in enumerate(self._stages):
                 left = stage.left()
                 if left is not None and not timed:
-                    lines[i] += f", {duration(left)} left"
+                    lines[i] += f", {duration(round(left))} left"
                     timed = True
-            since = "" if timed or first.seconds() < 1 else f", {duration(first.seconds())}"
+            since = "" if timed or first.seconds() < 1 else f", {duration(int(first.seconds()))}"
             text = " · ".join(lines) + since
             if not self._terminal():
                 (first.write or _print)(text)
@@ -232,13 +233,3 @@ def say(text: str, warning: bool = False) -> None:
 
 def _print(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
-
-
-def duration(seconds: float) -> str:
-    """Return seconds for a reader: 25 s, 2 min 10 s, 1 h 05 min."""
-    whole = round(seconds)
-    if whole < 60:
-        return f"{whole} s"
-    if whole < 3600:
-        return f"{whole // 60} min {whole % 60:02} s"
-    return f"{whole // 3600} h {whole // 60 % 60:02} min"

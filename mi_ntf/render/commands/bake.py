@@ -11,6 +11,7 @@ import mitsuba as mi
 
 from ...core import files, progress
 from ...core.errors import MiNtfError
+from ...core.quantities import size
 from ...core.variants import VARIANTS
 from ...infer.lights import LightTable
 from ...infer.visibility import REGISTRY
@@ -78,14 +79,14 @@ def print_maps(report: MapFile) -> None:
     """Print the file of :func:`bake`, and the use of it."""
     lights = f"{report['lights']} light{'s' if report['lights'] > 1 else ''}"
     print(f"map file: {report['file']} ({lights} of {report['resolution']}² texels, "
-          f"{report['bytes'] / 2**20:.1f} MiB)",
+          f"{size(report['bytes'])})",
           f'next: <string name="map_file" value="{report["file"]}"/> in the integrator of the scene', sep="\n")
 
 
 def print_fields(report: dict[str, dict[str, str | int]]) -> None:
     """Print the files of :func:`bake_fields`, and the use of them."""
     for file, about in report.items():
-        print(f"field: {file} ({about['voxels']}³ voxels, {int(about['bytes']) / 2**20:.1f} MiB)")
+        print(f"field: {file} ({about['voxels']}³ voxels, {size(int(about['bytes']))})")
     print("next: render as before; the voxels are read from the file")
 
 
