@@ -21,7 +21,7 @@ import numpy as np
 import OpenEXR
 
 from mi_ntf.commands.options import SCENE_HELP, SceneOptions
-from mi_ntf.core import files, ops, srgb
+from mi_ntf.core import files, ops, progress, srgb
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.core.variants import enough_threads
 from mi_ntf.render import log
@@ -90,7 +90,8 @@ def main(arguments: Sequence[str]) -> None:
         _watch(Path(args.scenes[0]), output, render, args.tev)
         return
     for scene in args.scenes:
-        render(Path(scene))
+        with progress.Stage(f"rendering {scene}", shown=False):  # Mitsuba's log shows the progress
+            render(Path(scene))
 
 
 def _watch(scene: Path, output: Path | None, render: Callable[..., mi.Film], address: str) -> None:

@@ -1,13 +1,16 @@
 """Ctrl-C, which Mitsuba, Dr.Jit and imports turn into errors of their own, or lose."""
 
 import signal
+import socket
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 from .errors import root
 
 _pressed = threading.Event()
+_signals: socket.socket | None = None
+"""Numbers of the signals that have come, as bytes."""
 
 
 @contextmanager
@@ -21,6 +24,12 @@ def noticed() -> Iterator[threading.Event]:
         yield _pressed
         return
     before = signal.signal(signal.SIGINT, _press)
+    # Python calls `_press` when its main thread is back from C++. The system writes to this pipe at once.
+    global _signals
+    _signals, writing = socket.socketpair()
+    _signals.setblocking(False)
+    writing.setblocking(False)
+    former = signal.set_wakeup_fd(writing.fileno(), warn_on_full_buffer=False)
     try:
         yield _pressed
     except Exception:
@@ -28,8 +37,12 @@ def noticed() -> Iterator[threading.Event]:
             raise KeyboardInterrupt from None
         raise
     finally:
+        signal.set_wakeup_fd(former)
         signal.signal(signal.SIGINT, before)
         _pressed.clear()
+        _signals.close()
+        writing.close()
+        _signals = None
 
 
 @contextmanager
@@ -56,6 +69,9 @@ def caused(error: BaseException) -> bool:
 
 
 def check() -> None:
-    """Raise KeyboardInterrupt if Ctrl-C was pressed, in case that the first one was lost."""
+    """Raise KeyboardInterrupt if Ctrl-C was pressed, also in threads for which the main one waits."""
+    with suppress(BlockingIOError):
+        if _signals is not None and signal.SIGINT in _signals.recv(64):
+            _pressed.set()
     if _pressed.is_set():
         raise KeyboardInterrupt

@@ -105,7 +105,7 @@ def bake_fields(path: Path, parameters: dict[str, str], environment: Environment
             mi.set_variant(*VARIANTS)
         resolutions = {str(path): None}
     result = {}
-    with progress.Stage("baked fields", len(resolutions), then="the same command bakes the others") as stage:
+    with progress.Stage("fields", len(resolutions), then="the same command goes on") as stage:
         for file, resolution in resolutions.items():
             result[file] = loaded.add_baked(Path(file), resolution)
             stage.advance()
