@@ -151,4 +151,11 @@ def print_pairs(values: Mapping[str, object], indent: str = "") -> None:
             print(f"{indent}{key}")
             print_pairs(value, indent + "  ")
         else:
-            print(f"{indent}{key:<{width}}  {value}")
+            print(f"{indent}{key:<{width}}  {_rounded(value)}")
+
+
+def _rounded(value: object) -> object:
+    """Return numbers with six significant digits, other values as they are."""
+    if isinstance(value, list | tuple):
+        return ", ".join(str(_rounded(v)) for v in value)
+    return f"{value:.6g}" if isinstance(value, float) else value

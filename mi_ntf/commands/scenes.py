@@ -136,9 +136,9 @@ class Cache:
 
     def run(self) -> None:
         """Print the cache's contents."""
-        from mi_ntf.render.commands.cache import report
+        from mi_ntf.render.commands.cache import print_table, report
 
-        options.print_report(report(self.clear), self.json, options.print_pairs)
+        options.print_report(report(self.clear), self.json, print_table)
 
 
 @dataclass

@@ -98,12 +98,13 @@ def read_image(path: Path) -> np.ndarray:
 
 def print_table(result: Json) -> None:
     """Print the result of :func:`compare` with the definition of each metric."""
+    from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
 
     variants = {title: result[name] for name, title in VARIANTS.items() if name in result}
     missing = result.get("not_measured", {})
-    table = Table("metric", "raw", *variants, "on")
+    table = Table("metric", "raw", *variants, "on", box=SIMPLE_HEAD, pad_edge=False)
     for name, metric in METRICS.items():
         if name in result:
             values = [figures[name] for figures in (result, *variants.values())]

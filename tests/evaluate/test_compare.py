@@ -150,11 +150,12 @@ def test_small_pictures_lack_what_needs_larger_ones(rng, capsys):
     assert "not measured:" in text and "176×176" in text and "to measure MS-SSIM: render larger" in text
 
 
-def test_table_shows_every_metric(capsys):
+def test_table_shows_every_metric(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
     figures = dict.fromkeys(METRICS, 0.125)
     print_table(figures | {"aligned": figures | {"factors": [0.5, 1.0, 2.0]}, "masked": figures | {"coverage": 0.25},
                            "picture": "a.png"})
     text = capsys.readouterr().out
     assert text.count("0.125") == 3 * len(METRICS) and "HDR-FLIP" in text and "PSNR, dB" in text
     assert "aligned: red, green, blue times 0.5000, 1.0000, 2.0000" in text and "object: 25.0%" in text
-    assert "picture: a.png" in text
+    assert "picture: a.png" in text and max(map(len, text.splitlines())) <= 80

@@ -18,6 +18,7 @@ from mi_ntf.evaluate.tradeoff import measure, references, ways
 from mi_ntf.evaluate.tradeoff.errors import Truth
 from mi_ntf.evaluate.tradeoff.ways import Subject, Way
 from mi_ntf.infer.visibility import REGISTRY
+from mi_ntf.render.scene.environment_option import Environment
 from mi_ntf.render.timing import once
 
 
@@ -162,6 +163,18 @@ def test_a_scene_without_the_names_has_no_command(folder, subject):
     assert command(Way("raymarch"), Subject(folder / "sky.xml", {}), 4) == ""
     limited = Subject(folder / "one.xml", {"noise": "0.1"})
     assert command(Way("raymarch"), limited, 4) == ""  # would end at a noise
+
+
+def test_a_changed_environment_reaches_every_render_of_a_study(folder):
+    """The ways, the mesh's scene, the key of the study and the command have twice the light of the sky."""
+    dim, bright = (Subject(folder / "sky.xml", {}, Environment(scale=scale)) for scale in (1.0, 2.0))
+    way = Way("transmittance_map")
+    pictures = [references.renderer(subject, way, 1)(1, 0)[0] for subject in (dim, bright)]
+    np.testing.assert_allclose(pictures[1], 2 * pictures[0], rtol=1e-3, atol=1e-4)
+    traced = [references.captured(subject, folder / "sky.xml", 1, 0.0).image.mean() for subject in (dim, bright)]
+    assert traced[1] == pytest.approx(2 * traced[0], rel=0.05)
+    assert dim.key() == Subject(folder / "sky.xml", {}).key() != bright.key()
+    assert Environment(scale=2.0).words() == ["--env-scale=2.0"] and Environment().words() == []
 
 
 def test_stock_volpath_agrees_with_the_converged_march(subject):

@@ -110,10 +110,15 @@ def test_environments_state_their_error(tmp_path, capsys):
     assert explain(SCENE, {"visibility": "none", "light": "point"})["environments"] == []
 
 
-def test_table_names_every_effect(capsys):
+def test_table_names_every_effect_within_the_columns_of_the_terminal(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
     report = explain(SCENE, {"visibility": "none", "res": "16", "depth": "2"})
+    report["effects"]["visibility"]["why"] *= 9
+    report["predicted"]["seconds"] = 110.4
     print_table(report)
     text = capsys.readouterr().out
+    assert max(len(line) for line in text.splitlines() if str(SCENE.parent) not in line) <= 80
+    assert re.search(r"time +110 s", text)
     assert all(name.split()[0] in text for name in report["effects"])
     assert "predicted by a pilot" in text and "memory: voxels" in text
 

@@ -3,7 +3,7 @@
 import csv
 import io
 import json
-import sys
+import re
 from html import escape
 from pathlib import Path
 from typing import TypeAlias
@@ -11,6 +11,7 @@ from typing import TypeAlias
 import numpy as np
 
 from ...core import files
+from ...core.quantities import duration
 from ...data.images import levels
 from ...data.page import Page, new_figure, plain
 from ..curves import draw
@@ -26,7 +27,7 @@ Pictures: TypeAlias = dict[str, dict[str, np.ndarray]]
 """Pictures of each way by the seconds after which they are compared."""
 COLUMNS = ("seconds", "samples", "error", "error_uncertainty", "noise", "noise_uncertainty", "bias", "bias_uncertainty",
            "mesh_error", "mesh_error_uncertainty", "front")
-HEADER = ("way", *(f"to {limit:.0%}" for limit in ERRORS), "error at the end", "after s", "samples", "noise", "bias",
+HEADER = ("way", *(f"to {limit:.0%}" for limit in ERRORS), "error at the end", "after", "samples", "noise", "bias",
           "to the mesh")
 
 
@@ -101,16 +102,16 @@ def cells(row: Json) -> list[str]:
                                                          for p in row["points"]], limit) for step in (0, -1, 1))
         if middle is None:
             return "not reached"
-        times = [f"{early:.2g}", "not reached" if late is None else f"{late:.2g}"]
+        times = ["not reached" if time is None else duration(time) for time in (early, late)]
         bound = "at most " if middle == seconds[0] else ""
-        return f"{bound}{middle:.2g} s" + (f" ({times[0]} to {times[1]})" if times[0] != times[1] else "")
+        return f"{bound}{duration(middle)}" + (f" ({times[0]} to {times[1]})" if times[0] != times[1] else "")
 
     def estimate(name: str) -> str:
         value = end.get(name)
         return "not known" if value is None else f"{value:.1%} ± {end[f'{name}_uncertainty']:.1%}"
 
     name = row["title"] + (" (a bound)" if row["method"] == BOUND else "")
-    return [name, *map(reached, ERRORS), estimate("error"), f"{end['seconds']:.3g}", f"{end['samples']}",
+    return [name, *map(reached, ERRORS), estimate("error"), duration(end["seconds"]), f"{end['samples']}",
             *map(estimate, ("noise", "bias", "mesh_error"))]
 
 
@@ -142,7 +143,7 @@ def _pictures(sheet: Page, result: Json, reference: np.ndarray, pictures: Pictur
                 continue
             point = [p for p in row["points"] if p["seconds"] <= mark][-1]
             heat = colormaps["inferno"](np.clip(2 * np.abs(image - reference).mean(-1) / rms, 0, 1))[..., :3]
-            pairs.append((f"{row['title']}: error {point['error']:.1%} after {point['seconds']:.2g} s",
+            pairs.append((f"{row['title']}: error {point['error']:.1%} after {duration(point['seconds'])}",
                           np.vstack([levels(image * scale), (255 * heat).astype(np.uint8)])))
         if pairs:
             sheet.markup(f"<h3>After {mark} s</h3>")
@@ -194,18 +195,21 @@ def verdict(result: Json) -> str:
         reached = {title: seconds for title, seconds in times.items() if seconds is not None}
         if reached:
             title = min(reached, key=lambda title: reached[title])
-            return f"{title} is the fastest to an error of {limit:.0%}, after {reached[title]:.2g} s"
+            return f"{title} is the fastest to an error of {limit:.0%}, after {duration(reached[title])}"
     return f"no way reached an error of {max(ERRORS):.0%}; give a longer --budget"
 
 
 def print_table(result: Json, out: Path) -> None:
     """Print the seconds to each error, the verdict, and the page in the folder `out`."""
+    from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(*HEADER[:7])
+    table = Table(*HEADER[:5], "error", "after", box=SIMPLE_HEAD, pad_edge=False)
     for row in result["ways"]:
-        table.add_row(*cells(row)[:7])
-    Console(width=None if sys.stdout.isatty() else 150).print(table, unsteady(result))
+        name, *others = cells(row)[:7]
+        # The page has the ranges; here they would not fit into a terminal.
+        table.add_row(name, *(re.sub(r" \(.*\)| ± .*", "", cell).replace("not reached", "–") for cell in others))
+    Console().print(table, unsteady(result))
     print(f"page: {out / 'index.html'}", f"verdict: {verdict(result)}",
           f"next: open {out / 'index.html'} in a browser; it has the recipe of every way", sep="\n")

@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import mitsuba as mi
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
 from ...core import progress
+from ...core.quantities import duration
 from ...infer.visibility import REGISTRY
 from .. import timing, user_cache
 from ..lights import environment
@@ -25,6 +27,8 @@ from ..transport import candidates, choosing, effects
 from ..transport.composition import Composition
 from ..transport.context import RenderContext, context_of
 
+PLAIN: dict[str, Any] = {"box": SIMPLE_HEAD, "pad_edge": False}
+"""Options of tables without vertical lines, which leave more columns for the text."""
 Report: TypeAlias = dict[str, Any]
 """Part of the report, as it is written to JSON."""
 
@@ -155,18 +159,18 @@ def _effects(scene: mi.Scene, active: effects.Effects, settings: Settings, count
 def print_table(report: Report) -> None:
     """Print a report of :func:`explain` as tables."""
     console = Console()
-    console = console if console.is_terminal else Console(width=120)
     image = report["image"]
     console.print(
-        f"{report['scene']}: {image['width']}×{image['height']}, {image['spp']} samples a pixel", highlight=False)
+        f"{report['scene']}: {image['width']}×{image['height']}, {image['spp']} samples a pixel", highlight=False,
+        soft_wrap=True)
     for field in report["fields"]:
-        console.print(f"field {field['file']} as {field['representation']}", highlight=False)
+        console.print(f"field {field['file']} as {field['representation']}", highlight=False, soft_wrap=True)
     for each in report["environments"]:
         console.print(
             f"{each['emitter']}: {each['lights']} directional lights of cells of "
             f"{each['radius_degrees']:.2g}° (RMS); the irradiance of an unshadowed surface is right within "
             f"{each['irradiance_error_percent']:.2g} % of all light", highlight=False)
-    table = Table("effect", "on", "why")
+    table = Table("effect", "on", "why", **PLAIN)
     for name, effect in report["effects"].items():
         table.add_row(name, "yes" if effect["on"] else "–", effect["why"])
     console.print(table)
@@ -176,10 +180,10 @@ def print_table(report: Report) -> None:
 
 
 def _trials(trials: list[Report]) -> Table:
-    table = Table("tried", "seconds", "error", "error below", "verdict")
+    table = Table("tried", "time", "error", "error below", "verdict", **PLAIN)
     for trial in trials:
         numbers = ["–"] * 3 if math.isnan(trial["bound"]) else [
-            f"{trial['seconds']:.2g}", f"{trial['error']:.2%}", f"{trial['bound']:.2%}"]
+            duration(trial["seconds"]), f"{trial['error']:.2%}", f"{trial['bound']:.2%}"]
         table.add_row(trial["name"], *numbers, trial["why"])
     return table
 
@@ -187,14 +191,15 @@ def _trials(trials: list[Report]) -> Table:
 def _costs(report: Report) -> Table:
     predicted, measured = report["predicted"], report.get("measured")
     table = Table(report["method"], "predicted by a pilot", *(["measured"] if measured else []),
-                  caption="seconds without the compilation of kernels; error against the march")
+                  caption="time without the compilation of kernels; error against the march", caption_justify="left",
+                  **PLAIN)
 
     def row(name: str, prediction: str, measurement: str = "") -> None:
         table.add_row(name, prediction, *([measurement] if measured else []))
 
     if predicted:
-        seconds = f"{measured['wall_seconds'] - measured['compile_seconds']:.2g}" if measured else ""
-        row("seconds", f"{predicted['seconds']:.2g}", seconds)
+        row("time", duration(predicted["seconds"]),
+            duration(measured["wall_seconds"] - measured["compile_seconds"]) if measured else "")
         row("error", f"{predicted['error']:.2%}, below {predicted['bound']:.2%}")
     for name, size in report["memory_bytes"].items():
         row(f"memory: {name}", f"{size / 2**20:.0f} MiB")
