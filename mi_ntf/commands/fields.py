@@ -70,8 +70,8 @@ class Capture:
         report = capture(self.scene, self.folder, views=self.views, size=self.size, test_views=self.test_views,
                          spp=self.spp, seed=self.seed, flash_offset=offset, shapes=self.shapes, parameters=parameters,
                          workers=self.workers)
-        kept = f", {report['kept']} of them from an earlier run" if report["kept"] else ""
-        print(f"photographs: {self.folder} ({report['rendered'] + report['kept']}{kept})",
+        earlier = f", {report['kept']} of them from an earlier run" if report["kept"] else ""
+        print(f"photographs: {self.folder} ({report['rendered'] + report['kept']}{earlier})",
               f"next: mi-ntf train {self.folder} -o field.safetensors --minutes 10", sep="\n")
 
 
