@@ -7,7 +7,7 @@ from .errors import MiNtfError
 EXTRAS = {
     "train": ("torch", "tensorboard", "matplotlib", "PIL", "cv2"),
     "video": ("imageio_ffmpeg",),
-    "view": ("viser", "websockets"),
+    "view": ("viser", "websockets", "PIL"),
     "eval": ("skimage", "flip_evaluator", "matplotlib", "PIL"),
     "mesh": ("skimage", "scipy", "trimesh"),
     "watch": ("tevclient",),

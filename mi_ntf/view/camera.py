@@ -62,6 +62,16 @@ def fov_of_height(fov_of_width: float, aspect: float) -> float:
     return float(np.degrees(2 * np.arctan(np.tan(np.radians(fov_of_width) / 2) / aspect)))
 
 
+def fov_of_window(fov: float, aspect: float, window: float) -> float:
+    """Return the vertical field of view in which a window shows a whole picture.
+
+    fov     the picture's vertical field of view in degrees
+    aspect  width of the picture over its height
+    window  width of the window over its height
+    """
+    return float(np.degrees(2 * np.arctan(np.tan(np.radians(fov) / 2) * max(1.0, aspect / window))))
+
+
 def place(sensor: mi.Sensor, parameters: Parameters, pose: Pose, size: tuple[int, int]) -> None:
     """Give the sensor the pose `pose` and a picture of (width, height) pixels."""
     film = sensor.film()

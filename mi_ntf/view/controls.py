@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeVar
@@ -11,18 +12,24 @@ import viser
 from viser import transforms
 
 from mi_ntf.infer.visibility import names
-from mi_ntf.page_server import serve
+from mi_ntf.page_server import Background, serve
 
 from . import environments
-from .camera import Pose, triple
+from .camera import Pose, fov_of_window, triple
 from .display import Bytes
 from .lights import Light
+from .picture import Interrupted
 from .save import beside_scene, save
 from .session import AOVS, Session
 from .viewer import Viewer
 
 LIGHT, NOTHING = "light", "–"
-JPEG_QUALITY = 90
+LINES = """<div style="height: 2.9em; overflow-y: auto; padding: 0.2em 0.9em; font-size: 0.85em; line-height: 1.4;
+white-space: pre-line; opacity: {opacity}">{text}</div>"""
+"""Two lines of text. Their height is fixed, so that no control moves under the mouse."""
+NARROW = "<style>@media (max-width: 36em) { [style*='max-height: 60%'] { max-height: 33% !important } }</style>"
+"""Style that leaves two thirds of a narrow window to the picture. viser's panel would take 60 %."""
+HELP = "Left button: orbit, right: pan, wheel: zoom. Drag a light's handles to move it."
 T = TypeVar("T")
 
 
@@ -40,9 +47,15 @@ class Controls:
     def __init__(self, session: Session, host: str = "127.0.0.1", port: int = 8080, samples: int = 64) -> None:
         self.session = session
         self.server, self.url = serve(f"mi-ntf: {session.path.name}", host, port)
-        self.viewer = Viewer(session, self._show, self._tell, samples)
-        self.gizmos: dict[int, Gizmo] = {}
+        self.background = Background(self.server)
+        self._cameras: dict[int, tuple[Pose, tuple[int, int]]] = {}  # pose and window of each browser, by its number
+        self.gizmos: dict[str, Gizmo] = {}
+        self.viewer = Viewer(session, self._show, self._tell, samples,
+                             lambda: {name: gizmo.handles.position for name, gizmo in self.gizmos.items()})
         self._set_camera()
+        self._status = self.server.gui.add_html(NARROW)
+        self._answer = self.server.gui.add_html(LINES.format(text=HELP, opacity=0.6))
+        self._add_camera_folder()
         self._add_picture_folder()
         for light in session.lights:
             self._add_light_folder(light)
@@ -62,11 +75,11 @@ class Controls:
         self.viewer.stop()
 
     def _show(self, picture: Bytes, status: str) -> None:
-        self.server.scene.set_background_image(picture, format="jpeg", jpeg_quality=JPEG_QUALITY)
-        self._status.content = status
+        self.background.show(picture)
+        self._status.content = NARROW + LINES.format(text=html.escape(status), opacity=1)
 
     def _tell(self, text: str) -> None:
-        self._answer.content = text
+        self._answer.content = LINES.format(text=html.escape(text), opacity=1)
 
     def _set_camera(self) -> None:
         pose, initial = self.session.pose, self.server.initial_camera
@@ -74,30 +87,38 @@ class Controls:
         initial.up, initial.position, initial.look_at = (np.array(v) for v in (pose.up, pose.origin, pose.target))
         initial.fov = float(np.radians(pose.fov))
 
-        def follow(client: viser.ClientHandle) -> None:
-            client.camera.on_update(lambda _: self._on_camera(client.camera))
+        async def follow(client: viser.ClientHandle) -> None:
+            client.camera.on_update(self._on_camera)
+            await self._on_camera(client.camera)  # viser has already passed the first message on
 
         self.server.on_client_connect(follow)
 
-    def _on_camera(self, view: viser.CameraHandle) -> None:
-        """Follow the browser's camera and the shape of its window."""
+    async def _on_camera(self, view: viser.CameraHandle) -> None:
+        """Follow the browser's camera and window. A window narrower than the scene's picture shows its whole width."""
+        fov = fov_of_window(self.session.initial_pose.fov, self.session.aspect, view.aspect)
+        view.fov = float(np.radians(fov))
         turn = transforms.SO3(np.array(view.wxyz)).as_matrix()
-        position, aspect = np.array(view.position, np.float64), float(view.aspect)
+        position, window = np.array(view.position, np.float64), (view.image_width, view.image_height)
         distance = float(np.linalg.norm(np.array(view.look_at) - position))
-        pose = Pose(triple(position), triple(position + distance * turn[:, 2]), triple(-turn[:, 1]),
-                    float(np.degrees(view.fov)))
+        pose = Pose(triple(position), triple(position + distance * turn[:, 2]), triple(-turn[:, 1]), fov)
+        if self._cameras.get(view.client.client_id) == (pose, window):
+            return
+        self._cameras[view.client.client_id] = pose, window
 
         def do() -> None:
-            size = self.session.edge
-            if abs(self.session.size[0] / self.session.size[1] - aspect) > 2 / size:
-                self.session.resize(size, aspect)
+            self.session.fit(*window)
             self.session.look(pose)
 
         self.viewer.change("camera", do, "camera")
 
+    def _add_camera_folder(self) -> None:
+        gui = self.server.gui
+        with gui.add_folder("Camera"):
+            gui.add_button("Scene's camera").on_click(self._return_to_scene)
+            gui.add_button("See all lights", hint="step back until they are in view").on_click(self._step_back)
+
     def _add_picture_folder(self) -> None:
         gui, viewer, session = self.server.gui, self.viewer, self.session
-        self._status, self._answer = gui.add_markdown(""), gui.add_markdown("")
         with gui.add_folder("Picture"):
             visibility = gui.add_dropdown("visibility", tuple(names()), initial_value=session.settings.visibility)
             depth = gui.add_number("max_depth", session.settings.max_depth, min=-1, max=64, step=1,
@@ -113,7 +134,12 @@ class Controls:
         self._link(second, "second", lambda v: session.choose(second_visibility="" if v == NOTHING else v))
         self._link(stops, "stops", lambda v: setattr(viewer, "stops", v), "shown")
         self._link(split, "split", lambda v: setattr(viewer, "split", v), "shown")
-        error.on_click(lambda _: viewer.change("error", self._measure, "shown"))
+
+        async def measure(_event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
+            self._tell("Measuring the error against raymarch …")
+            viewer.change("error", self._measure, "shown")
+
+        error.on_click(measure)
 
     def _link(self, handle: viser.GuiInputHandle[T], name: str, do: Callable[[T], object], kind: str = "other") -> None:
         """Call `do` with the value of a control after each change by a browser."""
@@ -126,8 +152,12 @@ class Controls:
         handle.on_update(update)
 
     def _measure(self) -> None:
-        errors = ", ".join(f"{100 * e:.2f} %" for e in self.session.error())
-        self._tell(f"Relative RMSE against raymarch: {errors}")
+        try:
+            errors = ", ".join(f"{name} {100 * error:.2f} %" for name, error in self.session.error())
+        except Interrupted:
+            self._tell("The error was not measured, because something moved meanwhile.")
+        else:
+            self._tell(f"Relative RMSE against raymarch:\n{errors}")
 
     def _add_light_folder(self, light: Light) -> None:
         gui, name = self.server.gui, f"{light.number} {light.kind}"
@@ -138,8 +168,8 @@ class Controls:
         with gui.add_folder(name):
             if light.can_move:
                 position = gui.add_vector3("position", triple(np.round(light.position, 6)), step=0.01)
-                self._link(position, f"light {name}", lambda v: self._type_position(light, v), "light")
-                self.gizmos[light.number].position = position
+                self._link(position, f"light {name}", lambda v: self._type_position(light, name, v), "light")
+                self.gizmos[name].position = position
             if light.can_turn:
                 turn = gui.add_slider("rotation", -180.0, 180.0, 1.0, 0.0, hint="degrees about the camera's up axis")
                 self._link(turn, f"turn {name}", light.turn, "light")
@@ -155,26 +185,25 @@ class Controls:
         handles = self.server.scene.add_transform_controls(
             f"/lights/{name}", scale=0.35 * radius, depth_test=False, disable_rotations=not light.can_point,
             disable_axes=not light.can_move, disable_sliders=not light.can_move, position=tuple(position), wxyz=wxyz)
-        self.gizmos[light.number] = Gizmo(handles)
+        gizmo = self.gizmos[name] = Gizmo(handles)
 
         async def follow(_event: viser.TransformControlsEvent) -> None:
             position, wxyz = np.array(handles.position), np.array(handles.wxyz)
-            self.viewer.change(f"light {name}", lambda: self._drag(light, position, wxyz), "light")
+            self.viewer.change(f"light {name}", lambda: self._drag(light, gizmo, position, wxyz), "light")
 
         handles.on_update(follow)
 
-    def _drag(self, light: Light, position: np.ndarray, wxyz: np.ndarray) -> None:
+    def _drag(self, light: Light, gizmo: Gizmo, position: np.ndarray, wxyz: np.ndarray) -> None:
         if light.can_move:
             light.move(position)
-            numbers = self.gizmos[light.number].position
-            if numbers is not None:
-                numbers.value = triple(np.round(position, 6))  # type: ignore[misc]  # read-only in the stub
+            if gizmo.position is not None:
+                gizmo.position.value = triple(np.round(position, 6))  # type: ignore[misc]  # read-only in the stub
         if light.can_point:
             light.point(transforms.SO3(wxyz).as_matrix()[:, 2])
 
-    def _type_position(self, light: Light, position: tuple[float, float, float]) -> None:
+    def _type_position(self, light: Light, name: str, position: tuple[float, float, float]) -> None:
         light.move(position)
-        self.gizmos[light.number].handles.position = position
+        self.gizmos[name].handles.position = position
 
     def _add_environments(self) -> None:
         """Add a choice of files for the environment, those beside its present one."""
@@ -196,14 +225,20 @@ class Controls:
         gui, path = self.server.gui, self.session.path
         with gui.add_folder("File"):
             name = gui.add_text("name", f"{path.stem}_view.xml", hint="of a file beside the scene")
+            camera = gui.add_checkbox("this camera", False, hint="save the camera of this window, not the scene's")
             button = gui.add_button("Save XML")
-        gui.add_button("See all lights", hint="step back until they are in view").on_click(self._step_back)
-        button.on_click(lambda _: self.viewer.change("save", lambda: self._save(name.value), "shown"))
+        button.on_click(lambda _: self.viewer.change("save", lambda: self._save(name.value, camera.value), "shown"))
 
-    def _save(self, name: str) -> None:
+    def _save(self, name: str, camera: bool) -> None:
         out = beside_scene(self.session, name)
-        save(self.session, out)
+        save(self.session, out, camera=camera)
         self._tell(f"Saved {out}")
+
+    def _return_to_scene(self, event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
+        if event.client is not None:
+            view, pose = event.client.camera, self.session.initial_pose
+            with event.client.atomic():
+                view.up_direction, view.position, view.look_at = pose.up, pose.origin, pose.target
 
     def _step_back(self, event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
         """Move the camera away from the fields until all lights with a position are in view."""

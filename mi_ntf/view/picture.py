@@ -39,6 +39,12 @@ class Picture:
         self._samples: tuple[object, ...] = ()
         self.rendered: list[Group] = []
 
+    @property
+    def method(self) -> str:
+        """Visibility method of the latest image, with its name in the scene if that is ``auto``."""
+        name = self.settings.visibility
+        return f"{name}: {self.context.achieved['visibility']}" if name == "auto" else name
+
     def should_stop(self) -> bool:
         """Raise Interrupted if something moved. The renderer asks for each chunk of pixels."""
         if self.stop():

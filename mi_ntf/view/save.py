@@ -9,6 +9,7 @@ import numpy as np
 from mi_ntf import scene_xml
 from mi_ntf.core import files
 from mi_ntf.core.errors import MiNtfError, shown
+from mi_ntf.render.scene.environment_option import KINDS
 
 from .lights import POWER, Light
 from .session import Session
@@ -27,14 +28,14 @@ def beside_scene(session: Session, name: str) -> Path:
     return session.path.with_name(name)
 
 
-def save(session: Session, out: Path, environment: Path | None = None) -> None:
-    """Write the scene of `session` as it is now.
+def save(session: Session, out: Path, environment: Path | None = None, camera: bool = False) -> None:
+    """Write the scene of `session` as it is now, with the scene's own camera, or with the present one if `camera`.
 
     Unchanged elements stay as they were written. Includes that hold a light, a sensor or an integrator are inlined,
     comments are lost, and the session's values of $names become their defaults.
 
-    `environment` is a picture file in place of the present one. Raises MiNtfError if `out` is the scene itself, or a
-    changed light is not an <emitter> of the scene's top level.
+    `environment` is a picture file in place of the present one. Raises MiNtfError if `out` is the scene itself, a
+    changed light is not an <emitter> of the scene's top level, or a changed environment is a sky.
     """
     if out.resolve() == session.path.resolve():
         raise MiNtfError(f"{out} is the scene that is being viewed; choose another name")
@@ -44,6 +45,8 @@ def save(session: Session, out: Path, environment: Path | None = None) -> None:
         root, session.path, lambda content: any(content.find(f".//{tag}") is not None for tag in CHANGED))
     scene_xml.move_paths(root, session.path.parent, out.parent, values)
     _set_defaults(root, session.define)
+    if session.option:
+        _write_option(root, session, values)
     for light in session.lights:
         if light.version:
             _write_light(_element(root, session, light, values), light)
@@ -54,7 +57,7 @@ def save(session: Session, out: Path, environment: Path | None = None) -> None:
                 place = os.path.relpath(environment, out.parent)
                 _replace(_element(root, session, light, values), ("filename", "bitmap"),
                          ET.Element("string", name="filename", value=Path(place).as_posix()))
-    if session.pose != session.initial_pose:
+    if camera:
         _write_pose(root, session)
     for name in ("visibility", "max_depth"):
         if getattr(session.settings, name) != getattr(session.initial_settings, name):
@@ -97,12 +100,35 @@ def _write_light(element: ET.Element, light: Light) -> None:
         # Mitsuba applies the steps of a transform in their order.
         x, y, z = (repr(float(c)) for c in light.up)
         ET.SubElement(transform, "rotate", x=x, y=y, z=z, angle=repr(light.degrees))
-    if light.brightness != 1 and light.power is not None:
-        name = POWER[light.emitter.class_name()].removesuffix(".value")
-        if len(light.power) > 1:
-            _replace(element, (name,), ET.Element("rgb", name=name, value=", ".join(map(_text, light.power))))
-        else:
-            _replace(element, (name,), ET.Element("float", name=name, value=_text(light.power[0])))
+    if light.brightness != 1:
+        _write_power(element, light)
+
+
+def _write_power(element: ET.Element, light: Light) -> None:
+    power = light.power
+    if power is None:
+        return
+    name = POWER[light.emitter.class_name()].removesuffix(".value")
+    new = (ET.Element("rgb", name=name, value=", ".join(map(_text, power))) if len(power) > 1 else
+           ET.Element("float", name=name, value=_text(power[0])))
+    _replace(element, (name,), new)
+
+
+def _write_option(root: ET.Element, session: Session, values: dict[str, str]) -> None:
+    """Write the environment as the command line changed it. Its picture is written with that of a view."""
+    light = next((light for light in session.lights if light.kind in ("envmap", "constant")), None)
+    elements = [e for e in root.findall("emitter") if scene_xml.substitute(e.get("type", ""), values) in KINDS]
+    if light is None or len(elements) > 1:
+        raise MiNtfError(f"{session.path}: the changes by --env-rotate and --env-scale can be saved for one envmap or "
+                         "constant emitter at the scene's top level; write them into the scene by hand")
+    element = elements[0] if elements else ET.SubElement(root, "emitter")
+    if scene_xml.substitute(element.get("type", ""), values) != light.kind:
+        element.set("type", light.kind)
+        for child in [c for c in element if c.get("name") != "sampling_weight"]:
+            element.remove(child)
+    if light.can_turn:
+        _replace(element, ("to_world",), _matrix(light.placement))
+    _write_power(element, light)
 
 
 def _write_pose(root: ET.Element, session: Session) -> None:

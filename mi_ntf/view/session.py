@@ -14,6 +14,7 @@ from mi_ntf.core.errors import MiNtfError
 from mi_ntf.infer.visibility import names
 from mi_ntf.render.lights import scene_lights
 from mi_ntf.render.plugins.registration import load_scene
+from mi_ntf.render.scene.environment_option import Environment
 from mi_ntf.render.scene.media import find_media, ordinary_shapes
 from mi_ntf.render.scene.settings import Settings
 from mi_ntf.render.transport.aovs import CHANNELS
@@ -43,25 +44,30 @@ class Frame:
     image: np.ndarray  # linear RGB and opacity, (h, w, 4), or an AOV, (h, w, c)
     seconds: float
     samples: int  # per pixel
-    right: np.ndarray | None = None  # by the second method of a split view
+    methods: tuple[str, ...]  # visibility method, and the second one of a split view
+    right: np.ndarray | None = None  # by the second method
 
 
 class Session:
-    """The scene file `path`, with values `define` of its $names, in pictures of about `size`² pixels.
+    """The scene file `path`, with values `define` of its $names, in pictures of at most about `limit`² pixels.
+
+    `environment` has changes of the scene's environment, which :func:`mi_ntf.view.save.save` writes, too.
 
     Lights are changed by the methods of `lights`, everything else by those of this class, from one thread. `stop` is
     called while :meth:`refine` renders. If it returns True, :class:`mi_ntf.view.picture.Interrupted` ends the pass.
     """
 
-    def __init__(self, path: Path, define: dict[str, str] | None = None, size: int = 256) -> None:
+    def __init__(self, path: Path, define: dict[str, str] | None = None, limit: int = 512,
+                 environment: Environment | None = None) -> None:
         self.path, self.define = Path(path), dict(define or {})
         self.stop: Callable[[], bool] = lambda: False
         self.aov, self.second_visibility = "", ""
-        self.environment: Path | None = None
+        self.limit, self.option = limit, environment or Environment()
+        self.environment = self.option.file  # picture in place of the scene's own
         self._passes, self._samples = 0, 0
         self._sums: list[np.ndarray] = []
         self._versions: dict[int, int] = {}  # of the lights in the latest picture
-        self._load(load_scene(self.path, self.define))
+        self._load(load_scene(self.path, self.define, self.option))
         self.center = np.mean([m.frame.origin for m in self.media], axis=0)
         self.pose = self.initial_pose = camera.pose_of(self.sensor, self.parameters, self.center)
         self.lights = lights_of(self.scene, self.parameters, np.array(self.pose.up))
@@ -70,7 +76,8 @@ class Session:
         self.settings = self.initial_settings = replace(context.settings, frames=FRAMES)
         self._common = [light.number for light in self.lights[MAX_LAYERS:]]
         width, height = (int(n) for n in self.sensor.film().crop_size())
-        self.resize(size, width / height)
+        self.aspect = width / height  # of the scene's own picture
+        self.size = _size(limit, self.aspect)
         self._make_pictures()
 
     def _load(self, scene: mi.Scene) -> None:
@@ -86,11 +93,12 @@ class Session:
             light.emitter, light.parameters, light.version = emitter, self.parameters, light.version + 1
         self._make_pictures()
 
-    def resize(self, size: int, aspect: float) -> None:
-        """Make pictures of about `size`² pixels, `aspect` times as wide as high."""
-        self.edge = size
-        self.size = max(1, round(size * aspect**0.5)), max(1, round(size / aspect**0.5))
-        self._restart()
+    def fit(self, width: int, height: int) -> None:
+        """Make pictures for a window of `width` × `height` pixels."""
+        size = _size(min(self.limit, (width * height) ** 0.5), width / height)
+        if size != self.size:
+            self.size = size
+            self._restart()
 
     def look(self, pose: camera.Pose) -> None:
         """Set the camera."""
@@ -119,17 +127,17 @@ class Session:
             self.aov = aov
         self._make_pictures()
 
-    def preview(self, divisor: int = 1) -> Frame:
+    def preview(self, divisor: float = 1) -> Frame:
         """Render fast: one sample per pixel, few lights for an environment, no further bounces.
 
         The picture is 1/`divisor` as wide and high. Layers that are as in the last preview are not rendered again.
         """
         start = time.perf_counter()
         self._restart()
-        width, height = (max(1, n // divisor) for n in self.size)
+        width, height = (max(1, round(n / divisor)) for n in self.size)
         self._place((width, height))
         images = [self._image(p, 0, 1, True) for p in self._previews]
-        return Frame(images[0], time.perf_counter() - start, 1, images[1] if len(images) > 1 else None)
+        return Frame(images[0], time.perf_counter() - start, 1, _methods(self._previews), *images[1:])
 
     def refine(self, spp: int = 1) -> Frame:
         """Render a pass of `spp` samples per pixel by the scene's settings, and return the mean since the last change.
@@ -145,15 +153,15 @@ class Session:
             total += spp * image
         self._passes, self._samples = self._passes + 1, self._samples + spp
         means = [total / self._samples for total in self._sums]
-        return Frame(means[0], time.perf_counter() - start, self._samples, means[1] if len(means) > 1 else None)
+        return Frame(means[0], time.perf_counter() - start, self._samples, _methods(self._finals), *means[1:])
 
     @property
     def refined(self) -> bool:
         """True if a pass of :meth:`refine` has ended since the last change."""
         return self._passes > 0
 
-    def error(self) -> list[float]:
-        """Return the relative RMSE of each shown method against ``raymarch``.
+    def error(self) -> list[tuple[str, float]]:
+        """Return the name of each shown method, and its relative RMSE against ``raymarch``.
 
         All render the same samples, one per pixel, so that noise contributes little.
         """
@@ -162,7 +170,8 @@ class Session:
         self._place(self.size)
         pictures = [self._final(visibility="raymarch"), *self._by_methods(self._final)]
         truth, *images = [self._image(picture, 0, 1, False) for picture in pictures]
-        return [relative_rmse(image[..., :3], truth[..., :3]) for image in images]
+        errors = [relative_rmse(image[..., :3], truth[..., :3]) for image in images]
+        return list(zip(_methods(pictures[1:]), errors, strict=True))
 
     def _image(self, picture: Picture, seed: int, spp: int, keep: bool) -> np.ndarray:
         picture.stop = (lambda: False) if keep else self.stop
@@ -217,3 +226,12 @@ class Session:
     def _restart(self) -> None:
         """Begin the passes anew."""
         self._passes, self._samples, self._sums = 0, 0, []
+
+
+def _size(edge: float, aspect: float) -> tuple[int, int]:
+    """Return the width and height of a picture of about `edge`² pixels, `aspect` times as wide as high."""
+    return max(1, round(edge * aspect**0.5)), max(1, round(edge / aspect**0.5))
+
+
+def _methods(pictures: list[Picture]) -> tuple[str, ...]:
+    return tuple(picture.method for picture in pictures)

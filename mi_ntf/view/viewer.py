@@ -1,20 +1,29 @@
 """The loop of a view: changes from the browser, previews while they come, refinement when they end."""
 
+import math
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+
+from numpy.typing import ArrayLike
 
 from mi_ntf.core.errors import MiNtfError, sentence
 
+from . import labels
 from .display import Bytes, bytes_of, split
 from .picture import Interrupted
 from .session import Frame, Session
 
 REST = 0.25
 """Seconds from the last change to the first refinement."""
-SLOW, FAST = 0.2, 0.04
-"""Seconds of a preview above which the next ones get coarser, and below which they get finer."""
-COARSEST = 4
+SLOW, FAST = 0.2, 0.08
+"""Seconds of a preview above which the next ones get coarser, and below which they get finer.
+
+A finer one has twice the pixels, so that it is still no slow one.
+"""
+FINER = 2**0.5
+"""Ratio of successive divisors. There are few of them, since kernels are compiled for each size."""
+COARSEST = 8.0
 """Largest divisor of the picture's width and height."""
 PASS = 0.4
 """Seconds that a pass of several samples may take."""
@@ -23,16 +32,17 @@ PASS = 0.4
 class Viewer:
     """Turns changes of `session` into pictures, all in the thread that calls :meth:`run`.
 
-    show     ``(picture, status)`` displays a picture and a line of text
+    show     ``(picture, status)`` displays a picture and two lines of text
     tell     displays a line of text, an answer or an error
     samples  samples per pixel at which refinement ends
+    lights   returns names and positions of lights to which the picture points if they are off view
     """
 
     def __init__(self, session: Session, show: Callable[[Bytes, str], None], tell: Callable[[str], None],
-                 samples: int = 64) -> None:
-        self.session, self.show, self.tell, self.samples = session, show, tell, samples
+                 samples: int = 64, lights: Callable[[], Mapping[str, ArrayLike]] = dict) -> None:
+        self.session, self.show, self.tell, self.samples, self.lights = session, show, tell, samples, lights
         self.stops, self.split = 0.0, 0.5
-        self._divisors = {"camera": 2}
+        self._divisors = {"camera": 2.0, "light": 2.0}
         self._slow_previews = 0
         self._changes: dict[str, tuple[str, Callable[[], object]]] = {}
         self._lock, self._news, self._ended = threading.Lock(), threading.Event(), False
@@ -95,19 +105,20 @@ class Viewer:
                 self._display(self._frame)
             return
         kind = next((k for k in ("camera", "light") if k in kinds), "other")
-        divisor = self._divisors.get(kind, 1)
+        divisor = self._divisors.get(kind, 1.0)
         self._frame = self.session.preview(divisor)
         self._last_change = time.monotonic()
         self._display(self._frame)
         self._adapt(kind, divisor, self._frame.seconds)
 
-    def _adapt(self, kind: str, divisor: int, seconds: float) -> None:
+    def _adapt(self, kind: str, divisor: float, seconds: float) -> None:
         """Set the divisor of the next preview. A single slow preview may have compiled kernels."""
         self._slow_previews = self._slow_previews + 1 if seconds > SLOW else 0
-        if self._slow_previews > 1 and divisor < COARSEST:
-            self._divisors[kind], self._slow_previews = 2 * divisor, 0
-        elif seconds < FAST and divisor > 1:
-            self._divisors[kind] = divisor // 2
+        if self._slow_previews > 1:
+            steps = math.ceil(math.log(seconds / SLOW, FINER**2))  # the time goes with the number of pixels
+            self._divisors[kind], self._slow_previews = min(divisor * FINER**steps, COARSEST), 0
+        elif seconds < FAST:
+            self._divisors[kind] = max(divisor / FINER, 1.0)
 
     def _refine(self) -> None:
         done = self._frame.samples if self._frame and self.session.refined else 0
@@ -120,9 +131,12 @@ class Viewer:
 
     def _display(self, frame: Frame) -> None:
         picture = bytes_of(frame.image, self.session.aov, self.stops)
+        height, width = picture.shape[:2]
         if frame.right is not None:
             picture = split(picture, bytes_of(frame.right, self.session.aov, self.stops), self.split)
-        height, width = picture.shape[:2]
-        rate = f"{1e3 * frame.seconds:.0f} ms"
-        self.show(picture, f"{width}×{height}, {frame.samples} samples a pixel, {rate} "
-                           f"{'the last pass' if self.session.refined else 'a frame'}")
+        aspect = self.session.size[0] / self.session.size[1]
+        off_view = {name: place for name, position in self.lights().items()
+                    if (place := labels.direction(position, self.session.pose, aspect)) is not None}
+        picture = labels.labelled(picture, self.session.size, frame.methods, self.split, off_view)
+        self.show(picture, f"{width}×{height}, {frame.samples} sample{'s' if frame.samples > 1 else ''} a pixel, "
+                           f"{1e3 * frame.seconds:.0f} ms\n{' | '.join(frame.methods)}")

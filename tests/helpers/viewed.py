@@ -41,3 +41,4 @@ ENVIRONMENT = """<emitter type="envmap">
         <string name="filename" value="sky.exr"/>
         <transform name="to_world"><rotate x="1" angle="20"/></transform>
     </emitter>"""
+CONSTANT = '<emitter type="constant"><rgb name="radiance" value="0.5, 0.6, 0.8"/></emitter>'

@@ -1,4 +1,4 @@
-"""`mi-ntf view` in a headless browser: a light is dragged, the picture changes, no other server is contacted."""
+"""`mi-ntf view` in a headless browser, one program and one browser for all tests."""
 
 import io
 import re
@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-from helpers.viewed import POINT
+from helpers.viewed import POINT, SCENE
 from PIL import Image
 
 from mi_ntf.view.session import Session
@@ -22,10 +22,11 @@ FLAGS = ["--no-sandbox", "--disable-quic", "--no-first-run", "--disable-backgrou
 IN_VIEW = POINT.replace('x="3.4" y="3" z="2.5"', 'x="0.9" y="0.5" z="1.8"').replace("60, 50, 40", "6, 5, 4")
 
 
-@pytest.fixture
-def served(scene):
+@pytest.fixture(scope="module")
+def served(folder):
     """Address of the running program, and its scene file."""
-    path = scene(IN_VIEW, name="served.xml")
+    path = folder / "served.xml"
+    path.write_text(SCENE.format(lights=IN_VIEW))
     command = [sys.executable, "-m", "mi_ntf", "view", str(path), "--size", "48", "--samples", "4", "--port", "8090"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as program:
         lines = iter(program.stdout.readline, "")
@@ -36,8 +37,8 @@ def served(scene):
             program.terminate()
 
 
-@pytest.fixture
-def page():
+@pytest.fixture(scope="module")
+def browser():
     if CHROMIUM is None:
         pytest.skip("no chromium is installed (Debian: apt-get install chromium)")
     playwright = pytest.importorskip("playwright.sync_api")
@@ -46,8 +47,20 @@ def page():
             browser = p.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         except playwright.Error as error:
             pytest.skip(f"chromium does not start: {str(error).splitlines()[0]}")
-        yield browser.new_page(viewport={"width": 760, "height": 480})
+        yield browser
         browser.close()
+
+
+@pytest.fixture
+def page(browser):
+    page = browser.new_page(viewport={"width": 760, "height": 480})
+    page.set_default_timeout(60_000)
+    yield page
+    page.close()
+
+
+def button(page, name):
+    return page.get_by_role("button", name=name)
 
 
 def on_screen(canvas, pose, point):
@@ -60,8 +73,9 @@ def on_screen(canvas, pose, point):
 
 def rested(page):
     """Return the picture on the page after all its samples."""
-    page.get_by_text(re.compile("4 samples a pixel")).wait_for(timeout=60_000)
-    time.sleep(0.5)  # until it is painted
+    page.get_by_text("4 samples a pixel").wait_for()
+    time.sleep(1.5)  # until it is painted, and the window's size was asked for once more
+    page.get_by_text("4 samples a pixel").wait_for()
     return np.array(Image.open(io.BytesIO(page.locator("canvas").first.screenshot())).convert("RGB"))
 
 
@@ -93,7 +107,61 @@ def test_a_light_is_dragged(page, served, tmp_path):
     assert hosts == {urlsplit(address).netloc}
     assert faults == []
 
-    page.get_by_role("button", name="Save XML").click()
-    page.get_by_text(re.compile("Saved .*served_view.xml")).wait_for(timeout=30_000)
+    button(page, "Save XML").click()
+    page.get_by_text(re.compile("Saved .*served_view.xml")).wait_for()
     moved = Session(path.with_name("served_view.xml"), {}, 32).lights[0].position
     assert moved[0] < 0.8 and moved[1:] == pytest.approx(light[1:], abs=1e-3)  # along the arrow that was drawn at
+
+
+def test_the_scenes_camera_is_one_click_away_and_is_what_is_saved(page, served):
+    address, path = served
+    page.goto(address)
+    before = rested(page)
+    button(page, "See all lights").click()
+    page.get_by_text("1 sample a pixel").wait_for()
+    away = rested(page)
+
+    def saved():
+        out = path.with_name("served_view.xml")
+        out.unlink(missing_ok=True)
+        button(page, "Save XML").click()
+        for _ in range(600):
+            if out.is_file():
+                return Session(out, {}, 32).pose
+            time.sleep(0.1)
+        raise TimeoutError
+
+    own = Session(path, {}, 32).pose
+    assert saved() == own
+    page.get_by_role("checkbox").check()
+    assert np.linalg.norm(np.subtract(saved().origin, own.origin)) > 1
+    page.get_by_role("checkbox").uncheck()
+    button(page, "Scene's camera").click()
+    page.get_by_text("1 sample a pixel").wait_for()
+    after = rested(page)
+    assert np.abs(before.astype(float) - away).mean() > 4 * np.abs(before.astype(float) - after).mean()
+
+
+def test_errors_have_names_and_are_announced_at_once(page, served):
+    page.goto(served[0])
+    rested(page)
+    place = button(page, "Save XML").bounding_box()
+    button(page, "Error against raymarch").click()
+    page.get_by_text("Measuring the error against raymarch …").wait_for()
+    page.get_by_text(re.compile(r"Relative RMSE against raymarch:\s+transmittance_map \d+\.\d\d %")).wait_for()
+    assert button(page, "Save XML").bounding_box() == place
+
+
+@pytest.mark.parametrize(("width", "height"), [(390, 800), (1400, 800)])
+def test_a_page_opens_with_a_picture_of_its_windows_shape(browser, served, width, height):
+    for _ in range(2):
+        page = browser.new_page(viewport={"width": width, "height": height})
+        page.goto(served[0])
+        rested(page)
+        text = page.get_by_text("4 samples a pixel").inner_text(timeout=60_000)
+        shown, canvas = re.search(r"(\d+)×(\d+)", text), page.locator("canvas").first.bounding_box()
+        panel = page.get_by_text("mi-ntf: served.xml").bounding_box()
+        page.close()
+        assert int(shown[1]) / int(shown[2]) == pytest.approx(canvas["width"] / canvas["height"], rel=0.06)
+    # A narrow window's panel covers at most a third of it, and the picture lies behind.
+    assert panel["y"] > 2 * height / 3 if width == 390 else canvas["width"] + 300 < width

@@ -4,6 +4,7 @@ import urllib.error
 import urllib.request
 from urllib.parse import urlsplit
 
+import numpy as np
 import pytest
 import viser
 from websockets.exceptions import InvalidStatus
@@ -66,6 +67,22 @@ def test_other_servers_of_the_process_are_left_alone(address):
         assert b"</html>" in urllib.request.urlopen(f"http://127.0.0.1:{server.get_port()}/").read()
     finally:
         server.stop()
+
+
+def test_no_address_without_the_token_is_printed(capsys):
+    server, _ = page_server.serve("quiet", port=8190)
+    printed = capsys.readouterr().out
+    server.stop()
+    assert printed == ""
+
+
+@pytest.mark.parametrize(("aspect", "shape"), [(2.0, (40, 80)), (0.5, (120, 60)), (1.5, (40, 60)), (1.46, (40, 60))])
+def test_a_picture_of_another_shape_gets_margins(aspect, shape):
+    """Deviations by the rounding of a small picture's width and height are left."""
+    framed = page_server.framed(np.full((40, 60, 3), 200, np.uint8), aspect)
+    assert framed.shape == (*shape, 3)
+    assert framed.sum() == 40 * 60 * 3 * 200
+    assert (framed[shape[0] // 2, shape[1] // 2] == 200).all()
 
 
 def test_a_server_that_asks_nobody_is_not_left_running(monkeypatch):

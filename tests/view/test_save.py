@@ -6,10 +6,11 @@ from xml.etree import ElementTree as ET
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers.viewed import DIRECTIONAL, ENVIRONMENT, POINT, SECOND, SPOT
+from helpers.viewed import CONSTANT, DIRECTIONAL, ENVIRONMENT, POINT, SECOND, SPOT
 
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.evaluate.metrics import relative_rmse
+from mi_ntf.render.scene.environment_option import Environment
 from mi_ntf.view import environments
 from mi_ntf.view.controls import Controls
 from mi_ntf.view.save import save
@@ -43,7 +44,7 @@ def test_a_saved_scene_is_the_one_that_was_seen(scene, tmp_path):
     before = view.refine().image
     change(view)
     shown = view.refine().image
-    save(view, tmp_path / "new" / "saved.xml")
+    save(view, tmp_path / "new" / "saved.xml", camera=True)
     assert relative_rmse(before, shown) > 0.2
     assert relative_rmse(fresh(tmp_path / "new" / "saved.xml"), shown) < SAME
 
@@ -61,6 +62,48 @@ def test_only_what_was_changed_is_written_anew(scene, tmp_path):
     assert only_old == {("point", (("name", "position"), ("x", "-2.5"), ("y", "2"), ("z", "3")))}
     assert only_new == {("point", (("name", "position"), ("x", "1"), ("y", "2"), ("z", "3"))),
                         ("path", (("value", "."),))}
+
+
+def test_the_scenes_own_camera_is_saved_unless_the_present_one_is_asked_for(scene):
+    view = Session(scene(POINT), {}, 32)
+    own, out = fresh(view.path), view.path.with_name("saved.xml")
+    view.look(dataclasses.replace(view.pose, origin=(-2.0, 1.0, 5.0)))
+    present = view.refine().image
+    save(view, out)
+    assert relative_rmse(fresh(out), own) == 0
+    save(view, out, camera=True)
+    assert relative_rmse(fresh(out), present) < SAME < relative_rmse(own, present)
+
+
+@pytest.mark.parametrize("lines", [('<path value="."/>',), ('<path value="."/>', '<include filename="extra.xml"/>')])
+def test_the_folder_of_the_scene_is_searched_once(scene, lines):
+    path = scene(POINT, *lines)
+    path.with_name("extra.xml").write_text(f'<scene version="3.9.0"><path value="."/>{SECOND}</scene>')
+    out = path.with_name("saved.xml")
+    save(Session(path, {}, 32), out)
+    assert [p.get("value") for p in ET.parse(out).iter("path")] == ["."]
+
+
+@pytest.mark.parametrize(("lights", "option"), [
+    ((ENVIRONMENT,), {"rotate": 30.0, "scale": 2.0}), ((ENVIRONMENT,), {"file": "other.exr", "rotate": -40.0}),
+    ((POINT,), {"file": "other.exr", "scale": 0.5}), ((CONSTANT,), {"scale": 0.5}),
+    ((CONSTANT,), {"file": "other.exr", "rotate": 70.0})])
+def test_an_environment_of_the_command_line_is_seen_and_saved(scene, lights, option):
+    """Later changes in the view add to it."""
+    path = scene(*lights)
+    given = Environment(**option | ({"file": path.with_name(option["file"])} if "file" in option else {}))
+    view = Session(path, {}, 32, given)
+    light = next(light for light in view.lights if light.kind in ("envmap", "constant"))
+    shown, out = view.refine().image, path.with_name("saved.xml")
+    assert relative_rmse(fresh(path), shown) > 0.01
+    save(view, out)
+    assert relative_rmse(fresh(out), shown) < SAME
+    light.dim(3)
+    if light.can_turn:
+        light.turn(50)
+    changed = view.refine().image
+    save(view, out)
+    assert relative_rmse(fresh(out), changed) < SAME < relative_rmse(shown, changed)
 
 
 def test_names_of_the_scene_keep_their_use(scene):
@@ -124,8 +167,8 @@ def test_a_page_saves_beside_the_scene_alone(scene, tmp_path):
         folder = controls.session.path.parent
         for name in ("../out.xml", str(tmp_path / "out.xml"), "deep/out.xml", "blobs.safetensors", "out", ".", ""):
             with pytest.raises(MiNtfError, match=r"name is .*; scenes are saved beside the opened one: give a name"):
-                controls._save(name)
-        controls._save("out.xml")
+                controls._save(name, False)
+        controls._save("out.xml", False)
         assert (folder / "out.xml").is_file()
         assert not list(tmp_path.iterdir()) and not (folder.parent / "out.xml").exists()
     finally:

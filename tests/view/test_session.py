@@ -159,8 +159,23 @@ def test_methods_side_by_side_and_their_error(scene):
     assert relative_rmse(without, fresh(view.path, visibility="none")) < SAME
     truth = fresh(view.path, visibility="raymarch")
     expected = [relative_rmse(i[..., :3], truth[..., :3]) for i in (by_map, without)]
-    assert view.error() == pytest.approx(expected, rel=1e-3)
+    names, errors = zip(*view.error(), strict=True)
+    assert names == frame.methods == ("transmittance_map", "none")
+    assert errors == pytest.approx(expected, rel=1e-3)
     assert 0 < expected[0] < 0.1 < expected[1]
+
+
+def test_a_picture_names_the_method_that_auto_took(scene):
+    view = session(scene(POINT), visibility="auto")
+    assert view.preview().methods[0] in ("auto: transmittance_atlas", "auto: raymarch")
+
+
+@pytest.mark.parametrize(("window", "size"), [
+    ((1000, 1000), (32, 32)), ((400, 1600), (16, 64)), ((20, 20), (20, 20)), ((30, 10), (30, 10))])
+def test_pictures_have_the_shape_of_the_window_and_no_more_pixels(scene, window, size):
+    view = session(scene(POINT))
+    view.fit(*window)
+    assert view.preview().image.shape[1::-1] == size
 
 
 def test_other_outputs(scene):
