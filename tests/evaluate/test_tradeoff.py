@@ -141,7 +141,7 @@ def test_a_finished_study_is_not_rendered_again(folder, done, counted, capsys):
     before = result_of(done)
     after = study.tradeoff(folder / "many.xml", done, {}, 4.0)
     assert after["ways"] == before["ways"] and counted == []
-    assert "continues; " in capsys.readouterr().err
+    assert "goes on: " in capsys.readouterr().err
 
 
 def test_an_interrupted_study_renders_what_is_missing(folder, done, counted, tmp_path):
@@ -211,7 +211,7 @@ def test_an_interruption_leaves_the_report_and_130(folder, tmp_path, monkeypatch
     words = ["tradeoff", str(folder / "one.xml"), "-o", str(tmp_path), "--budget", "3s", "-D", "res=16"]
     assert cli.main(words) == 130
     said = capsys.readouterr().err
-    ended = re.search(r"mi-ntf: interrupted; (\d+) ways are finished; the same command continues the study", said)
+    ended = re.search(r"mi-ntf: stopped; (\d+) ways are finished, and the same command goes on$", said, re.M)
     assert ended and signal.getsignal(signal.SIGINT) is before
     result = result_of(tmp_path)
     assert len(result["ways"]) == int(ended[1]) > 0 and not result["finished"]
@@ -225,13 +225,13 @@ def test_an_interruption_leaves_the_report_and_130(folder, tmp_path, monkeypatch
     after = result_of(tmp_path)
     errors = [[[p["error"] for p in row["points"]] for row in found["ways"]] for found in (result, after)]
     assert errors[1][: len(errors[0])] == errors[0] and after["finished"]
-    assert f"continues; {ended[1]} ways are finished" in capsys.readouterr().err
+    assert f"goes on: {ended[1]} ways are finished" in capsys.readouterr().err
 
 
 def test_an_interruption_before_the_reference_leaves_no_report(folder, tmp_path, monkeypatch, capsys):
     interrupting(monkeypatch, "raymarch")
     assert cli.main(["tradeoff", str(folder / "one.xml"), "-o", str(tmp_path), "--budget", "2s"]) == 130
-    assert "mi-ntf: interrupted; 0 ways are finished" in capsys.readouterr().err
+    assert "mi-ntf: stopped; 0 ways are finished" in capsys.readouterr().err
     assert not (tmp_path / "index.html").exists()
 
 
@@ -246,7 +246,7 @@ def test_a_signal_to_the_program_ends_it(folder, tmp_path):
                 time.sleep(1)
                 program.send_signal(signal.SIGINT)
         assert program.wait(60) == 130
-    assert "the same command continues the study" in said[-1], said
+    assert re.fullmatch(r"mi-ntf: stopped; \d+ ways are finished, and the same command goes on\n", said[-1]), said
     rows = result_of(tmp_path)["ways"]
     assert rows[0]["method"] == "raymarch" and not any(row["reason"] for row in rows)
 

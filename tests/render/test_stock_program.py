@@ -100,8 +100,8 @@ def test_it_says_what_it_does(folder, tmp_path):
     done = run_program("mitsuba", "-m", "llvm_ad_rgb", "-D", "visibility=auto", "-o", tmp_path / "a.exr", path,
                        cwd=tmp_path)
     text = done.stdout + done.stderr
-    lines = [r"nrf medium: baked .*blobs.safetensors, \d+³ voxels \([\d.]+ s\)",
-             r"nrf medium: loaded .*blobs.safetensors \([\d.]+ s\)",
+    lines = [r"nrf medium: baking .*blobs.safetensors, \d+³ voxels \([\d.]+ s\)",
+             r"nrf medium: reading .*blobs.safetensors \([\d.]+ s\)",
              r"nrf integrator: auto takes visibility=raymarch: camera rays times lights are 3.1 thousand, no more than",
              r"nrf integrator: done, \d+ × \d+ pixels with \d+ samples each \([\d.]+ s\)", r"Developing"]
     places = [re.search(line, text) for line in lines]

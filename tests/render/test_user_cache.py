@@ -2,8 +2,10 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
+import time
 
 import mitsuba as mi
 import numpy as np
@@ -12,7 +14,7 @@ from helpers import fields, scenes
 from helpers.variants import VARIANT
 
 from mi_ntf import cli
-from mi_ntf.core import field_file
+from mi_ntf.core import field_file, progress
 from mi_ntf.infer import bake, bricks
 from mi_ntf.render import log, user_cache
 from mi_ntf.render.scene import loaded
@@ -192,21 +194,30 @@ def test_bricks_of_wrong_arrays():
 # --- what is said -----------------------------------------------------------------------------------------------------
 
 
-def test_progress(monkeypatch):
-    """A line every INTERVAL seconds, with the time left; none of short work."""
-    clock, lines = [0.0], []
-    monkeypatch.setattr(log.time, "perf_counter", lambda: clock[0])
-    monkeypatch.setattr(log, "info", lines.append)
-    progress = log.Progress("work")
-    for k in range(101):
-        clock[0] = 0.1 * k
-        progress(k / 100)
-    assert lines == ["work: 30%, about 7 s left", "work: 60%, about 4 s left", "work: 90%, about 1 s left"]
-    lines.clear()
-    clock[0], progress = 0.0, log.Progress("long work")
-    clock[0] = 3600.0
-    progress(0.1)
-    assert lines == ["long work: 10%, about 9.0 h left"]
+def test_work_is_part_of_a_commands_progress_or_logged_at_level_info(monkeypatch, capsys):
+    shown, logged = [], []
+    monkeypatch.setattr(log, "info", logged.append)
+    monkeypatch.setattr(log, "INTERVAL", 0.1)
+
+    def work():
+        with log.Work("nrf medium", "baking a.safetensors") as stage:
+            for done in (0.25, 0.5, 0.75):
+                stage.update(done)
+                time.sleep(0.15)
+
+    work()  # in a script
+    with progress.Stage("reading scene.xml", write=shown.append, interval=0.1):
+        work()
+    assert "reading scene.xml · baking a.safetensors: 50%, 0 s left" in shown and logged == []
+    level = mi.log_level()
+    mi.set_log_level(mi.LogLevel.Info)
+    try:
+        work()
+    finally:
+        mi.set_log_level(level)
+    assert "nrf medium: baking a.safetensors: 25%" in logged
+    assert re.fullmatch(r"nrf medium: baking a.safetensors \(0\.\d+ s\)", logged[-1])
+    assert capsys.readouterr() == ("", "")
 
 
 def test_a_bake_tells_its_progress():
