@@ -20,7 +20,7 @@ import numpy as np
 
 from mi_ntf.core.errors import MiNtfError, shown
 from mi_ntf.data import file_names
-from mi_ntf.data.file_names import is_file_name, locate, mask_places, photographs, plain
+from mi_ntf.data.file_names import is_file_name, locate, mask_places, moved, photographs, plain
 from mi_ntf.data.schema import Camera, DataSet, View, drop_missing
 
 FORM = "COLMAP model"
@@ -90,16 +90,17 @@ def read(folder: Path) -> DataSet:
             raise MiNtfError(f"{where}: there is no camera {image.camera}; export the model again with `colmap "
                              "model_converter`")
         camera = cameras[image.camera]
-        name = plain(image.name)
-        views.append(View(where, locate(root / "images", image.name), name, mask_places(root / "masks", name),
-                          _opengl(image), _opencv(camera, f"{model}, camera {image.camera}"),
-                          (camera.width, camera.height)))
+        name = moved(root / "images", image.name)
+        within = not plain(name).startswith("images/") or (root / "images" / name).is_file()
+        photograph, name = locate(root / "images" if within else root, name), plain(name)
+        views.append(View(where, photograph, name, mask_places(root / "masks", name), _opengl(image),
+                          _opencv(camera, f"{model}, camera {image.camera}"), (camera.width, camera.height)))
     if not views:
         raise MiNtfError(f"{model}: the model has no posed photograph; run `colmap mapper` again")
     splits, notes = drop_missing({"train": views})
     stored, posed = len(photographs((root / "images").rglob("*"))), len(splits["train"])
-    if stored > posed:
-        notes.append(f"{stored - posed} of {stored} photographs in {root / 'images'} have no pose and are left out")
+    notes += [f"{stored - posed} of {stored} photographs in {root / 'images'} have no pose and are left out"
+              ] * (stored > posed)
     return DataSet(FORM, splits, None, points, notes, assumed)
 
 
@@ -161,7 +162,8 @@ def _whole(path: Path, reader: "Callable[[str], T] | Callable[[bytes], T]", assu
             assumed += [note] if note else []
         return reader(content)
     except (OSError, ValueError, struct.error) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
+        short = isinstance(error, struct.error)
+        reason = error.strerror if isinstance(error, OSError) else "it ends too early" if short else error
         raise MiNtfError(f"{path}: cannot be read as part of a COLMAP model ({shown(str(reason))}); it needs cameras, "
                          "images and points3D, all .bin or all .txt: export it again with `colmap model_converter`"
                          ) from None
@@ -179,7 +181,7 @@ def _image(name: str, camera: int, pose: tuple[float, ...]) -> StoredImage:
     if not is_file_name(name):
         raise ValueError(f"an image's name is {shown(name)}")
     if not all(abs(v) < 1e30 for v in pose) or not 1e-12 < math.hypot(*pose[:4]):
-        raise ValueError(f"the pose of image {shown(name)} is {pose}")
+        raise ValueError(f"the pose of image {shown(name)} is {[round(v, 4) for v in pose]}")
     return StoredImage(name, camera, pose[:4], pose[4:])
 
 

@@ -25,6 +25,14 @@ class Header(NamedTuple):
     has_alpha: bool
 
 
+def open_image(path: Path, formats: tuple[str, ...] | None = None) -> "Image.Image":
+    """Open an image with Pillow, whatever its size: its limit is meant for files of strangers. Raises its errors."""
+    from PIL import Image
+
+    Image.MAX_IMAGE_PIXELS = None
+    return Image.open(path, formats=formats)
+
+
 def turned(pixels: np.ndarray, orientation: int) -> np.ndarray:
     """Return a view of `pixels` (H, W, ...) as stored, turned by the Exif `orientation`."""
     if orientation > 4:
@@ -36,10 +44,8 @@ def turned(pixels: np.ndarray, orientation: int) -> np.ndarray:
 
 def read_header(path: Path) -> Header | None:
     """Return the header of the file, or None if Pillow cannot read it."""
-    from PIL import Image
-
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             tags = getattr(image, "tag_v2", {}) if image.format == "TIFF" else {}
             size = (tags[WIDTH], tags[LENGTH]) if tags else image.size
             return Header(_orientation(image), size, "A" in image.getbands() or "transparency" in image.info)

@@ -135,9 +135,7 @@ def _read_exr(path: Path) -> Decoded:
 
 def _read_srgb(path: Path) -> Decoded:
     """Read an 8-bit image as it is stored, not turned by its Exif orientation."""
-    from PIL import Image
-
-    with Image.open(path) as image:
+    with exif.open_image(path) as image:
         exif.check_stored(image, path)
         if image.mode not in ("L", "LA", "P", "RGB", "RGBA"):
             raise MiNtfError(f"{path}: image of mode '{image.mode}'; write it with 8 bits a channel, or as EXR or TIFF")
@@ -152,12 +150,12 @@ def _read_tiff(path: Path) -> Decoded:
 
     Pillow would cut 16 bits to 8, and OpenCV multiplies 8 bits by alpha, so each depth has its own library.
     """
-    from PIL import Image, UnidentifiedImageError
+    from PIL import UnidentifiedImageError
 
     bits: tuple[int, ...] = ()
     premultiplied, profile = False, None
     try:
-        with Image.open(path, formats=("TIFF",)) as image:
+        with exif.open_image(path, ("TIFF",)) as image:
             tags = getattr(image, "tag_v2", {})
             bits, premultiplied = tags.get(258, (1,)), 1 in tags.get(338, ())  # BitsPerSample, ExtraSamples
             profile = image.info.get("icc_profile")
@@ -177,7 +175,8 @@ def _read_tiff(path: Path) -> Decoded:
                          "bits or floating-point numbers a channel")
     stored = stored.astype(np.float32) / np.float32(65535 if whole else 1)
     rgb = stored[..., [2, 1, 0]] if stored.shape[2] > 1 else np.repeat(stored, 3, -1)
-    return Decoded(rgb, stored[..., 3] if stored.shape[2] == 4 else None, whole and not premultiplied)
+    assumed = ("a TIFF file of 16 bits without a colour profile holds linear light",) if whole and not profile else ()
+    return Decoded(rgb, stored[..., 3] if stored.shape[2] == 4 else None, whole and not premultiplied, assumed)
 
 
 def opencv(purpose: str) -> ModuleType:

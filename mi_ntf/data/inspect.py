@@ -126,7 +126,7 @@ def _thumbnails(folder: Path, views: dict[Path, View], splits: Splits, rows: lis
     for k in np.unique(np.linspace(0, len(rows) - 1, min(THUMBNAILS, len(rows))).round().astype(int)):
         name, split, i = places[k]
         view = views.get(folder / name, views.get(Path(name)))
-        yield (f"{k}: {name} ({split}), covers {percent(rows[k].coverage)}",
+        yield (f"{k}: {name} ({split}), covers {percent(rows[k].coverage)}".replace(" %", "\u00a0%"),
                inspect_figures.thumbnail(splits[split], i, view, white))
 
 

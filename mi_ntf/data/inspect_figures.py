@@ -152,7 +152,7 @@ def _whole(view: View, pinhole: Camera, width: int, height: int) -> np.ndarray |
     if view.image.suffix.lower() not in SRGB_SUFFIXES:
         return None
     bent = view.camera if isinstance(view.camera, Camera) and any(view.camera.distortion) else None
-    with Image.open(view.image) as image:
+    with exif.open_image(view.image) as image:
         size = image.size
         turned = view.upright and view.orientation > 4
         quarter = width != height and ((size[0] > size[1]) != turned) != (width > height)  # `photographs.load` did

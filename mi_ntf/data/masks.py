@@ -42,10 +42,8 @@ RIM = 0.02  # width of the border from which the room's brightness is measured
 
 def read(path: Path) -> tuple[np.ndarray, str | None]:
     """Return the 8-bit alpha (H, W) of the mask in `path`, and an assumption or None. Raises MiNtfError."""
-    from PIL import Image
-
     try:
-        with Image.open(path) as image:
+        with exif.open_image(path) as image:
             exif.check_stored(image, path)
             return _decode(image, path)
     except MiNtfError:

@@ -1,7 +1,7 @@
 """HTML pages for reports. A page contains everything that it shows: it needs no network and no other file.
 
-Every text is escaped. Arrays are (H, W, 3) RGB, linear light as floats or sRGB levels as uint8. Pillow and matplotlib
-(extra `train`) are imported where they are needed.
+Every text is escaped; words between backticks are code. Arrays are (H, W, 3) RGB, linear light as floats or sRGB levels
+as uint8. Pillow and matplotlib (extra `train`) are imported where they are needed.
 """
 
 import base64
@@ -39,7 +39,7 @@ td, th { padding: .15em .8em .15em 0; text-align: left; border-bottom: 1px solid
 .row { display: flex; flex-wrap: wrap; gap: 10px; }
 figure { margin: 0 0 .5em; } figcaption { font-size: .85em; opacity: .8; overflow-wrap: anywhere; }
 img { display: block; max-width: 100%; height: auto; } img.small { image-rendering: pixelated; }
-summary { cursor: pointer; } .wide { overflow-x: auto; }
+summary { cursor: pointer; } code { overflow-wrap: anywhere; } .wide { overflow-x: auto; }
 pre { overflow-x: auto; background: #8882; padding: .5em; margin: .2em 0; } button { font: inherit; font-size: .85em; }
 """
 _COPY = """<script>
@@ -65,16 +65,16 @@ class Page:
 
     def text(self, text: str) -> None:
         """Add a paragraph."""
-        self._parts.append(f"<p>{escape(text)}</p>")
+        self._parts.append(f"<p>{prose(text)}</p>")
 
     def warning(self, text: str) -> None:
         """Add a paragraph that stands out."""
-        self._parts.append(f'<p class="warning">⚠ {escape(text)}</p>')
+        self._parts.append(f'<p class="warning">⚠ {prose(text)}</p>')
 
     def table(self, header: Sequence[object], rows: Iterable[Sequence[object]], folded: str = "") -> None:
         """Add a table, one text or number a cell. The text `folded`, if any, hides it until it is clicked."""
-        lines = ["".join(f"<th>{escape(str(cell))}</th>" for cell in header)]
-        lines += ["".join(f"<td>{escape(str(cell))}</td>" for cell in row) for row in rows]
+        lines = ["".join(f"<th>{prose(str(cell))}</th>" for cell in header)]
+        lines += ["".join(f"<td>{prose(str(cell))}</td>" for cell in row) for row in rows]
         table = "<table>" + "".join(f"<tr>{line}</tr>\n" for line in lines) + "</table>"
         self.scrolling(f"<details><summary>{escape(folded)}</summary>{table}</details>" if folded else table, "table")
 
@@ -159,6 +159,11 @@ class Page:
         caption = escape(caption)
         self._parts.append(f'<figure{frame}><img src="{uri}" alt="{caption}"{attributes}>'
                            f"<figcaption>{caption}</figcaption></figure>")
+
+
+def prose(text: str) -> str:
+    """Return the HTML of a text, in which words between backticks are code."""
+    return re.sub("`([^`]+)`", r"<code>\1</code>", escape(text))
 
 
 def new_figure(width: float, height: float) -> "Figure":

@@ -191,6 +191,11 @@ def find_form(folder: Path) -> tuple[Form, list[str]]:
         if near:
             others = f"{' and '.join(near[:5])} {'holds' if len(near) == 1 else 'hold'} one"
             raise MiNtfError(f"{folder}: no data set is here, but {others}; name that folder")
+        count = len(file_names.photographs([*folder.iterdir(), *folder.glob("images/*")]))
+        if count:
+            raise MiNtfError(f"{folder}: {count} photographs are here, but no camera poses; put them into "
+                             f"{folder}/images and run `colmap automatic_reconstructor --workspace_path {folder} "
+                             f"--image_path {folder}/images --dense 0`")
         raise MiNtfError(f"{folder}: no data set is here: neither transforms_train.json (capture, NeRF-synthetic, "
                          "NRHints) nor transforms.json (nerfstudio) nor a COLMAP model (cameras and images, .bin or "
                          ".txt, in sparse/0, sparse or the folder itself) nor poses_bounds.npy (LLFF); "

@@ -53,6 +53,16 @@ def in_a_folder(folder: Path) -> None:
     change("images.txt", lambda raw: raw.replace(b"003.png", b"ring\\003.png"))(folder)
 
 
+def with_absolute_names(folder: Path) -> None:
+    """Name the photographs by their places on another machine."""
+    change("images.txt", lambda raw: re.sub(rb"(\d+.png)", rb"/home/somebody/set/images/\1", raw))(folder)
+
+
+def with_the_folder(folder: Path) -> None:
+    """Name the photographs from the folder above `images`."""
+    change("images.txt", lambda raw: re.sub(rb"(\d+.png)", rb"images/\1", raw))(folder)
+
+
 def with_other_extensions(folder: Path) -> None:
     """Rename files: the model says .JPG, masks are called after that, and photographs are .PNG."""
     for path in (folder / "masks").iterdir():
@@ -69,10 +79,10 @@ def with_other_extensions(folder: Path) -> None:
     lambda f: encoded(f, "utf-8-sig"), lambda f: encoded(f, "utf-16"), lambda f: encoded(f, "utf-16-le"),
     change("images.txt", lambda raw: raw.replace(b"\n", b"\r\n")),
     lambda f: (f / "sparse/0/points3D.txt").unlink(),
-    with_other_extensions, in_a_folder,
+    with_other_extensions, in_a_folder, with_absolute_names, with_the_folder,
 ], ids=["no lines of points", "empty lines", "points", "many points", "both", "two spaces", "a space", "UTF-8",
         "Latin-1", "byte-order mark", "UTF-16", "UTF-16 without a mark", "Windows line ends", "no points3D",
-        "another extension", "Windows separators"])
+        "another extension", "Windows separators", "absolute names", "names with images/"])
 def test_every_photograph_is_read(tmp_path, edit):
     edit(forms.colmap(tmp_path))
     splits, messages = load(tmp_path)

@@ -56,6 +56,8 @@ def test_tiff_of_more_than_8_bits_is_linear(tmp_path, dtype, one):
             ("b.TIFF", bgra[..., :3], np.concatenate([values[..., 2::-1], np.ones((3, 5, 1))], -1)),
             ("c.tif", bgra[..., 0], np.concatenate([np.repeat(values[..., :1], 3, -1), np.ones((3, 5, 1))], -1))):
         assert cv2.imwrite(str(tmp_path / name), stored)
+        assert images.decode(tmp_path / name).assumed == (
+            ("a TIFF file of 16 bits without a colour profile holds linear light",) if dtype == np.uint16 else ())
         np.testing.assert_allclose(images.read_image(tmp_path / name), expected, rtol=1e-6, atol=1e-7)  # float32
 
 
@@ -138,3 +140,12 @@ def test_photographs_of_telephones_and_raw_files_say_what_to_do(tmp_path, suffix
     (tmp_path / f"a{suffix}").write_bytes(b"\0\0\0\x18ftypheic" + bytes(99))
     with pytest.raises(MiNtfError, match=rf"a{suffix}: images of type '{suffix}' are not read; convert it to .exr, "):
         images.decode(tmp_path / f"a{suffix}")
+
+
+def test_photographs_of_200_megapixels(tmp_path, recwarn):
+    """Telephones take such; Pillow refuses them by default, and warns of half as many."""
+    Image.new("1", (20000, 10000)).save(tmp_path / "a.png", compress_level=1)
+    assert images.size_of(tmp_path / "a.png") == (20000, 10000)
+    with pytest.raises(MiNtfError, match=r"a.png: image of mode '1'; write it"):  # its pixels would fill a gigabyte
+        images.decode(tmp_path / "a.png")
+    assert not recwarn.list

@@ -53,6 +53,14 @@ def test_every_text_is_escaped():
     assert html.count("&lt;b&gt;&amp;&quot;x&quot;") == 12  # title twice, each picture's caption twice
 
 
+def test_words_between_backticks_are_code():
+    page = Page("title")
+    for add in (page.text, page.warning, lambda text: page.table(["`head`"], [[text]])):
+        add("run `colmap a < b` and `that`, not ` this")
+    assert page.html().count("run <code>colmap a &lt; b</code> and <code>that</code>, not ` this") == 3
+    assert "<th><code>head</code></th>" in page.html()
+
+
 def test_pictures_come_out_as_they_went_in():
     rng = np.random.default_rng(0)
     levels = rng.integers(0, 256, (10, 12, 3), np.uint8)

@@ -148,6 +148,12 @@ def _cut(folder: Path) -> None:
     (folder / "sparse/0/points3D.txt").write_text("1 0.5\n")
 
 
+def _no_pose(folder: Path) -> None:
+    path = folder / "sparse/0/images.txt"
+    first, rest = path.read_text().split("\n", 1)
+    path.write_text(" ".join([first.split()[0], *7 * ["nan"], *first.split()[8:]]) + "\n" + rest)
+
+
 def _shrink(folder: Path) -> None:
     for kind in ("images", "masks"):
         Image.new("RGB", (12, 12)).save(folder / kind / "003.png")
@@ -156,6 +162,7 @@ def _shrink(folder: Path) -> None:
 @pytest.mark.parametrize(("model", "change", "text"), [
     ("OPENCV_FISHEYE", lambda f: None, r"camera 1: its model OPENCV_FISHEYE is not read .*`colmap image_undistorter` "
      r"and .* \(read as COLMAP model\)$"),
+    ("PINHOLE", _no_pose, r"images.txt: cannot be read .*the pose of image '015.png' is \[nan, nan, nan, "),
     ("PINHOLE", _cut, r"points3D.txt: cannot be read .*has 2 words.*`colmap model_converter`"),
     ("PINHOLE", lambda f: (f / "images").rename(f / "photos"), "images does not exist; put the photographs of"),
     ("PINHOLE", lambda f: [p.unlink() for p in sorted((f / "images").iterdir())[2:12]],
@@ -325,3 +332,12 @@ def test_the_folder_that_was_meant_is_named(tmp_path):
             load(given)
     with pytest.raises(MiNtfError, match=rf"transforms.json is a file; name the folder that it is in, {folder}"):
         load(folder / "transforms.json")
+
+
+@pytest.mark.parametrize("place", [".", "images"])
+def test_photographs_without_poses_say_how_to_find_them(tmp_path, place):
+    (tmp_path / place).mkdir(exist_ok=True)
+    for number in range(3):
+        (tmp_path / place / f"IMG_{number}.JPG").touch()
+    with pytest.raises(MiNtfError, match=rf"{tmp_path}: 3 photographs are here, but no camera poses; .* `colmap auto"):
+        load(tmp_path)

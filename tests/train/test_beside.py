@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import re
-from html import escape
 
 import numpy as np
 import pytest
@@ -13,6 +12,7 @@ torch = pytest.importorskip("torch", reason="training needs PyTorch: pip install
 from train import two_spheres  # noqa: E402
 
 from mi_ntf.core import field_file  # noqa: E402
+from mi_ntf.data.page import prose  # noqa: E402
 from mi_ntf.train import config, fast, train, trainer  # noqa: E402
 
 OFFSET = (1.0, 1.4, 0.0)
@@ -100,7 +100,7 @@ def test_the_page_beside_the_field_tells_what_was_found(learned):
     text = (folder / "f.html").read_text()
     assert not re.search(r"""(src|href)=["']?https?:""", text)
     for note in report["notes"]:
-        assert escape(note.removeprefix("warning: ")) in text, note
+        assert prose(note.removeprefix("warning: ")) in text, note
     assert f"{report['test']['srgb']:.2f} dB" in text
     assert text.count("<img") == 3 * 5 + 8 + 3, "test views, lamp's places, curves of validation, loss and gains"
     header, _ = field_file.load(folder / "f")
