@@ -7,6 +7,7 @@ import types
 import typing
 from importlib.metadata import version
 from pathlib import Path
+from unittest.mock import ANY
 
 import pytest
 from helpers.programs import run_on_one_core, run_program
@@ -45,7 +46,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list:
              print_table=lambda values: print("table", values["psnr"]))
     stand_in("mi_ntf.core.field_file", describe=note(table), print_summary=lambda values: None)
     stand_in("mi_ntf.evaluate.tradeoff", study=types.SimpleNamespace(
-        tradeoff=note(table), print_table=lambda values: print("table", values["psnr"])))
+        tradeoff=note(table), print_table=lambda values, out: print("table", values["psnr"])))
     return calls
 
 
@@ -68,8 +69,8 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list:
             "train data -o f.safetensors --minutes 2.5",
             (Path("data"), Path("f.safetensors")),
             {"preset": "fast", "minutes": 2.5, "steps": None, "seed": 0, "tensorboard": None, "field": None,
-             "ntf": None, "augmentation": True, "colour_loss": True, "visibility_mlp": False,
-             "bounces": True, "fresnel": True, "gains": True, "estimate": False, "view": False,
+             "further": False, "began": ANY, "ntf": None, "augmentation": True, "colour_loss": True,
+             "visibility_mlp": False, "bounces": True, "fresnel": True, "gains": True, "estimate": False, "view": False,
              "reading": {"size": None, "masks": None, "background": None, "flash_offset": None}},
         ),
         (
@@ -77,24 +78,24 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list:
             "--no-fresnel --visibility-mlp",
             (Path("data"), Path("f.safetensors")),
             {"preset": "fast", "minutes": None, "steps": 9, "seed": 0, "tensorboard": None, "field": Path("g"),
-             "ntf": "ray", "augmentation": False, "colour_loss": False, "visibility_mlp": True,
-             "bounces": False, "fresnel": False, "gains": True, "estimate": False, "view": False,
+             "further": False, "began": ANY, "ntf": "ray", "augmentation": False, "colour_loss": False,
+             "visibility_mlp": True, "bounces": False, "fresnel": False, "gains": True, "estimate": False, "view": False,
              "reading": {"size": None, "masks": None, "background": None, "flash_offset": None}},
         ),
         (
             "train data -o f.safetensors --size 768 --background black --flash-offset estimate --no-gains",
             (Path("data"), Path("f.safetensors")),
             {"preset": "fast", "minutes": None, "steps": None, "seed": 0, "tensorboard": None, "field": None,
-             "ntf": None, "augmentation": True, "colour_loss": True, "visibility_mlp": False,
-             "bounces": True, "fresnel": True, "gains": False, "estimate": True, "view": False,
+             "further": False, "began": ANY, "ntf": None, "augmentation": True, "colour_loss": True,
+             "visibility_mlp": False, "bounces": True, "fresnel": True, "gains": False, "estimate": True, "view": False,
              "reading": {"size": 768, "masks": None, "background": "black", "flash_offset": None}},
         ),
         (
             "train data -o f.safetensors --masks m --flash-offset 0.1,0.2,-0.3",
             (Path("data"), Path("f.safetensors")),
             {"preset": "fast", "minutes": None, "steps": None, "seed": 0, "tensorboard": None, "field": None,
-             "ntf": None, "augmentation": True, "colour_loss": True, "visibility_mlp": False,
-             "bounces": True, "fresnel": True, "gains": True, "estimate": False, "view": False,
+             "further": False, "began": ANY, "ntf": None, "augmentation": True, "colour_loss": True,
+             "visibility_mlp": False, "bounces": True, "fresnel": True, "gains": True, "estimate": False, "view": False,
              "reading": {"size": None, "masks": Path("m"), "background": None, "flash_offset": (0.1, 0.2, -0.3)}},
         ),
         (
@@ -139,11 +140,11 @@ def test_json(calls: list, line: str, capsys: pytest.CaptureFixture[str]):
 
 def test_limits_of_compare_decide_the_exit_code(calls: list, capsys: pytest.CaptureFixture[str]):
     assert cli.main("compare a b --min-psnr 30.5".split()) == 0
-    assert capsys.readouterr() == ("table 30.5\n", "")
+    assert capsys.readouterr() == ("table 30.5\n", "comparing a\n")
     assert cli.main("compare a b --min-psnr 31 --max-flip 0.5".split()) == 1
     out, err = capsys.readouterr()
     assert out == "table 30.5\n"
-    assert err == ("mi-ntf: PSNR is 30.5 dB, less than --min-psnr 31 allows\n"
+    assert err == ("comparing a\nmi-ntf: PSNR is 30.5 dB, less than --min-psnr 31 allows\n"
                    "mi-ntf: HDR-FLIP was not measured, so --max-flip 0.5 cannot be judged: "
                    "it is not among the figures\n")
     assert cli.main("compare a b --min-psnr 31 --json".split()) == 1
@@ -161,6 +162,7 @@ def test_limits_of_compare_decide_the_exit_code(calls: list, capsys: pytest.Capt
         "train",
         "capture s.xml data --views many",
         "train data -o f.safetensors --minutes 1 --steps 5",
+        "train data -o f.safetensors --continue --overwrite",
         "train data -o f.safetensors --flash-offset 1,2",
         "train data -o f.safetensors --flash-offset up",
         "capture s.xml data --flash-offset estimate",
@@ -300,6 +302,37 @@ def test_failed_work_is_1_and_one_line(calls: list, monkeypatch, capsys, error: 
     monkeypatch.setenv("MI_NTF_DEBUG", "1")
     assert cli.main(["info", "f"]) == 1
     assert "Traceback" in capsys.readouterr().err
+
+
+def test_a_finished_field_is_trained_further_or_replaced_only_on_request(calls: list, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("f.safetensors").write_text("finished")
+    assert cli.main("train d -o f.safetensors".split()) == 1
+    assert capsys.readouterr().err == ("mi-ntf: error: f.safetensors exists; add --continue to train it further or "
+                                       "--overwrite to replace it, or choose another name\n")
+    assert calls == [] and Path("f.safetensors").read_text() == "finished"
+    assert cli.main("train d -o f.safetensors --overwrite".split()) == 0
+    assert cli.main("train d -o f.safetensors --continue".split()) == 0
+    assert [kwargs["further"] for _, kwargs in calls] == [False, True]
+
+
+@pytest.mark.parametrize(("manifest", "following"), [
+    (None, "mi-ntf info out/f.safetensors"),
+    ('{"scene": "m.xml"}', "mi-ntf swap m.xml out/f.safetensors -o nrf.xml"),
+    ('{"scene": "m.xml", "shapes": "not:floor"}', "mi-ntf swap m.xml out/f.safetensors -o nrf.xml --shapes not:floor"),
+])
+def test_training_ends_with_the_files_a_verdict_and_the_next_command(calls: list, tmp_path, monkeypatch, capsys,
+                                                                     manifest, following):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys.modules["mi_ntf.train"], "train",
+                        lambda *_, **__: {"verdict": "test views 31.2 dB: good"})
+    Path("d").mkdir()
+    if manifest:
+        Path("d/capture.json").write_text(manifest)
+    assert cli.main("train d -o out/f.safetensors".split()) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        "field: out/f.safetensors", "page: out/f.html (open it in a browser)", "test views 31.2 dB: good",
+        f"next: {following}"]
 
 
 def test_missing_extra_points_to_doctor(calls: list, monkeypatch, capsys):
