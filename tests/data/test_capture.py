@@ -9,6 +9,7 @@ import pytest
 from helpers.programs import run_on_one_core
 from helpers.variants import VARIANT
 
+from mi_ntf import cli
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.data import capture as cap
 from mi_ntf.data import capture_scene, schema
@@ -348,3 +349,13 @@ def test_shapes_with_a_sensor_are_not_photographed(tmp_path):
     meter = '<shape type="cube"><sensor type="irradiancemeter"><film type="hdrfilm"/></sensor></shape></scene>'
     (note,) = capture_scene.load(write(tmp_path, MESHES.replace("</scene>", meter))).notes
     assert note == "photographed: cube, rectangle; left out: cube (sensor)"
+
+
+@pytest.mark.parametrize("value", ["0.7", "0.2"])
+def test_values_of_names_reach_the_object(tmp_path, value):
+    default = '<integrator type="path"/> <default name="r" value="0.5"/>'
+    scene = write(tmp_path, SPHERE.replace('<integrator type="path"/>', default).replace('value="0.7"', 'value="$r"'))
+    words = ["--views", "1", "--test-views", "1", "--size", "8", "--spp", "1", "-D", f"r={value}", "-m", VARIANT]
+    assert cli.main(["capture", str(scene), str(tmp_path / "set"), *words]) == 0
+    described = json.loads((tmp_path / "set/transforms_train.json").read_text())
+    assert described["unit_sphere"]["radius"] == pytest.approx(cap.MARGIN * float(value), rel=0.01)
