@@ -1,5 +1,6 @@
 """`mi-ntf inspect`: a data set before training, as a page and as numbers."""
 
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -22,8 +23,8 @@ def inspect(folder: Path, out: Path | None = None, **options: Any) -> Numbers:
 
     The page `out` is DIR-inspect.html in the current folder by default. Options that are None are ignored. The keys of
     the result are "folder", "form", "said" (sentences of the reader), "assumed" (the assumptions among them),
-    "warnings", "page", "views" (one mapping for each photograph) and those of :func:`measures.numbers`. Raises
-    MiNtfError if the data set has a fault, or the page cannot be written.
+    "warnings", "page", "next" (the command that trains), "views" (one mapping for each photograph) and those of
+    :func:`measures.numbers`. Raises MiNtfError if the data set has a fault, or the page cannot be written.
     """
     folder = Path(folder)
     out = Path(f"{folder.resolve().name}-inspect.html") if out is None else Path(out)
@@ -41,6 +42,7 @@ def _inspect(folder: Path, out: Path, options: dict[str, Any]) -> Numbers:
     data = {"folder": str(folder), "form": form.name, "said": messages,
             "assumed": [text for text in messages if text.startswith(assumptions.PREFIX)], **numbers,
             "warnings": measures.warnings(numbers, rows), "page": str(out),
+            "next": _next(folder, splits["train"].located, options),
             "views": [{key: _plain(value) for key, value in row._asdict().items()} for row in rows]}
     with progress.Stage("writing the page", inner=True):
         _page(folder, form.read(folder), splits, rows, data).write(out)
@@ -49,10 +51,25 @@ def _inspect(folder: Path, out: Path, options: dict[str, Any]) -> Numbers:
 
 def print_table(data: Numbers) -> None:
     """Print the result of :func:`inspect` for a reader."""
-    table = summary(data)
+    table, count = summary(data), len(data["warnings"])
     width = max(len(key) for key, _ in table)
+    verdict = f"{count} warning{'s' * (count > 1)}: mend what is named there, or the field will show it"
     print(*data["said"], *(f"{key:<{width}}  {value}" for key, value in table),
-          *(f"warning: {text}" for text in data["warnings"]), data["page"], sep="\n")
+          *(f"warning: {text}" for text in data["warnings"]), f"page: {data['page']}",
+          f"verdict: {verdict if count else 'nothing here will harm the field'}", f"next: {data['next']}", sep="\n")
+
+
+def _next(folder: Path, located: bool, options: dict[str, Any]) -> str:
+    """Return the command that trains on the data set with the same options."""
+    flash = options.get("flash_offset")
+    words = ["mi-ntf", "train", str(folder), "-o", f"{folder.resolve().name}.safetensors"]
+    for key in ("size", "masks", "background"):
+        words += [f"--{key}", str(options[key])] if options.get(key) is not None else []
+    if flash is not None:
+        words.append(f"--flash-offset={','.join(f'{v:g}' for v in flash)}")
+    elif not located:
+        words += ["--flash-offset", "estimate"]
+    return shlex.join([*words, "--minutes", "10"])
 
 
 def summary(data: Numbers) -> list[tuple[str, str]]:

@@ -236,7 +236,24 @@ def test_every_form(tmp_path, monkeypatch, form, capsys):
     print_table(json.loads(json.dumps(numbers)))
     printed = capsys.readouterr().out
     assert "warning: 13 photographs" in printed or "warning: 14 photographs" in printed
-    assert printed.endswith("set-inspect.html\n")
+    assert printed.splitlines()[-3:] == [
+        "page: set-inspect.html", f"verdict: {len(numbers['warnings'])} warnings: mend what is named there, or the "
+        "field will show it", f"next: {numbers['next']}"]
+
+
+@pytest.mark.parametrize(("form", "options", "more"), [
+    (forms.capture, {}, ""),
+    (forms.blender, {}, "--flash-offset estimate "),
+    (forms.colmap, {"flash_offset": (-1, 1.5, 0), "size": 16}, "--size 16 --flash-offset=-1,1.5,0 "),
+    (forms.colmap, {"masks": "masks"}, "--masks '{folder}/masks' --flash-offset estimate "),
+], ids=["capture", "place of the flash not known", "options", "masks"])
+def test_the_next_command_has_the_same_options(tmp_path, form, options, more):
+    folder = form(tmp_path / "a set")
+    if "masks" in options:
+        options = {"masks": folder / "masks"}
+    numbers = inspect(folder, tmp_path / "page.html", **options)
+    assert numbers["next"] == (f"mi-ntf train '{folder}' -o 'a set.safetensors' " + more.format(folder=folder)
+                               + "--minutes 10")
 
 
 def test_a_page_that_cannot_be_written_is_told_before_the_work(tmp_path):
