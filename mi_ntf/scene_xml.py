@@ -72,6 +72,18 @@ def pattern(text: str) -> re.Pattern[str]:
     return re.compile(".*".join(map(re.escape, _PARAMETER.split(text)[::2])))
 
 
+def set_defaults(root: ET.Element, values: dict[str, str]) -> None:
+    """Make `values` the defaults of the $parameters with their names, above all else where there are none yet."""
+    for name, value in values.items():
+        defaults = [d for d in root.iter("default") if d.get("name") == name]
+        for default in defaults[1:]:
+            root.remove(default)
+        if defaults:
+            defaults[0].set("value", value)
+        else:
+            root.insert(0, ET.Element("default", name=name, value=value))
+
+
 class Includes:
     """Files that a scene file in `folder` includes, found as Mitsuba finds them.
 

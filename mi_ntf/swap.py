@@ -36,14 +36,14 @@ class Swapped:
         return f"replaced: {scene_shapes.listed(self.replaced)}; kept: {scene_shapes.listed(self.unchanged)}"
 
 
-def swap(scene: Path, field: Path, out: Path, shapes: str = "") -> Swapped:
+def swap(scene: Path, field: Path, out: Path, shapes: str = "", parameters: dict[str, str] | None = None) -> Swapped:
     """Write a copy of a scene in which a field replaces shapes.
 
     `shapes` chooses them as the option ``--shapes`` does: by names, by ``not:`` and names, or all ("" by default).
-    Shapes that emit light or hold a sensor stay. The field sits in one bounding ``sphere`` with a ``null`` BSDF, with
-    the centre and radius of the capture. The integrator becomes ``nrf`` with
-    ``<default name="visibility" value="auto"/>``. It keeps `hide_emitters`, the channels of ``aov`` that ``nrf`` has,
-    and `max_depth`, also where it was the old integrator's default.
+    Shapes that emit light or hold a sensor stay. `parameters` become the defaults of $names. The field sits in one
+    bounding ``sphere`` with a ``null`` BSDF, with the centre and radius of the capture. The integrator becomes ``nrf``
+    with ``<default name="visibility" value="auto"/>``. It keeps `hide_emitters`, the channels of ``aov`` that ``nrf``
+    has, and `max_depth`, also where it was the old integrator's default.
 
     Sensors, films, emitters, parameters and includes stay. An include that holds shapes or the integrator is inlined,
     with the defaults of ``$parameters`` in its name. BSDFs, textures and groups that nothing refers to any more are
@@ -56,6 +56,7 @@ def swap(scene: Path, field: Path, out: Path, shapes: str = "") -> Swapped:
     if out.resolve() == scene.resolve():
         raise MiNtfError(f"{out} is the mesh scene itself; choose another name for the scene with the field")
     root = scene_xml.parse(scene)
+    scene_xml.set_defaults(root, parameters or {})
     content = _Content(root, scene)
     sphere = _bounding_sphere(similarity, os.path.relpath(field, out.parent))
     replaced, unchanged = content.replace(shapes, sphere)

@@ -10,6 +10,7 @@ from tyro.conf import Positional
 from mi_ntf.commands import options
 from mi_ntf.commands.options import (
     Count,
+    Define,
     FieldFile,
     Flag,
     InScene,
@@ -41,14 +42,16 @@ class Swap:
     """Scene to write, .xml."""
     shapes: Shapes = ""
     """Shapes to replace, as cow,grass, or all but some, as not:floor. The default is all but lights."""
+    define: Define = ()
     overwrite: Overwrite = False
 
     def run(self) -> None:
         """Write the scene, and print what was replaced and what stays."""
+        parameters = options.definitions(self.define)
         files.check(self.output, (".xml",), self.overwrite)
         from mi_ntf.swap import swap
 
-        report = swap(self.scene, self.field_file, self.output, self.shapes)
+        report = swap(self.scene, self.field_file, self.output, self.shapes, parameters)
         for note in report.notes:
             print(f"mi-ntf: {note}", file=sys.stderr)
         print(report, f"scene: {self.output}", f"next: mitsuba -m llvm_ad_rgb {self.output}", sep="\n")

@@ -44,7 +44,7 @@ def save(session: Session, out: Path, environment: Path | None = None, camera: b
     scene_xml.Includes(session.path.parent, values).inline(
         root, session.path, lambda content: any(content.find(f".//{tag}") is not None for tag in CHANGED))
     scene_xml.move_paths(root, session.path.parent, out.parent, values)
-    _set_defaults(root, session.define)
+    scene_xml.set_defaults(root, session.define)
     if session.option:
         _write_option(root, session, values)
     for light in session.lights:
@@ -65,17 +65,6 @@ def save(session: Session, out: Path, environment: Path | None = None, camera: b
     ET.indent(root, "    ")
     files.make_folder(out.parent)
     files.write(out, ET.tostring(root, encoding="unicode") + "\n")
-
-
-def _set_defaults(root: ET.Element, define: dict[str, str]) -> None:
-    for name, value in define.items():
-        defaults = [d for d in root.iter("default") if d.get("name") == name]
-        for default in defaults[1:]:
-            root.remove(default)
-        if defaults:
-            defaults[0].set("value", value)
-        else:
-            root.insert(0, ET.Element("default", name=name, value=value))
 
 
 def _element(root: ET.Element, session: Session, light: Light, values: dict[str, str]) -> ET.Element:

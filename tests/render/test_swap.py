@@ -262,6 +262,16 @@ def test_capture_and_swap_give_shapes_the_same_names(folder):
     assert str(report) == f"replaced: {names}; kept: b (sphere), rectangle (area light)"
 
 
+def test_values_of_names_become_their_defaults(folder):
+    """Capture and swap see the same shapes with the same -D; the other default stays."""
+    (folder / "mesh.xml").write_text("""<scene version="3.9.0"> <default name="name" value="b"/>
+        <default name="spp" value="4"/> <shape type="cube"/> <shape type="sphere" id="$name"/></scene>""")
+    report = swap(folder / "mesh.xml", folder / "f.safetensors", folder / "scene.xml", "cube", {"name": "ball"})
+    assert str(report) == "replaced: cube; kept: ball (sphere)"
+    defaults = {d.get("name"): d.get("value") for d in ET.parse(folder / "scene.xml").getroot().iter("default")}
+    assert defaults == {"name": "ball", "spp": "4", "visibility": "auto"}
+
+
 def test_the_command_prints_what_is_replaced_and_what_comes_next(own, capsys):
     out = own / "scene.xml"
     assert cli.main(["swap", str(own / "mesh.xml"), str(own / "f.safetensors"), "-o", str(out), "--shapes",
