@@ -5,6 +5,7 @@ import socket
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from multiprocessing import resource_tracker
 
 from .errors import root
 
@@ -46,16 +47,18 @@ def noticed() -> Iterator[threading.Event]:
 
 
 @contextmanager
-def ignored() -> Iterator[None]:
-    """Make processes that start in the block ignore Ctrl-C: this process ends them, and they would print tracebacks."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+def kept_from_others() -> Iterator[None]:
+    """Keep Ctrl-C from processes that start in the block: this process ends them.
+
+    They would print tracebacks, or write the unfinished picture that Mitsuba returns. Ctrl-C in the block is noticed
+    at its end.
+    """
+    resource_tracker.ensure_running()  # otherwise the first process starts one, which lets Ctrl-C through again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _press(_number: int, _frame: object) -> None:

@@ -60,7 +60,7 @@ class Stage:
     warm
         Number of things at the beginning that compile kernels, so that their time says nothing on that of the others.
     inner
-        Show the stage within another one only.
+        Show the stage within another one only, unless it has `write`. The other one has the sentence after Ctrl-C.
     shown
         False: show nothing.
     write
@@ -86,7 +86,7 @@ class Stage:
                  ) -> None:
         _shown.end(self)
         if error is not None and interruption.caused(error):
-            if isinstance(error, KeyboardInterrupt) and str(error) and not self.then:
+            if isinstance(error, KeyboardInterrupt) and (self._inner or (str(error) and not self.then)):
                 return
             where = f"after {self.done:.0f} of {self.total} {self.title}" if self.total else f"while {self.title}"
             raise KeyboardInterrupt(f"stopped {where}; {self.then or 'nothing was written'}") from None
@@ -144,7 +144,7 @@ class _Shown:
 
     def begin(self, stage: Stage, inner: bool) -> None:
         with self._lock:
-            if self.silent or (inner and not self._stages):
+            if self.silent or (inner and not self._stages and not stage.write):
                 return
             self._stages.append(stage)
             stage.visible = True

@@ -49,7 +49,7 @@ class Dask:
         stack.enter_context(environment(variables))  # Dask sets them in this process, too, and never restores them
         # No limit of memory: Dask's limit is no measure of the memory that a picture needs for a moment.
         try:
-            with interruption.ignored():
+            with interruption.kept_from_others():
                 cluster = distributed.LocalCluster(
                     n_workers=workers.workers, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0",
                     memory_limit=0, env=variables)

@@ -66,7 +66,7 @@ class _Slot:
             context = multiprocessing.get_context("spawn")  # Dr.Jit's threads do not survive a fork
             self.pipe, theirs = context.Pipe()
             self._process = context.Process(target=serve, args=(theirs, self._setup, self._work), daemon=True)
-            with environment(self._setup.variables()), interruption.ignored():
+            with environment(self._setup.variables()), interruption.kept_from_others():
                 self._process.start()
             theirs.close()
         assert self.pipe is not None

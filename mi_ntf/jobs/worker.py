@@ -7,7 +7,6 @@ import importlib.util
 import os
 import pickle
 import platform
-import signal
 import threading
 import traceback
 from collections.abc import Callable, Iterator
@@ -100,7 +99,6 @@ def environment(variables: dict[str, str]) -> Iterator[None]:
 
 def serve(pipe: Connection, setup: Setup, work: bytes) -> None:
     """Be a worker of the engine ``local``: answer each (index, task) that comes through `pipe` until it is closed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that started this one, which ends it
     while True:
         try:
             index, task = pickle.loads(pipe.recv_bytes())

@@ -50,7 +50,7 @@ class Work(progress.Stage):
 
     def __init__(self, who: str, title: str, seconds: float = 0.0) -> None:
         self._logs = bool(mi.log_level() <= mi.LogLevel.Info)
-        super().__init__(title, seconds=seconds, inner=not self._logs, interval=INTERVAL,
+        super().__init__(title, seconds=seconds, inner=True, interval=INTERVAL,
                          write=(lambda text: info(f"{who}: {text}")) if self._logs else None)
         self.ended, self._who, self._waited = title, who, 0.0
 
