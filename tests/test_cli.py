@@ -274,6 +274,7 @@ def test_a_finished_file_is_replaced_only_on_request(line, tmp_path, monkeypatch
     ("inspect d", "matplotlib", "train"),
     ("view s.xml", "viser", "view"),
     ("export f.safetensors -o m.ply", "trimesh", "mesh"),
+    ("compare a.exr b.exr", "skimage", "eval"),
     ("compare a.exr b.exr -o c.png", "matplotlib", "eval"),
     ("tradeoff s.xml", "matplotlib", "eval"),
     ("sequence s.xml -o d --film f.mp4", "imageio_ffmpeg", "video"),

@@ -43,8 +43,7 @@ class Compare:
         """Print the metrics, and the exceeded limits to standard error."""
         if self.masked and not given(self.limits):
             raise UsageError("--masked says what limits judge; give one, as --max-relative-rmse 0.05")
-        if self.output is not None:
-            extras.need("eval", "a picture of the comparison", "matplotlib", "flip_evaluator")
+        extras.need("eval", "a comparison", "skimage", "flip_evaluator", *(["matplotlib"] if self.output else []))
         with progress.Stage(f"comparing {self.image}"):
             from mi_ntf.evaluate.compare import compare, print_table
 

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mi_ntf.core import extras
 from mi_ntf.core.errors import MiNtfError
 
 from . import compare_picture, metrics, perceptual
@@ -148,6 +149,7 @@ def _read_exr(path: Path) -> np.ndarray:
 
 
 def _read_png(path: Path) -> np.ndarray:
+    extras.need("eval", "a PNG image", "PIL")
     from PIL import Image
 
     try:
