@@ -10,6 +10,7 @@ torch = pytest.importorskip("torch", reason="training needs PyTorch: pip install
 
 from train import two_spheres  # noqa: E402
 
+from mi_ntf import page_server  # noqa: E402
 from mi_ntf.core import field_file  # noqa: E402
 from mi_ntf.core.errors import MiNtfError  # noqa: E402
 from mi_ntf.train import config, fast, live, monitor, recipe, train, trainer, training_data  # noqa: E402
@@ -57,6 +58,25 @@ def test_a_nan_is_rolled_back_and_reported(photographs, tmp_path, monkeypatch, c
     assert report["steps_done"] == 16
     header, _ = field_file.load(out)  # refuses values that are not finite
     assert header.provenance["faults"] == report["faults"]
+
+
+def test_ctrl_c_says_how_to_go_on(photographs, tmp_path, monkeypatch, capsys):
+    """The step is that of the checkpoint from which the same command goes on."""
+    pressed = []
+
+    def press(learner, loss):
+        if learner.clock.step == 6 and not pressed:
+            pressed.append(True)
+            raise KeyboardInterrupt
+        return loss
+
+    tamper(monkeypatch, "field", press)
+    with pytest.raises(KeyboardInterrupt, match="stopped at step 4 of 8; the same command goes on"):
+        train(photographs, tmp_path / "f", steps=8)
+    assert {*tmp_path.iterdir()} == {tmp_path / "f.ckpt"}
+    assert train(photographs, tmp_path / "f", steps=8)["steps_done"] == 8
+    said = capsys.readouterr().err
+    assert "goes on from step 4\n" in said and "reading photographs" in said and "scoring the field" in said
 
 
 def test_rolling_back_restores_the_state_and_halves_the_rate(photographs, tmp_path):
@@ -171,9 +191,9 @@ def test_tensorboard_gets_scalars_and_previews(photographs, tmp_path, monkeypatc
 
 @pytest.mark.slow
 def test_a_run_that_is_watched_shows_its_pictures_and_learns_the_same(photographs, tmp_path, monkeypatch):
-    viser = pytest.importorskip("viser", reason="pip install 'mi-ntf[view]'")
+    pytest.importorskip("viser", reason="pip install 'mi-ntf[view]'")
     shown, pages = [], []
-    monkeypatch.setattr(viser.SceneApi, "set_background_image", lambda scene, image, *_, **how: shown.append(image))
+    monkeypatch.setattr(page_server.Background, "show", lambda background, image: shown.append(image))
 
     def show(self, step, psnr, picture):
         self._next = 0.0  # a run of a second has no time for pictures
@@ -184,7 +204,6 @@ def test_a_run_that_is_watched_shows_its_pictures_and_learns_the_same(photograph
     monkeypatch.setattr(live.Live, "show", show)
     for name, view in (("watched", True), ("alone", False)):
         train(photographs, tmp_path / name, steps=20, view=view)
-    shown = [image for image in shown if image is not None]  # none as the page is made
     assert len(shown) == 1 and all(b"<html" in page for page in pages)
     photograph = shown[-1][:, :16]
     assert shown[-1].shape[1] == 3 * 16 and photograph.max() > 50  # not the dark around it alone
