@@ -74,17 +74,16 @@ def read(folder: Path) -> DataSet:
     read_cameras, read_points = (_cameras_bin, _points_bin) if suffix == ".bin" else (_cameras_txt, _points_txt)
     cameras, images = _whole(model / f"cameras{suffix}", read_cameras, assumed), _images(model, assumed)
     place = model / f"points3D{suffix}"
-    if place.is_file():
-        points = _whole(place, read_points, assumed)
-    else:
-        points = None
+    points = _whole(place, read_points, assumed) if place.is_file() else None
+    if points is None:
         assumed.append(f"{model} has no points3D, so the object's place is not known from points")
     root = next((p for p in (folder, folder / "colmap", *list(folder.absolute().parents)[:3]) if (p / "images").is_dir()
                  ), None)
     if root is None:
         raise MiNtfError(f"{folder / 'images'} does not exist; put the photographs of the model {model} there")
     views = []
-    for image in sorted(images, key=lambda i: i.name):
+    images.sort(key=lambda i: i.name)
+    for image in images:
         where = f"{model}, image '{image.name}'"
         if image.camera not in cameras:
             raise MiNtfError(f"{where}: there is no camera {image.camera}; export the model again with `colmap "
@@ -97,6 +96,7 @@ def read(folder: Path) -> DataSet:
                           _opencv(camera, f"{model}, camera {image.camera}"), (camera.width, camera.height)))
     if not views:
         raise MiNtfError(f"{model}: the model has no posed photograph; run `colmap mapper` again")
+    assumed += file_names.note_moved([image.name for image in images], [view.name for view in views], model)
     splits, notes = drop_missing({"train": views})
     stored, posed = len(photographs((root / "images").rglob("*"))), len(splits["train"])
     notes += [f"{stored - posed} of {stored} photographs in {root / 'images'} have no pose and are left out"

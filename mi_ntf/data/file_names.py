@@ -43,6 +43,13 @@ def moved(folder: Path, name: str) -> str:
     return next((tail for tail in tails if on_disk(folder / tail)), name)
 
 
+def note_moved(names: list[str], current: list[str], source: Path) -> list[str]:
+    """Return the assumption that the photographs `names` of the file `source` are now `current`, or nothing."""
+    elsewhere = [name for name, now in zip(names, current, strict=True) if is_absolute(name) and not is_absolute(now)]
+    return [f"{len(elsewhere)} photographs are not at the places that {source} names (first {elsewhere[0]}); those of "
+            "the same names in the data set are read"] if elsewhere else []
+
+
 def plain(name: str) -> str:
     """Return `name` with "/" between its parts."""
     return name.replace("\\", "/")

@@ -102,11 +102,7 @@ def _views(data: Entries, frames: list[object], path: Path, assumed: list[str]) 
     """Return the photographs of all frames; an assumption about their places is added to `assumed`."""
     views = [_view(data, entry, f"{path}, frame {i}", path.parent) for i, entry in enumerate(frames)]
     names = [str(entry["file_path"]) for entry in frames if isinstance(entry, dict)]
-    elsewhere = [name for name, view in zip(names, views, strict=True)
-                 if file_names.is_absolute(name) and not file_names.is_absolute(view.name)]
-    if elsewhere:
-        assumed.append(f"{len(elsewhere)} photographs are not at the places that {path} names (first {elsewhere[0]}); "
-                       "those of the same names in its folder are read")
+    assumed += file_names.note_moved(names, [view.name for view in views], path)
     return views
 
 

@@ -95,6 +95,7 @@ def test_every_photograph_is_read(tmp_path, edit):
 
 
 @pytest.mark.parametrize(("edit", "text"), [
+    (with_absolute_names, "assumed: 16 photographs are not at the places that .*sparse/0 names .first /home/somebody/"),
     (lambda f: (f / "sparse/0/points3D.txt").unlink(), "assumed: .*sparse/0 has no points3D, so the object's place"),
     (renamed("Größe.png", "latin-1"), "assumed: .*images.txt: is no UTF-8 and is read as Latin-1"),
     (lambda f: [Image.open(p).save(p.with_suffix(".tif")) or p.unlink() for p in (f / "images").iterdir()],
