@@ -56,14 +56,26 @@ def test_instances_beside_stock_volpath(blobs, depth):
     np.testing.assert_allclose(np.mean(images[0], (0, 1, 2)), np.mean(images[1], (0, 1, 2)), rtol=0.02)
 
 
-def test_a_field_in_a_group_is_refused(blobs):
-    """It is refused even beside a field that is in no group."""
-    group = {"group": {"type": "shapegroup", "inner": scenes.ball(blobs)},
-             "at": {"type": "instance", "group": {"type": "ref", "id": "group"}}}
-    for field in (None, blobs):
-        loaded = scene(field, scenes.nrf(), group)
+def grouped(blobs, place=(0, 0, 0), **more) -> dict:
+    """Return a group with the field, and an instance of it."""
+    move = mi.ScalarTransform4f().translate
+    return {"group": {"type": "shapegroup", "inner": scenes.ball(blobs), **more},
+            "at": {"type": "instance", "to_world": move(place), "group": {"type": "ref", "id": "group"}}}
+
+
+@pytest.mark.parametrize("options", [{}, {"max_depth": 4}])
+def test_a_field_in_a_group_is_what_is_written_out(blobs, options):
+    images = [scenes.render(scene(field, scenes.nrf(**options), shapes, size=16, spp=16))
+              for field, shapes in ((None, grouped(blobs)), (blobs, {}))]
+    np.testing.assert_array_equal(*images)
+
+
+def test_a_field_that_an_instance_moves_or_shares_is_refused(blobs):
+    """It is refused also beside the same field outside, and beside a ball in its group."""
+    for field, shapes in ((None, grouped(blobs, (2.5, 0, 0))), (blobs, grouped(blobs)),
+                          (None, grouped(blobs, ball=ball(center=PLACES[1])))):
         with pytest.raises(MiNtfError, match=r'"inner" bounds an nrf medium inside a shapegroup.*take the'):
-            find_media(loaded)
+            find_media(scene(field, scenes.nrf(), shapes))
 
 
 def test_another_medium_in_a_group_is_refused(blobs):

@@ -18,7 +18,7 @@ light_samples      integer 0       0 to 65536     sampled lights per shading poi
                                                   are marched.
 environment_lights integer 512     1 to 65536     largest number of directional lights that represent an environment
 map_resolution     integer 0       0 to 4096      texels along a side of a light's map. 0: as fine as the field's voxels
-                                                  for up to 4 lights, whose number of texels more lights share, but at
+                                                  for up to 16 lights, whose number of texels more lights share, but at
                                                   least 192.
 map_source         string  field   field, network ``field``: a texel is marched; ``network``: it is one query of the ray
                                                   network
@@ -76,9 +76,9 @@ diffuse surfaces. With at most 32 lights it is differentiable with respect to th
 their shadows are marched then. Other parameters with gradients are refused, and so are places of lights beside surfaces
 that let light through.
 
-Does not support: media other than ``nrf``; fields in a ``shapegroup``; a place inside another integrator, such as
-``aov`` or ``moment`` (use `aovs`); spectral and polarised variants; derivatives with respect to fields and turning
-environments; ``timed_sunsky``; environments whose `to_world` shears or, among surfaces, scales.
+Does not support: media other than ``nrf``; instances that move a field of their ``shapegroup``; a place inside another
+integrator, such as ``aov`` or ``moment`` (use `aovs`); spectral and polarised variants; derivatives with respect to
+fields and turning environments; ``timed_sunsky``; environments whose `to_world` shears or, among surfaces, scales.
 
 .. code-block:: xml
 

@@ -35,7 +35,8 @@ class NRFMedium(Protocol):
 def find_media(scene: mi.Scene) -> list[NRFMedium]:
     """Return the scene's ``nrf`` media.
 
-    Raises MiNtfError if there is none, or if a bounding shape is wrong or belongs to a shape group.
+    A field in a shape group lies where its medium says, as under ``volpath``: instances do not move it. Raises
+    MiNtfError if there is no medium, or if a bounding shape is wrong.
     """
     media: list[NRFMedium] = []
     bounds: list[list[mi.Shape]] = []
@@ -47,32 +48,33 @@ def find_media(scene: mi.Scene) -> list[NRFMedium]:
             media.append(medium)
             bounds.append([])
         bounds[next(i for i, m in enumerate(media) if m is medium)].append(shape)
+    for medium, shapes in zip(media, bounds, strict=True):
+        _check_bounds(medium, shapes)
     for shape in _grouped(scene):
-        if _nrf_medium(shape) is not None:
-            raise MiNtfError(
-                f"nrf integrator: {_label(shape)} bounds an nrf medium inside a shapegroup, but fields cannot be "
-                "instanced; take the shape out of the group, and give each other place a shape and a medium of its own"
-            )
+        medium = _nrf_medium(shape)
+        if medium is not None:
+            _check_group(scene, shape, medium, any(medium is m for m in media))
+            media.append(medium)
     if not media:
         raise MiNtfError(
             'nrf integrator: the scene has no nrf medium; put one inside a bounding shape: <shape type="sphere"> '
             '… <bsdf type="null"/> <medium type="nrf" name="interior"> … </medium> </shape>, '
             "or let `mi-ntf swap` write the scene"
         )
-    for medium, shapes in zip(media, bounds, strict=True):
-        _check_bounds(medium, shapes)
     return media
 
 
 def ordinary_shapes(scene: mi.Scene) -> list[mi.Shape]:
     """Return the shapes that rays can meet.
 
-    Bounds of ``nrf`` media and shapes with a ``null`` BSDF that emit nothing are left out. Raises MiNtfError if a shape
-    bounds another medium.
+    Bounds of ``nrf`` media, shapes with a ``null`` BSDF that emit nothing, and instances of groups are left out if the
+    groups hold fields alone. Raises MiNtfError if a shape bounds another medium.
     """
-    shapes = [s for s in scene.shapes() if _nrf_medium(s) is None and not _is_absent(s)]
+    absent = _hold_fields_alone(scene)
+    shapes = [s for s in scene.shapes() if _nrf_medium(s) is None and not _is_absent(s)
+              and not (absent and s.class_name() == "Instance")]
     for shape in shapes + _grouped(scene):
-        if shape.is_medium_transition():
+        if shape.is_medium_transition() and _nrf_medium(shape) is None:
             raise MiNtfError(
                 f"nrf integrator: {_label(shape)} bounds a medium that is no nrf medium, which this integrator does "
                 "not see; remove the medium, or render the scene with volpath"
@@ -87,8 +89,9 @@ def shape_groups(scene: mi.Scene) -> list[mi.Shape]:
 
 def lets_light_through(scene: mi.Scene) -> bool:
     """Return True if an ordinary shape of `scene` has a BSDF with a null component, which light can cross."""
+    groups = [] if _hold_fields_alone(scene) else shape_groups(scene)
     return any(isinstance(node, mi.BSDF) and mi.has_flag(node.flags(), mi.BSDFFlags.Null)
-               for shape in shape_groups(scene) + ordinary_shapes(scene) for node in mi.traverse(shape).hierarchy)
+               for shape in groups + ordinary_shapes(scene) for node in mi.traverse(shape).hierarchy)
 
 
 def _is_absent(shape: mi.Shape) -> bool:
@@ -103,6 +106,11 @@ def _grouped(scene: mi.Scene) -> list[mi.Shape]:
             and node is not group]
 
 
+def _hold_fields_alone(scene: mi.Scene) -> bool:
+    """Return True if all shapes in the shape groups of `scene` bound ``nrf`` media."""
+    return all(_nrf_medium(shape) is not None for shape in _grouped(scene))
+
+
 def _nrf_medium(shape: mi.Shape) -> NRFMedium | None:
     medium = shape.interior_medium() if shape.is_medium_transition() else None
     return cast(NRFMedium, medium) if getattr(medium, "is_nrf", False) else None
@@ -110,26 +118,54 @@ def _nrf_medium(shape: mi.Shape) -> NRFMedium | None:
 
 def _check_bounds(medium: NRFMedium, shapes: Sequence[mi.Shape]) -> None:
     """Raise MiNtfError unless exactly one shape bounds `medium` and encloses its object."""
-    corners = np.stack(np.meshgrid(*zip(*medium.field.grid.bounds, strict=True), indexing="ij"), -1).reshape(-1, 3)
-    world = np.array(medium.frame.point_to_world(corners.T.astype(np.float32)), dtype=np.float64).T
-    # All matter is in the unit sphere, from which the corners of the box may protrude.
-    origin, radius = medium.frame.origin, medium.frame.length
-    low, high = np.maximum(world.min(0), origin - radius), np.minimum(world.max(0), origin + radius)
+    origin, radius, low, high = _extent(medium)
     if len(shapes) > 1:
         raise MiNtfError(
             f"{len(shapes)} bounding shapes ({', '.join(map(_label, shapes))}) share one nrf medium ({medium.path}), "
             f"which is at one place, {_text(origin)}, by <ref> or since Mitsuba merges media of the same text; give "
             "each shape a medium of its own with its own to_world, or take the other shapes out"
         )
-    (shape,), slack = shapes, 0.01 * radius
+    (shape,) = shapes
     _check_bsdf(shape)
     box = shape.bbox()
-    if not ((np.array(box.min).ravel() <= low + slack).all() and (np.array(box.max).ravel() >= high - slack).all()):
+    if not _encloses(shape, medium):
         raise MiNtfError(
             f"bounding {_label(shape)} spans {_text(box.min)} to {_text(box.max)}, but the nrf medium inside it "
             f"({medium.path}) has its object from {_text(low)} to {_text(high)}; give shape and medium the same "
             f"placement (a sphere of centre {_text(origin)} and radius {radius:.4g} fits)"
         )
+
+
+def _check_group(scene: mi.Scene, shape: mi.Shape, medium: NRFMedium, is_bounded: bool) -> None:
+    """Raise MiNtfError unless a field that `shape` bounds in a group is one that could stand outside.
+
+    An instance must enclose its object, groups must hold fields alone, and no other shape may bound `medium`.
+    """
+    _check_bsdf(shape)
+    instances = [other for other in scene.shapes() if other.class_name() == "Instance"]
+    if is_bounded or not _hold_fields_alone(scene) or not any(_encloses(other, medium) for other in instances):
+        raise MiNtfError(
+            f"nrf integrator: {_label(shape)} bounds an nrf medium inside a shapegroup, but fields cannot be instanced "
+            f"(the object of {medium.path} is at {_text(medium.frame.origin)}); take the shape out of the group, and "
+            "give each other place a shape and a medium of its own"
+        )
+
+
+def _extent(medium: NRFMedium) -> tuple[np.ndarray, float, np.ndarray, np.ndarray]:
+    """Return the centre and radius of the field's sphere, and the corners of the box of its object, in the scene."""
+    corners = np.stack(np.meshgrid(*zip(*medium.field.grid.bounds, strict=True), indexing="ij"), -1).reshape(-1, 3)
+    world = np.array(medium.frame.point_to_world(corners.T.astype(np.float32)), dtype=np.float64).T
+    # All matter is in the unit sphere, from which the corners of the box may protrude.
+    origin, radius = medium.frame.origin, medium.frame.length
+    return origin, radius, np.maximum(world.min(0), origin - radius), np.minimum(world.max(0), origin + radius)
+
+
+def _encloses(shape: mi.Shape, medium: NRFMedium) -> bool:
+    """Return True if the box of `shape` contains the object of `medium`."""
+    _, radius, low, high = _extent(medium)
+    box, slack = shape.bbox(), 0.01 * radius
+    inside = (np.array(box.min).ravel() <= low + slack) & (np.array(box.max).ravel() >= high - slack)
+    return bool(inside.all())
 
 
 def _label(shape: mi.Shape) -> str:
