@@ -183,23 +183,29 @@ class _Shown:
             clock = time.monotonic()
             if not self._stages or (not now and clock - self._last_line < self._pace()):
                 return
-            self._last_line, first = clock, self._stages[0]
-            lines, timed = [stage.line() for stage in self._stages], False
-            for i, stage in enumerate(self._stages):
-                left = stage.left()
-                if left is not None and not timed:
-                    lines[i] += f", {duration(round(left))} left"
-                    timed = True
-            since = "" if timed or first.seconds() < 1 else f", {duration(int(first.seconds()))}"
-            text = " · ".join(lines) + since
+            self._last_line, text = clock, self._text()
             if not self._terminal():
-                (first.write or _print)(text)
+                (self._stages[0].write or _print)(text)
                 return
             self.clear()
-            text = text[:(os.get_terminal_size(sys.stderr.fileno()).columns or 80) - 1]
+            room = (os.get_terminal_size(sys.stderr.fileno()).columns or 80) - 1
+            text = text if len(text) <= room else f"…{text[1 - room:]}"
             sys.stderr.write(text)
             sys.stderr.flush()
             self._width = len(text)
+
+    def _text(self) -> str:
+        """Return the outermost and the innermost stage, with the time that is left, or else that has passed."""
+        stages = [self._stages[0], *self._stages[1:][-1:]]
+        lines = [stage.line() for stage in stages]
+        passed = stages[0].seconds()
+        for i, left in enumerate(stage.left() for stage in stages):
+            if left is not None and left >= 0.5:
+                lines[i] += f", {duration(round(left))} left"
+                break
+        else:
+            lines[-1] += f", {duration(int(passed))} so far" if passed >= 1 else ""
+        return " · ".join(lines)
 
     def clear(self) -> None:
         """Remove the terminal's line, so that another one can be printed."""
