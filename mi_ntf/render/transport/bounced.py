@@ -67,7 +67,7 @@ class Patches:
     def __init__(self, scene: FieldScene) -> None:
         self._key = _key(scene)
         self.skins = [Skin(part.medium) for part in scene.parts]
-        arrays = user_cache.cached("patches", user_cache.key(*self._key), lambda: self._found(scene),
+        arrays = user_cache.cached("patches", user_cache.key(*self._key), lambda: self._search(scene),
                                  placed=len(self.skins) > 1)
         for number, skin in enumerate(self.skins):
             for name in Skin.ARRAYS:
@@ -77,7 +77,7 @@ class Patches:
         log.info(f"nrf integrator: light bounces between {len(self.albedo)} patches of skins, which count as diffuse: "
                  "fast and biased; bounces=paths is not")
 
-    def _found(self, scene: FieldScene) -> dict[str, np.ndarray]:
+    def _search(self, scene: FieldScene) -> dict[str, np.ndarray]:
         with log.Work("nrf integrator", "finding the patches that light bounces between"):
             return self._arrays(scene)
 
