@@ -183,9 +183,10 @@ def test_without_the_extra_it_says_what_to_install(tmp_path: Path, monkeypatch: 
 def test_the_command_needs_neither_mitsuba_nor_torch(tmp_path: Path):
     code = ("import sys; from mi_ntf.cli import main; code = main(sys.argv[1:]); "
             "print(code, {'mitsuba', 'torch'} & set(sys.modules))")
-    done = run_program("python", "-c", code, "export", STATUE, "-o", "m.ply", "--resolution", "64", "--json",
-                       cwd=tmp_path)
-    assert done.stdout.splitlines()[-1] == "0 set()", done.stderr
+    done = run_program("python", "-c", code, "export", STATUE, "-o", "m.ply", "--resolution", "64", cwd=tmp_path)
+    mesh, _, following, modules = done.stdout.splitlines()
+    assert modules == "0 set()" and done.stderr == "making m.ply\n"
+    assert mesh.startswith("mesh: m.ply (") and following == "next: import m.ply in Blender or another program"
     assert (tmp_path / "m.ply").stat().st_size > 100_000
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from ..core import files, progress
 from ..core.errors import MiNtfError
+from ..core.quantities import duration
 from ..jobs import Workers, each
 from ..render.scene.environment_option import Environment
 from . import image_file, parameters, timeline
@@ -151,12 +152,13 @@ def print_check(result: Check) -> None:
 
 def print_summary(summary: Summary) -> None:
     """Print the result of :func:`run`."""
-    print(f"{summary.folder}: {summary.rendered} of {summary.images} images in {summary.seconds:.1f} s, "
-          f"{summary.existing} were there")
-    if summary.each is not None:
-        print(f"the first in {summary.first:.2f} s, each of the others in {summary.each:.2f} s (median)")
+    kept = f", {summary.existing} of them from an earlier run" if summary.existing else ""
+    print(f"frames: {summary.folder} ({summary.images}{kept})")
+    if summary.first is not None:
+        others = "" if summary.each is None else f"; each other one {duration(summary.each)} (median)"
+        print(f"time: {duration(summary.seconds)}; the first frame {duration(summary.first)}{others}")
     if summary.film is not None:
-        print(f"{summary.film}: {summary.toned}")
+        print(f"film: {summary.film} ({summary.toned})")
     elif summary.images > 1:
         print("next: the same command with --film FILM.mp4 makes a film of them")
 

@@ -111,8 +111,14 @@ def test_the_command_renders_goes_on_and_checks(scene, circle, tmp_path, capsys)
         assert f"frame_000{i}.exr" in printed.err
     assert '"position": [3.0, 3.0, 2.5]' in result["other"][0]
 
-    assert cli.main(words) == 0
-    assert contents(out) == whole
+    assert cli.main(words) == 0 and contents(out) == whole
+    (out / "frame_0000.exr").unlink()
+    capsys.readouterr()
+    assert cli.main(words[:-1]) == 0
+    printed = capsys.readouterr()
+    assert "goes on: 3 of 4 frames are there\nframes: 3 of 4\n" in printed.err
+    assert printed.out.splitlines()[0] == f"frames: {out} (4, 3 of them from an earlier run)"
+    assert printed.out.splitlines()[-1] == "next: the same command with --film FILM.mp4 makes a film of them"
     assert cli.main([*words[:-3], "-D", "spp=2", "--json"]) == 0  # other parameters: all are made anew
     assert contents(out) != whole
 
