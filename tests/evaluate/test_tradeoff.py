@@ -266,7 +266,17 @@ def test_a_way_that_fails_is_a_row_that_says_why(folder, tmp_path, monkeypatch, 
     assert "failed: no room for maps" in outline((tmp_path / "index.html").read_text()).texts
     monkeypatch.setenv("COLUMNS", "80")
     report.print_table(result_of(tmp_path), Path("study"))
-    assert max(map(len, capsys.readouterr().out.splitlines())) <= 80
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80 and [line.partition(":")[0] for line in lines[-3:]] == ["page", "verdict", "next"]
+
+
+@pytest.mark.parametrize(("end", "sentence"), [
+    (0.04, "slow is the fastest to an error of 5%, after 3.5 s"),
+    (0.08, "quick is the fastest to an error of 10%, after "),
+    (0.2, "no way reached an error of 10%; give a longer --budget")])
+def test_the_verdict_names_the_fastest_way_to_the_least_error(end, sentence):
+    ways = [row([1.0, 4.0], [0.5, end], method="slow"), row([0.5, 2.0], [0.5, max(end, 0.07)], method="quick")]
+    assert report.verdict({"ways": ways}).startswith(sentence)
 
 
 def test_what_is_built_is_built_anew_for_each_way(folder, tmp_path, monkeypatch):

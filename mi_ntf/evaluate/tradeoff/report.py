@@ -212,4 +212,4 @@ def print_table(result: Json, out: Path) -> None:
         table.add_row(name, *(re.sub(r" \(.*\)| ± .*", "", cell).replace("not reached", "–") for cell in others))
     Console().print(table, unsteady(result))
     print(f"page: {out / 'index.html'}", f"verdict: {verdict(result)}",
-          f"next: open {out / 'index.html'} in a browser; it has the recipe of every way", sep="\n")
+          "next: open the page in a browser; it has the recipe of every way", sep="\n")
