@@ -8,18 +8,6 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from mi_ntf.commands import options
-from mi_ntf.commands.options import (
-    Flag,
-    InScene,
-    Json,
-    OptionalFile,
-    OptionalOutput,
-    OutputFolder,
-    Scene,
-    SceneOptions,
-    UsageError,
-    named,
-)
 from mi_ntf.core import extras, progress
 from mi_ntf.evaluate.limits import Limits, broken, given
 
@@ -28,21 +16,21 @@ from mi_ntf.evaluate.limits import Limits, broken, given
 class Compare:
     """Measure an image against a reference; the exit code is 1 beyond a limit."""
 
-    image: Annotated[Positional[Path], named("IMAGE")]
+    image: Annotated[Positional[Path], options.named("IMAGE")]
     """Image to judge, EXR or PNG."""
-    reference: Annotated[Positional[Path], named("REFERENCE")]
+    reference: Annotated[Positional[Path], options.named("REFERENCE")]
     """Image taken as truth, EXR or PNG."""
-    output: OptionalOutput = None
+    output: options.OptionalOutput = None
     """Picture to write, .png: both images, their difference, HDR-FLIP."""
     limits: Annotated[object, arg(name="", constructor=Limits)] = field(default_factory=Limits)
-    masked: Flag = False
+    masked: options.Flag = False
     """Apply the limits to the object's pixels, where the reference's alpha is above 0.5, not to the whole picture."""
-    json: Json = False
+    json: options.Json = False
 
     def run(self) -> int:
         """Print the metrics, and the exceeded limits to standard error."""
         if self.masked and not given(self.limits):
-            raise UsageError("--masked says what limits judge; give one, as --max-relative-rmse 0.05")
+            raise options.UsageError("--masked says what limits judge; give one, as --max-relative-rmse 0.05")
         extras.need("eval", "a comparison", "skimage", "flip_evaluator", *(["matplotlib"] if self.output else []))
         with progress.Stage(f"comparing {self.image}"):
             from mi_ntf.evaluate.compare import compare, print_table
@@ -59,12 +47,12 @@ class Compare:
 class Explain:
     """Describe how a scene would be rendered, why, and at which cost."""
 
-    scene: Scene
+    scene: options.Scene
     """Scene with an nrf medium."""
-    measure: Flag = False
+    measure: options.Flag = False
     """Render the scene, and show the measured seconds beside those that a pilot predicts."""
-    loading: InScene = field(default_factory=SceneOptions)
-    json: Json = False
+    loading: options.InScene = field(default_factory=options.SceneOptions)
+    json: options.Json = False
 
     def run(self) -> None:
         """Print the description."""
@@ -79,16 +67,16 @@ class Explain:
 class Tradeoff:
     """Study error over time on a scene: a page with the curve of every method."""
 
-    scene: Scene
+    scene: options.Scene
     """Scene with an nrf medium and integrator."""
-    output: OutputFolder = Path("tradeoff")
+    output: options.OutputFolder = Path("tradeoff")
     """Folder for index.html, tradeoff.csv and tradeoff.json. An interrupted study continues in it."""
-    budget: Annotated[str, named("TIME")] = "5m"
+    budget: Annotated[str, options.named("TIME")] = "5m"
     """Time that the study may take: 90s, 5m, 1h."""
-    reference: OptionalFile = None
+    reference: options.OptionalFile = None
     """The path-traced mesh: an EXR picture or the XML file of its scene. Shipped scenes have theirs."""
-    loading: InScene = field(default_factory=SceneOptions)
-    json: Json = False
+    loading: options.InScene = field(default_factory=options.SceneOptions)
+    json: options.Json = False
 
     def run(self) -> None:
         """Measure, write the page, and print the table."""
@@ -100,7 +88,7 @@ class Tradeoff:
         try:
             budget = seconds(self.budget)
         except ValueError as error:
-            raise UsageError(str(error)) from None
+            raise options.UsageError(str(error)) from None
         report = study.tradeoff(self.scene, self.output, parameters, budget, self.reference,
                                 environment=self.loading.environment())
         options.print_report(report, self.json, lambda result: study.print_table(result, self.output))

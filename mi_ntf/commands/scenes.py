@@ -8,25 +8,6 @@ from typing import Annotated
 from tyro.conf import Positional
 
 from mi_ntf.commands import options
-from mi_ntf.commands.options import (
-    Count,
-    Define,
-    FieldFile,
-    Flag,
-    InScene,
-    Json,
-    OptionalFile,
-    OptionalOutput,
-    Output,
-    OutputFolder,
-    Overwrite,
-    Scene,
-    SceneOptions,
-    Shapes,
-    UsageError,
-    WorkerOptions,
-    named,
-)
 from mi_ntf.core import extras, files
 from mi_ntf.jobs.options import Workers
 
@@ -35,15 +16,15 @@ from mi_ntf.jobs.options import Workers
 class Swap:
     """Write a copy of a scene in which a field replaces the meshes."""
 
-    scene: Scene
+    scene: options.Scene
     """Mitsuba scene made of meshes."""
-    field_file: FieldFile
-    output: Output
+    field_file: options.FieldFile
+    output: options.Output
     """Scene to write, .xml."""
-    shapes: Shapes = ""
+    shapes: options.Shapes = ""
     """Shapes to replace, as cow,grass, or all but some, as not:floor. The default is all but lights."""
-    define: Define = ()
-    overwrite: Overwrite = False
+    define: options.Define = ()
+    overwrite: options.Overwrite = False
 
     def run(self) -> None:
         """Write the scene, and print what was replaced and what stays."""
@@ -75,17 +56,17 @@ class Render:
 class View:
     """Show a scene in a browser: move camera and lights, compare methods, save it."""
 
-    scene: Scene
+    scene: options.Scene
     """Scene with an nrf medium and integrator."""
-    size: Count = 512
+    size: options.Count = 512
     """The picture has the size of the window, but at most about N² pixels."""
-    samples: Count = 64
+    samples: options.Count = 64
     """Samples per pixel of a picture in which nothing moves."""
-    host: Annotated[str, named("ADDRESS")] = "127.0.0.1"
+    host: Annotated[str, options.named("ADDRESS")] = "127.0.0.1"
     """Address to serve. 0.0.0.0 serves everyone who reaches this machine."""
-    port: Count = 8080
+    port: options.Count = 8080
     """Port to serve at. If it is taken, a later one is used."""
-    loading: InScene = field(default_factory=SceneOptions)
+    loading: options.InScene = field(default_factory=options.SceneOptions)
 
     def run(self) -> None:
         """Serve the page until Ctrl-C."""
@@ -100,21 +81,21 @@ class View:
 class Bake:
     """Write the transmittance maps of a scene's lights to a file, or voxels to fields."""
 
-    scene: Scene
+    scene: options.Scene
     """Scene with an nrf medium and integrator, whose property map_file reads the result. With --baked, a field file
     will do."""
-    output: OptionalOutput = None
+    output: options.OptionalOutput = None
     """Map file to write, .exr."""
-    baked: Flag = False
+    baked: options.Flag = False
     """Put the voxels of the scene's fields into their files, so that they load without a bake or a cache."""
-    overwrite: Overwrite = False
-    loading: InScene = field(default_factory=SceneOptions)
-    json: Json = False
+    overwrite: options.Overwrite = False
+    loading: options.InScene = field(default_factory=options.SceneOptions)
+    json: options.Json = False
 
     def run(self) -> None:
         """Write the files and print their sizes."""
         if self.baked == (self.output is not None):
-            raise UsageError("give -o FILE for maps, or --baked for the fields' voxels")
+            raise options.UsageError("give -o FILE for maps, or --baked for the fields' voxels")
         parameters = self.loading.parameters()
         if self.output:
             files.check(self.output, (".exr",), self.overwrite)
@@ -133,9 +114,9 @@ class Bake:
 class Cache:
     """Show the files that speed up later renders: voxels, maps, patches."""
 
-    clear: Flag = False
+    clear: options.Flag = False
     """Remove them."""
-    json: Json = False
+    json: options.Json = False
 
     def run(self) -> None:
         """Print the cache's contents."""
@@ -148,30 +129,30 @@ class Cache:
 class RenderSequence:
     """Render many frames of a scene from a timeline or a table of parameters."""
 
-    scene: Scene
+    scene: options.Scene
     """Mitsuba scene."""
-    output: OutputFolder
+    output: options.OutputFolder
     """Folder for frame_0000.exr and so on. A second run renders the frames that are missing there."""
-    timeline: Annotated[Path | None, named("T.toml")] = None
+    timeline: Annotated[Path | None, options.named("T.toml")] = None
     """Values over the frames at key frames: $names, camera, lights, environment."""
-    parameters: Annotated[Path | None, named("P.csv")] = None
+    parameters: Annotated[Path | None, options.named("P.csv")] = None
     """Values of $names, one line per frame."""
-    loading: InScene = field(default_factory=SceneOptions)
-    shard: Annotated[str, named("i/n")] = "1/1"
+    loading: options.InScene = field(default_factory=options.SceneOptions)
+    shard: Annotated[str, options.named("i/n")] = "1/1"
     """Render the i-th of n shards, counted from 1."""
-    film: OptionalFile = None
+    film: options.OptionalFile = None
     """MP4 or WebM of all frames: linear values, clipped to 0..1, with sRGB's curve. It needs the extra `video`."""
-    exposure: Annotated[float, named("STOPS")] = 0.0
+    exposure: Annotated[float, options.named("STOPS")] = 0.0
     """Exposure of the film in stops."""
-    check: Flag = False
+    check: options.Flag = False
     """Render nothing. Name the frames that are missing, broken or of other parameters (exit code 1)."""
-    workers: WorkerOptions = field(default_factory=Workers)
-    json: Json = False
+    workers: options.WorkerOptions = field(default_factory=Workers)
+    json: options.Json = False
 
     def run(self) -> int:
         """Render or check the frames of this shard."""
         if self.timeline is not None and self.parameters is not None:
-            raise UsageError("give --timeline or --parameters, not both")
+            raise options.UsageError("give --timeline or --parameters, not both")
         options.check_workers(self.workers)
         fixed = self.loading.parameters()
         from mi_ntf.sequence import command
@@ -180,9 +161,9 @@ class RenderSequence:
         try:
             i, n = command.shard(self.shard)
         except ValueError as error:
-            raise UsageError(str(error)) from None
+            raise options.UsageError(str(error)) from None
         if self.film and (n > 1 or self.check):
-            raise UsageError("--film shows all frames: give it without --shard and --check when they are there")
+            raise options.UsageError("--film shows all frames: give it without --shard and --check when they are there")
         frames = command.frames_of(self.timeline, self.parameters, fixed)
         tasks = command.tasks_of(self.scene, self.output, frames.frames, self.loading.mode,
                                  self.loading.environment())[i - 1 :: n]
