@@ -18,6 +18,7 @@ from mi_ntf.infer.network import NetworkField
 from mi_ntf.infer.profile import DepthProfile
 from mi_ntf.infer.visibility.light_rays import COLUMNS, DIRECTIONAL, FRUSTUM, KIND, SPHERE, LightRays, frames
 from mi_ntf.infer.visibility.map_source import CLEAR, Source, field_source, network_source
+from mi_ntf.infer.visibility.method import resolution_for
 from mi_ntf.infer.visibility.ray_network import RayNetwork
 from mi_ntf.infer.visibility.raymarch import optical_depth
 from mi_ntf.infer.visibility.transmittance_map import TransmittanceMap
@@ -275,3 +276,10 @@ def test_tables_of_any_size(grid, resolution, rng):
         alone = [np.array(v) for v in LightRays(table(name), grid.hull, resolution, mi).all_rays(0, 1)[2]]
         part = slice(k * resolution**2, (k + 1) * resolution**2)
         np.testing.assert_allclose([v[part] for v in actual], alone, atol=1e-6)
+
+
+def test_default_resolution_shares_the_texels_of_a_few_fine_maps():
+    """Few lights have texels as fine as the voxels, and more lights share as many texels, but at least 192 a side."""
+    assert [resolution_for(lights, 384) for lights in (0, 1, 8, 16)] == [384] * 4
+    assert [resolution_for(lights, 384) for lights in (32, 64, 512)] == [271, 192, 192]
+    assert [resolution_for(lights, 192) for lights in (1, 512)] == [192, 192]
