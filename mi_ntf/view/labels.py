@@ -38,10 +38,11 @@ def labelled(picture: Bytes, size: tuple[int, int], sides: tuple[str, ...], frac
     image = image if image.size == size else image.resize(size, Image.Resampling.BILINEAR)
     draw = ImageDraw.Draw(image)
     if len(sides) == 2:
-        for name, anchor, offset, share in zip(sides, ("ra", "la"), (-MARGIN, MARGIN), (fraction, 1 - fraction),
-                                               strict=True):
-            if draw.textlength(name, ImageFont.load_default(FONT_SIZE)) + 2 * MARGIN <= share * size[0]:
-                _write(draw, size, name, (fraction * size[0] + offset, MARGIN), anchor)
+        line = fraction * size[0]
+        for name, x, width, anchor in ((sides[0], line - MARGIN, line, "ra"),
+                                       (sides[1], line + MARGIN, size[0] - line, "la")):
+            if draw.textlength(name, ImageFont.load_default(FONT_SIZE)) + 2 * MARGIN <= width:
+                _write(draw, size, name, (x, MARGIN), anchor)
     for name, towards in pointers.items():
         _point(draw, size, name, towards)
     return np.array(image)

@@ -43,7 +43,7 @@ class Viewer:
         self.session, self.show, self.tell, self.samples, self.lights = session, show, tell, samples, lights
         self.stops, self.split = 0.0, 0.5
         self._divisors = {"camera": 2.0, "light": 2.0}
-        self._slow_previews = 0
+        self._slow_previews, self._is_coarse = 0, False
         self._changes: dict[str, tuple[str, Callable[[], object]]] = {}
         self._lock, self._news, self._ended = threading.Lock(), threading.Event(), False
         self._last_change = 0.0
@@ -84,7 +84,10 @@ class Viewer:
                 return True
             if not self._is_unrefined() or time.monotonic() - self._last_change < REST:
                 return False
-            self._refine()
+            if self._is_coarse:  # the first pass may take seconds
+                self._render_preview(1.0)
+            else:
+                self._refine()
             return True
         except Interrupted:
             return True
@@ -106,10 +109,15 @@ class Viewer:
             return
         kind = next((k for k in ("camera", "light") if k in kinds), "other")
         divisor = self._divisors.get(kind, 1.0)
-        self._frame = self.session.preview(divisor)
+        seconds = self._render_preview(divisor)
         self._last_change = time.monotonic()
+        self._adapt(kind, divisor, seconds)
+
+    def _render_preview(self, divisor: float) -> float:
+        """Show a preview, and return the seconds that it took."""
+        self._frame, self._is_coarse = self.session.preview(divisor), divisor > 1
         self._display(self._frame)
-        self._adapt(kind, divisor, self._frame.seconds)
+        return self._frame.seconds
 
     def _adapt(self, kind: str, divisor: float, seconds: float) -> None:
         """Set the divisor of the next preview. A single slow preview may have compiled kernels."""

@@ -1,11 +1,13 @@
 """The loop of a view: the resolution follows the time of previews, and the page tells what is shown."""
 
+import time
+
 import numpy as np
 import pytest
 
 from mi_ntf.view.camera import Pose
 from mi_ntf.view.session import Frame
-from mi_ntf.view.viewer import FAST, SLOW, Viewer
+from mi_ntf.view.viewer import FAST, REST, SLOW, Viewer
 
 
 class Renderer:
@@ -23,6 +25,10 @@ class Renderer:
         self.edges.append(round(512 / divisor))
         self.times.append(self.overhead + self.seconds / divisor**2)
         return Frame(np.zeros((6, 8, 4)), self.times[-1], 1, ("auto: raymarch",))
+
+    def refine(self, spp):
+        self.edges.append("refined")
+        return Frame(np.zeros((6, 8, 4)), 5.0, spp, ("auto: raymarch",))
 
 
 def drag(viewer, previews=20, kind="camera"):
@@ -59,6 +65,19 @@ def test_a_single_slow_preview_changes_nothing():
     for renderer.overhead in (0.1, 1.0, 0.1, 1.0, 0.1):
         drag(viewer, previews=1)
     assert set(renderer.edges) == {256}
+
+
+@pytest.mark.parametrize(("kind", "edges"), [("camera", [256, 512, "refined"]), ("other", [512, "refined"])])
+def test_a_coarse_picture_is_followed_by_a_preview_of_full_size(kind, edges):
+    """A first pass of all lights may take seconds."""
+    renderer = Renderer(overhead=0.1)
+    viewer = Viewer(renderer, lambda *_: None, print)
+    drag(viewer, previews=1, kind=kind)
+    assert not viewer.step()  # something may still move
+    time.sleep(REST)
+    for _ in edges[1:]:
+        viewer.step()
+    assert renderer.edges == edges
 
 
 def test_the_page_tells_size_samples_time_and_method():
