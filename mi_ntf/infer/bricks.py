@@ -177,11 +177,15 @@ def _check(arrays: dict[str, np.ndarray]) -> None:
 
 
 def of_dense(values: np.ndarray, mask: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the arrays of a :class:`Bricks` of `values` (z, y, x, channels) around the voxels of `mask`."""
-    n = len(values)
+    """Return the arrays of a :class:`Bricks` of `values` (z, y, x, channels) around the voxels of `mask`.
+
+    Where the axes differ in length, the voxels fill the lowest corner of a cube.
+    """
+    n = max(mask.shape)
     first = SIDE * np.arange(bricks_per_side(n))
     places = np.argwhere(any_between(mask, first, first + SIDE))
-    voxels = np.minimum(SIDE * places[..., None] + np.arange(SIDE + 1), n - 1)  # (bricks, axis, 9)
+    last = np.array(mask.shape)[:, None] - 1
+    voxels = np.minimum(SIDE * places[..., None] + np.arange(SIDE + 1), last)  # (bricks, axis, 9)
     z, y, x = voxels[:, 0, :, None, None], voxels[:, 1, None, :, None], voxels[:, 2, None, None, :]
     return pack(np.moveaxis(values[z, y, x], -1, 1), places, octants_of(mask[z, y, x]), n, 0.0)
 

@@ -75,10 +75,10 @@ class Strand:
 class Bundle:
     """Rays with their strands through all fields, whose densities add where they overlap.
 
-    Inside a bundle t counts from `base`, the place on the ray where it enters the first sphere: cameras and lights may
-    be 10⁴ radii away, where float32 cannot resolve cells. Cells have the length of the finest field in whose sphere
-    they lie, and begin `offset` of a cell's length before the sphere. At `end` the ray leaves the last sphere, or ends
-    at `maxt`. The `strands` of a bundle have their origins at t = 0.
+    Inside a bundle t counts from `base`, the place on the ray where it enters the first field's extent, which is its
+    sphere or a body within: cameras and lights may be 10⁴ radii away, where float32 cannot resolve cells. Cells have
+    the length of the finest field in whose extent they lie, and begin `offset` of a cell's length before it. At `end`
+    the ray leaves the last extent, or ends at `maxt`. The `strands` of a bundle have their origins at t = 0.
     """
 
     def __init__(self, strands: Sequence[Strand], maxt: Float, offset: Float):
@@ -91,23 +91,24 @@ class Bundle:
             hit, m, h = spheres.chord(ops, s.o, s.d)
             # From the middle of the chord, which keeps its digits where the origin is far.
             middle = spheres.coordinate(tuple(a - b for a, b in zip(m, s.o, strict=True)), s.d)
-            enter = dr.maximum(-h, -middle)
-            hit = hit & (h > enter) & ((middle + enter) < maxt * rate)
+            first, last = s.volume.extent(m, s.d, h)
+            enter = dr.maximum(first, -middle)
+            hit = hit & (last > enter) & ((middle + enter) < maxt * rate)
             self.active = hit | self.active
             self.base = dr.minimum(self.base, dr.select(hit, (middle + enter) / rate, dr.inf))
-            chords.append((hit, m, h, middle, enter, rate))
+            chords.append((hit, m, last, middle, enter, rate))
         self.base = dr.select(self.active, self.base, 0)
         self.strands: list[Strand] = []
         self.intervals: list[tuple[Float, Float]] = []
         self.cells: list[Float] = []
         self.begins: list[Float] = []
         self.end: Float = dr.zeros(type(self.base), dr.width(self.base))
-        for s, (hit, m, h, middle, enter, rate) in zip(strands, chords, strict=True):
+        for s, (hit, m, last, middle, enter, rate) in zip(strands, chords, strict=True):
             # t' of t = 0, without a difference of large numbers where there is one strand.
             at = enter if self.single else dr.select(hit, self.base * rate - middle, 0)
             origin = tuple(a + at * b for a, b in zip(m, s.d, strict=True))
             self.strands.append(replace(s, o=origin))
-            begin, end = (enter - at) / rate, dr.minimum((h - at) / rate, maxt - self.base)
+            begin, end = (enter - at) / rate, dr.minimum((last - at) / rate, maxt - self.base)
             self.intervals.append((dr.select(hit, begin, dr.inf), dr.select(hit, end, -dr.inf)))
             self.end = dr.select(hit, dr.maximum(self.end, end), self.end)
             self.cells.append(s.step / rate)

@@ -45,8 +45,19 @@ class Density(Protocol):
         `inverse_d`: 1/direction by axis, finite.
         """
 
+    def extent(self, m: Vector, d: Vector, h: Float, /) -> tuple[Float, Float]:
+        """Return begin and end, t', of the part of the chord m + t' d, |t'| ≤ h, that may hold density."""
 
-class GridField:
+
+class InSphere:
+    """A density that fills the unit sphere."""
+
+    def extent(self, m: Vector, d: Vector, h: Float) -> tuple[Float, Float]:
+        """Return the ends of the whole chord."""
+        return -h, h
+
+
+class GridField(InSphere):
     """A field's density, trilinear ln σ between the voxels of :mod:`mi_ntf.infer.bake`, and its reflectance.
 
     Parameters
@@ -92,7 +103,7 @@ class GridField:
         return normalize(ops, tuple(v[:3])), tuple(v[3:6]), v[6], v[7]
 
 
-class NetworkVolume:
+class NetworkVolume(InSphere):
     """The density and reflectance of the networks `field` themselves, in the empty space of `grid`."""
 
     def __init__(self, field: NetworkField, grid: GridField, majorant: float):

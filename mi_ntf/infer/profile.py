@@ -7,10 +7,13 @@ import drjit as dr
 from ..core import spheres
 from ..core.depth_profile import LEVELS
 from . import ops
-from .bundle import onward, safe_inverse
+from .bundle import density_where, onward, safe_inverse
 from .grid import Density
 from .network import density_of
 from .types import Array, Float, Mask, Place, Vector
+
+BORDER = 1e-3
+"""Distance inside the border at which the density there is evaluated, in steps."""
 
 
 class DepthProfile:
@@ -33,8 +36,9 @@ class DepthProfile:
         Notes
         -----
         For places and total see :func:`mi_ntf.core.depth_profile.frame`. σ is taken in the middle of each step, linear
-        across it with the slope from the step before: constant σ would place the levels too close to the light where
-        density sets in. Steps stay on one lattice even where empty space is skipped, so neighbouring rays agree.
+        across it with the slope from the step before, or from the border. Constant σ would place the levels too close
+        to the light where density sets in. Steps stay on one lattice even where empty space is skipped, so neighbouring
+        rays agree.
         """
         return self.with_end(o, d, levels, begin)[:2]
 
@@ -42,6 +46,7 @@ class DepthProfile:
                  begin: Float | None) -> tuple[list[Float], Float, Float]:
         """Return ``(places, total, last)``; behind the place `last` the march met no more matter."""
         hit, m, h = spheres.chord(ops, o, d)
+        near, far = self.volume.extent(m, d, h)
         back = tuple(-c for c in d)
         inverse = safe_inverse(back)
         floats = type(o[0])
@@ -72,12 +77,17 @@ class DepthProfile:
                 (s, depth, before, last, place, *places), active & (skip <= 0), cross, skip_step, label="cross"
             )
             s = s + onward(skip, step)
-            return s, depth, before, tuple(crossed), last, active & (s < 2 * h) & (depth < levels[-1])
+            return s, depth, before, tuple(crossed), last, active & (s < stop) & (depth < levels[-1])
 
         zero = dr.zeros(floats, dr.width(h))
-        start = zero if begin is None else dr.maximum(h - begin, 0)
-        active = dr.mask_t(floats)(hit & (start < 2 * h))
-        state = (start, zero, floats(zero), tuple(floats(zero) for _ in levels), floats(zero), active)
+        start, stop = zero + (h - far), h - near
+        if begin is not None:
+            start = dr.maximum(h - begin, start)
+        active = dr.mask_t(floats)(hit & (start < stop))
+        # Matter may begin at once at the border of the extent.
+        border = tuple(mi + (h - start - BORDER * step) * di for mi, di in zip(m, d, strict=True))
+        before = density_where(active, self.volume, self.volume.place(border))
+        state = (start, zero, before, tuple(floats(zero) for _ in levels), floats(zero), active)
         _, depth, _, places, last, _ = ops.while_loop(
             state=state,
             cond=lambda s, depth, before, places, last, active: active,

@@ -18,7 +18,10 @@ def evaluate(wi: Vector, wo: Vector, reflectance: Reflectance) -> tuple[Vector, 
 
     The value is the phase function (linear RGB, 1/sr), the density that of :func:`sample` (1/sr).
     """
-    normal, albedo, roughness, specular, softness, rim = reflectance
+    normal, albedo, roughness, specular, softness, rim, lobe = reflectance
+    if lobe:
+        phase, pdf = lobe.evaluate(wi, wo)
+        return tuple(k * c for k, c in zip(albedo, phase, strict=True)), pdf
     diffuse, glossy = microfacet.scattering(ops, wi, wo, normal, roughness, softness)
     diffuse_weight, specular_weight = fresnel.weights(ops, wi, wo, normal, roughness, specular, rim)
     value = tuple(diffuse_weight * k * diffuse + specular_weight * glossy for k in albedo)
@@ -36,6 +39,8 @@ def evaluate(wi: Vector, wo: Vector, reflectance: Reflectance) -> tuple[Vector, 
 
 def sample(wo: Vector, reflectance: Reflectance, u1: Float, u2: tuple[Float, Float]) -> Vector:
     """Return a unit direction to the light, of the density of :func:`evaluate`; `u1`, `u2`: uniform in [0, 1)."""
+    if reflectance.lobe:
+        return reflectance.lobe.sample(wo, u1, u2)
     normal, roughness = reflectance.normal, reflectance.roughness
     chance, above = _specular_chance(wo, reflectance)
     glossy = u1 < chance

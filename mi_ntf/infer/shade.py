@@ -1,6 +1,6 @@
 """Reflected light at shading points: points × lights in one kernel."""
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import drjit as dr
 
@@ -14,10 +14,21 @@ EDGE = 0.02
 """Cosines over which derivatives spread the jump of the phase function between light from below and from above."""
 
 
+class Lobe(Protocol):
+    """Phase function of a participating medium at points; directions in field coordinates."""
+
+    def evaluate(self, wi: Vector, wo: Vector) -> tuple[Vector, Float]:
+        """Return value (linear RGB, 1/sr) and density of light scattered from `wi` to `wo`."""
+
+    def sample(self, wo: Vector, u1: Float, u2: tuple[Float, Float]) -> Vector:
+        """Return a direction to the light, of the density of :meth:`evaluate`; the numbers are uniform in [0, 1)."""
+
+
 class Reflectance(NamedTuple):
     """Reflectance of field points: ranges as in :mod:`mi_ntf.core.microfacet`, softness as in :mod:`mi_ntf.core.skin`.
 
-    `fresnel`: the specular weight is that at normal incidence (:mod:`mi_ntf.core.fresnel`).
+    `fresnel`: the specular weight is that at normal incidence (:mod:`mi_ntf.core.fresnel`). `lobe`: a phase function
+    that is weighted by the albedo, in place of normal, roughness and specular weight.
     """
 
     normal: Vector
@@ -26,6 +37,7 @@ class Reflectance(NamedTuple):
     specular: Float
     softness: Float
     fresnel: bool = False
+    lobe: Lobe | None = None
 
     def diffuse_albedo(self) -> list[Float]:
         """Return the linear RGB albedo of a diffuse surface that reflects as much of uniform light."""
@@ -48,7 +60,7 @@ class Points:
         uint = dr.uint32_array_t(type(x[0]))
         self.ray: UInt32 = dr.arange(uint, dr.width(x[0])) if ray is None else ray
         self.ordinal: UInt32 = uint(0) if ordinal is None else ordinal
-        self.normal, self.albedo, self.roughness, self.specular, self.softness, _ = reflectance
+        self.normal, self.albedo, self.roughness, self.specular, self.softness, _, self.lobe = reflectance
 
     def evaluate(self) -> None:
         """Evaluate the arrays now, before a loop over lights."""
@@ -85,7 +97,7 @@ def reflect(points: Points, lights: LightSource, visibility: Visibility | None, 
 
     def body(i: UInt32, r: Float, g: Float, b: Float) -> tuple[Array, ...]:
         light = lights.sample(i, points.x, True)
-        lit, diffuse, glossy = _lobes(light.wi, points, skin and bool(visibility), specular)
+        lit, value = _value(light.wi, points, skin and bool(visibility), specular)
         tau: Array = 1
         if visibility:
             wi, distance = light.wi, light.distance
@@ -95,7 +107,6 @@ def reflect(points: Points, lights: LightSource, visibility: Visibility | None, 
             tau = dr.select(lit, visibility.tau(points.x, wi, distance, index, lit, light.sun), 0)
             if moving:
                 tau = tau * _edge(light.wi, points.normal)
-        value = [k * diffuse + glossy for k in points.albedo] if specular else [k * diffuse for k in points.albedo]
         dimmed = tuple(tau) if dr.depth_v(tau) > 1 else (tau, tau, tau)
         r, g, b = (c + e * v * t for c, e, v, t in zip((r, g, b), light.irradiance, value, dimmed, strict=True))
         return i + 1, r, g, b
@@ -123,19 +134,22 @@ def _edge(wi: Vector, normal: Vector) -> Float:
     return ops.replace_grad(type(cos)(1), dr.select(dr.detach(cos) < EDGE, cos * (1 / EDGE), 0))
 
 
-def _lobes(wi: Vector, points: Points, skin: bool, specular: bool) -> tuple[Mask, Float, Float | None]:
-    """Return a mask of light on the normal's side, the diffuse lobe, to be multiplied by the albedo, and the specular.
-
-    Each lobe has its weight, which may be 0; the specular one is None without `specular`.
-    """
+def _value(wi: Vector, points: Points, skin: bool, specular: bool) -> tuple[Mask, list[Float]]:
+    """Return a mask of light that is scattered, and the phase function, linear RGB; `specular`: with that lobe."""
+    if points.lobe:
+        phase, _ = points.lobe.evaluate(wi, points.wo)
+        value = [k * c for k, c in zip(points.albedo, phase, strict=True)]
+        return dr.maximum(dr.maximum(value[0], value[1]), value[2]) > 0, value
     if not specular:
         cos = dr.maximum(dot(points.normal, wi), 0)
         if skin:
             cos = microfacet.joint_cosine(ops, cos, dr.maximum(dot(points.normal, points.wo), 0), points.softness)
-        return cos > 0, cos * microfacet.INV_PI, None
+        diffuse = cos * microfacet.INV_PI
+        return cos > 0, [k * diffuse for k in points.albedo]
     direction = wi, points.wo, points.normal, points.roughness
     diffuse, glossy = (
         microfacet.scattering(ops, *direction, points.softness) if skin else microfacet.lobes(ops, *direction)
     )
     diffuse_weight, specular_weight = fresnel.weights(ops, *direction, points.specular, points.reflectance.fresnel)
-    return diffuse > 0, diffuse_weight * diffuse, specular_weight * glossy
+    diffuse_part, glossy = diffuse_weight * diffuse, specular_weight * glossy
+    return diffuse > 0, [k * diffuse_part + glossy for k in points.albedo]

@@ -28,7 +28,8 @@ WORDS = {"visibility", "bounces", "map_source", "representation", "aovs", "filen
 FLAGS = {"hide_emitters", "sample_emitters", "unbiased"}
 RANGES = {
     "samples": (8, 8192), "light_samples": (0, 65536), "environment_lights": (1, 65536), "map_resolution": (0, 4096),
-    "map_components": (1, 2), "map_memory": (0.0, 2.0**24), "max_depth": (-1, 1 << 20), "resolution": (16, 1024),
+    "map_components": (0, 2), "map_memory": (0.0, 2.0**24), "max_depth": (-1, 1 << 20), "rr_depth": (1, 1 << 20),
+    "resolution": (16, 1024),
     "scale": (1e-12, 1e12), "sampling_weight": (0.0, 1e30), "noise_threshold": (0.0, 1e6), "max_error": (0.0, 1e6),
 }  # fmt: skip
 CASES = [(plugin, name) for plugin, names in PLUGINS.items() for name in names]

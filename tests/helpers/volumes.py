@@ -4,10 +4,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_ntf.infer.grid import InSphere
 from mi_ntf.infer.network import NOTHING
 
 
-class Formula:
+class Formula(InSphere):
     """A :class:`mi_ntf.infer.grid.Density` of the density `density`, without any empty space."""
 
     def __init__(self, density, hull=None):
@@ -29,7 +30,7 @@ class Unskipped(Formula):
 
     def __init__(self, volume):
         super().__init__(volume.density, volume.hull)
-        self.place, self.log_density = volume.place, volume.log_density
+        self.place, self.log_density, self.extent = volume.place, volume.log_density, volume.extent
 
     def clear_distance(self, place, inverse_d):
         return 0 * self.density(tuple(place[:3]))

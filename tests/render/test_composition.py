@@ -196,13 +196,6 @@ def test_a_shape_hides_the_field_behind_it(blobs):
     assert coarse[..., :3].mean() == pytest.approx(fine[..., :3].mean(), rel=0.02)
 
 
-def test_a_foreign_medium_is_refused(blobs):
-    fog = {"fog": {"type": "cube", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}, "id": "fog"}}
-    with pytest.raises(Exception) as caught:
-        scenes.render(scenes.scene(blobs, nrf(), {"light": scenes.light("point")}, size=8, spp=1, shapes=fog))
-    assert "bounds a medium that is no nrf medium" in str(caught.value.__cause__ or caught.value)
-
-
 @pytest.mark.parametrize("floor", [None, DIFFUSE])
 def test_chunks_that_meet_nothing(blobs, monkeypatch, floor):
     """Chunks are rows of pixels, the first of which see no matter."""

@@ -119,7 +119,7 @@ def test_truncated_and_foreign_field_files(path, tmp_path):
 
 def test_no_medium():
     text = f'<scene version="3.9.0"><integrator type="nrf"/>{SENSOR}{LIGHT}<shape type="sphere"/></scene>'
-    with pytest.raises(MiNtfError, match="the scene has no nrf medium"):
+    with pytest.raises(MiNtfError, match="the scene has no nrf medium and no other"):
         mi.render(mi.load_string(text), spp=1)
 
 

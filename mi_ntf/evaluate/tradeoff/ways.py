@@ -161,7 +161,7 @@ def finer(subject: Subject, methods: list[str]) -> list[Way]:
         dials += [(name, "unbiased", True) for name in methods if REGISTRY[name].automatic and REGISTRY[name].numbers]
     dials += [(name, "map_resolution", 2 * (int(values["map_resolution"]) or subject.texels(name))) for name in methods
               if "map_resolution" in REGISTRY[name].dials]
-    if values["map_components"] == 1 and values["map_source"] == "field":
+    if values["map_components"] != 2 and values["map_source"] == "field":
         dials += [(name, "map_components", 2) for name in methods if "map_components" in REGISTRY[name].dials]
     dials.append(("raymarch", "samples", min(2 * int(values["samples"]), 8192)))
     if values["bounces"] == "auto" and not 0 <= int(values["max_depth"]) <= 2:

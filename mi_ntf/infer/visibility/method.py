@@ -65,6 +65,8 @@ class Field(Protocol):
     def grid(self) -> GridField: ...  # noqa: D102
     @property
     def softness(self) -> Softness: ...  # noqa: D102
+    @property
+    def trained(self) -> bool: ...  # noqa: D102
 
 
 class Medium(Protocol):

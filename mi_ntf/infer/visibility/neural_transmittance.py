@@ -32,4 +32,5 @@ METHOD = Method(
     numbers=numbers,
     per_field=True,
     dials=("map_file",),
+    needs=lambda medium: medium.field.trained,
 )

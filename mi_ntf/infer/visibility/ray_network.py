@@ -46,4 +46,5 @@ METHOD = Method(
     summary="the ray network asked per point and light, as in the paper; networks that read a ray's depths march for "
             "them first",
     build=build,
+    needs=lambda medium: medium.field.trained,
 )

@@ -49,7 +49,7 @@ def default_steps(step: float, gradients: bool = False) -> tuple[float, float, f
 
 
 def optical_depth(volume: Density, x: Vector, d: Vector, length: Float, steps: Steps, active: Mask) -> Float:
-    """Return ∫ σ along x + t d for t in [0, length], clipped to the unit sphere; it stops at MAX_OPTICAL_DEPTH.
+    """Return ∫ σ along x + t d for t in [0, length], clipped to the extent of `volume`; it stops at MAX_OPTICAL_DEPTH.
 
     `x` may lie outside the sphere. Derivatives by `x`, `d` and `length` are those of the integral. The march sums the
     slopes of σ on its way, detached, and the sums are attached after it, since Dr.Jit loses derivatives by variables
@@ -60,7 +60,8 @@ def optical_depth(volume: Density, x: Vector, d: Vector, length: Float, steps: S
     # Places are t' of the chord, small numbers also where `x` lies far outside.
     hit, m, h = spheres.chord(ops, still, along)
     here = spheres.coordinate(still, along)
-    begin, end = dr.maximum(-h, here), dr.minimum(here + far, h)
+    first, last_place = volume.extent(m, along, h)
+    begin, end = dr.maximum(first, here), dr.minimum(here + far, last_place)
     shortest, longest, growth = steps
     inverse = safe_inverse(along)
 
@@ -89,7 +90,7 @@ def optical_depth(volume: Density, x: Vector, d: Vector, length: Float, steps: S
     depth, *slopes = ops.while_loop(state=start, cond=lambda t, sums, active: active, body=body, label="light march")[1]
     if not attached:
         return depth
-    last = density_where(active & hit & (end > begin) & (end < h), volume, volume.place(at(end)))
+    last = density_where(active & hit & (end > begin) & (end < last_place), volume, volume.place(at(end)))
     return ops.replace_grad(depth, dot(slopes[:3], x) + dot(slopes[3:], d) + last * length)
 
 

@@ -51,5 +51,5 @@ METHOD = Method(
     name="visibility_mlp",
     summary="one query of a network of a point and a direction per point and light: the baseline",
     build=build,
-    needs=lambda medium: medium.field.header.architecture.visibility is not None,
+    needs=lambda medium: medium.field.trained and medium.field.header.architecture.visibility is not None,
 )

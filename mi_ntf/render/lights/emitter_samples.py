@@ -14,8 +14,8 @@ from ...infer.lights import LightSample
 from ...infer.shade import Points
 from ...infer.types import Array, Color3, Float, Mask, UInt32, Vector, Vector3
 from ..scene.frame import Frame
+from ..scene.recent import Recent, Version
 from . import environment
-from .recent import Recent, Version
 
 SAMPLES = 2
 """Resampled lights per point of each emitter with an extent, where all discrete lights are summed."""

@@ -21,7 +21,7 @@ import numpy as np
 from ...core import spheres
 from ...core.errors import MiNtfError
 from ...infer.types import Color3, Vector3
-from .recent import Recent, Version
+from ..scene.recent import Recent, Version
 
 ROWS = 512
 """Largest number of rows of blocks, and half of that of columns. Only a large number of lights needs more."""

@@ -7,8 +7,8 @@ import mitsuba as mi
 import numpy as np
 
 from ...core.errors import MiNtfError
+from ..scene.recent import Recent, Version
 from .environment import name
-from .recent import Recent, Version
 
 _checked: Recent[None] = Recent(2)
 

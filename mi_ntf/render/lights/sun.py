@@ -10,8 +10,8 @@ import mitsuba as mi
 import numpy as np
 
 from ...core.errors import MiNtfError
+from ..scene.recent import Recent
 from . import environment
-from .recent import Recent
 
 RINGS = 16
 """Rings of the disc, of equal solid angle, over which its radiance is averaged."""

@@ -28,7 +28,12 @@ from . import map_cache
 
 
 def resolved(settings: Settings, lights: int, media: Sequence[NRFMedium]) -> Settings:
-    """Return `settings` with a `map_resolution` that suits the number of lights, where it is 0."""
+    """Return `settings` with a `map_resolution` that suits the number of lights, and logistics that suit the media.
+
+    Either is changed where it is 0. Smoke needs two logistics a texel, since its rays have no single skin.
+    """
+    opaque = all(m.field.softness.opaque for m in media)
+    settings = replace(settings, map_components=settings.map_components or (1 if opaque else 2))
     if settings.map_resolution:
         return settings
     method = REGISTRY["transmittance_map" if settings.visibility == "auto" else settings.visibility]

@@ -199,7 +199,8 @@ def _visibility(name: str, inner: mi.Emitter, medium: NRFMedium) -> Visibility |
                 "places; choose raymarch or transmittance_atlas"
             )
         table = scene_lights.rows([(inner, kind)], 1).table(medium.frame)
-    options = Options(STEP, resolution_for(1, medium.field.grid.resolution), cache=True)
+    options = Options(STEP, resolution_for(1, medium.field.grid.resolution), cache=True,
+                      map_components=1 if medium.field.softness.opaque else 2)
     visibility = building.build(method, medium, table, options)
     if visibility and REGISTRY[method].per_field and not one:
         return building.with_suns(visibility, None, medium, table, options)

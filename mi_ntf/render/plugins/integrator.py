@@ -22,14 +22,16 @@ map_resolution     integer 0       0 to 4096      texels along a side of a light
                                                   least 192.
 map_source         string  field   field, network ``field``: a texel is marched; ``network``: it is one query of the ray
                                                   network
-map_components     integer 1       1, 2           logistics per texel of a marched map. Two are more accurate on maps of
-                                                  256² or more and in smoke, and take four times the memory.
+map_components     integer 0       0, 1, 2        logistics per texel of a marched map; 0: one for fields with opaque
+                                                  skins, two for smoke. Two are more accurate on maps of 256² or more,
+                                                  and take four times the memory.
 map_memory         float   1024    0 to 2²⁴       MiB of maps or volumes in memory at once. More lights are rendered in
                                                   several runs.
 map_file           string  none    a path         EXR file of ``mi-ntf bake`` with the maps or the atlas
 max_depth          integer 2       −1 to 2²⁰      longest path in edges. 1: visible emitters; 2: single scattering;
                                                   more: multiple scattering in fields and between surfaces; −1: no
-                                                  limit, Russian roulette ends paths from depth 5 on.
+                                                  limit.
+rr_depth           integer 5       1 to 2²⁰       depth from which Russian roulette may end paths
 bounces            string  auto    see meaning    method for light of `max_depth` > 2. ``paths``: traced paths, unbiased
                                                   and noisy. ``radiosity``: patches of skins exchange light as diffuse
                                                   surfaces, biased, without noise, between opaque fields alone.
@@ -76,9 +78,16 @@ diffuse surfaces. With at most 32 lights it is differentiable with respect to th
 their shadows are marched then. Other parameters with gradients are refused, and so are places of lights beside surfaces
 that let light through.
 
-Does not support: media other than ``nrf``; instances that move a field of their ``shapegroup``; a place inside another
-integrator, such as ``aov`` or ``moment`` (use `aovs`); spectral and polarised variants; derivatives with respect to
-fields and turning environments; ``timed_sunsky``; environments whose `to_world` shears or, among surfaces, scales.
+Mitsuba's ``homogeneous`` and ``heterogeneous`` media are lit in the same way, inside spheres, meshes and other closed
+shapes with a ``null`` BSDF, with any phase function: under single scattering and more, the picture is that of
+``volpath``. Their extinction is sampled at the voxels of their grid, or at 192 voxels across a shape that is not
+convex. Maps follow them where a cell of the march (2/`samples` of the bounding sphere's radius) is thinner than a mean
+free path; denser media need ``raymarch``.
+
+Does not support: media with another extinction in each colour, exterior media, surfaces that bound media, media in a
+``shapegroup``; instances that move a field of their ``shapegroup``; a place inside another integrator, such as ``aov``
+or ``moment`` (use `aovs`); spectral and polarised variants; derivatives with respect to fields and turning
+environments; ``timed_sunsky``; environments whose `to_world` shears or, among surfaces, scales.
 
 .. code-block:: xml
 
@@ -163,10 +172,11 @@ def _context(read: properties.Reader) -> RenderContext:
         light_samples=read.whole("light_samples", 0, 0, 65536),
         environment_lights=read.whole("environment_lights", 512, 1, 65536),
         map_resolution=read.whole("map_resolution", 0, 0, 4096),
-        map_components=read.whole("map_components", 1, 1, 2),
+        map_components=read.whole("map_components", 0, 0, 2),
         map_memory=read.number("map_memory", 1024.0, 0.0, 2.0**24),
         map_file=read.text("map_file", ""),
         max_depth=read.whole("max_depth", 2, -1, 1 << 20),
+        rr_depth=read.whole("rr_depth", 5, 1, 1 << 20),
         bounces=read.choice("bounces", "auto", ("auto", "paths", "radiosity")),
         unbiased=read.flag("unbiased", False),
         hide_emitters=read.flag("hide_emitters", False),

@@ -39,6 +39,12 @@ class LoadedField:
     grid: GridField
     softness: Softness
     digest: str
+    trained = True
+
+    @property
+    def fresnel(self) -> bool:
+        """True if the specular weight grows towards grazing angles."""
+        return self.header.architecture.fresnel
 
 
 def voxels(header: Header) -> int:

@@ -14,6 +14,7 @@ from ...infer.shade import Reflectance
 from ...infer.types import Vector
 from .frame import Frame
 from .loaded import LoadedField
+from .stock_medium import StockMedium
 
 
 class NRFMedium(Protocol):
@@ -33,16 +34,19 @@ class NRFMedium(Protocol):
 
 
 def find_media(scene: mi.Scene) -> list[NRFMedium]:
-    """Return the scene's ``nrf`` media.
+    """Return the scene's ``nrf`` media, and then its media of Mitsuba.
 
     A field in a shape group lies where its medium says, as under ``volpath``: instances do not move it. Raises
     MiNtfError if there is no medium, or if a bounding shape is wrong.
     """
     media: list[NRFMedium] = []
     bounds: list[list[mi.Shape]] = []
+    stock: list[NRFMedium] = []
     for shape in scene.shapes():
         medium = _nrf_medium(shape)
         if medium is None:
+            if shape.is_medium_transition():
+                stock.append(_stock_medium(shape))
             continue
         if not any(medium is m for m in media):
             media.append(medium)
@@ -55,31 +59,30 @@ def find_media(scene: mi.Scene) -> list[NRFMedium]:
         if medium is not None:
             _check_group(scene, shape, medium, any(medium is m for m in media))
             media.append(medium)
-    if not media:
+    if not media and not stock:
         raise MiNtfError(
-            'nrf integrator: the scene has no nrf medium; put one inside a bounding shape: <shape type="sphere"> '
-            '… <bsdf type="null"/> <medium type="nrf" name="interior"> … </medium> </shape>, '
+            'nrf integrator: the scene has no nrf medium and no other; put one inside a bounding shape: '
+            '<shape type="sphere"> … <bsdf type="null"/> <medium type="nrf" name="interior"> … </medium> </shape>, '
             "or let `mi-ntf swap` write the scene"
         )
-    return media
+    return media + stock
 
 
 def ordinary_shapes(scene: mi.Scene) -> list[mi.Shape]:
     """Return the shapes that rays can meet.
 
-    Bounds of ``nrf`` media, shapes with a ``null`` BSDF that emit nothing, and instances of groups are left out if the
-    groups hold fields alone. Raises MiNtfError if a shape bounds another medium.
+    Bounds of media, shapes with a ``null`` BSDF that emit nothing, and instances of groups are left out if the groups
+    hold fields alone. Raises MiNtfError if a shape in a group bounds another medium than a field.
     """
     absent = _hold_fields_alone(scene)
-    shapes = [s for s in scene.shapes() if _nrf_medium(s) is None and not _is_absent(s)
-              and not (absent and s.class_name() == "Instance")]
-    for shape in shapes + _grouped(scene):
+    for shape in _grouped(scene):
         if shape.is_medium_transition() and _nrf_medium(shape) is None:
             raise MiNtfError(
-                f"nrf integrator: {_label(shape)} bounds a medium that is no nrf medium, which this integrator does "
-                "not see; remove the medium, or render the scene with volpath"
+                f"nrf integrator: {_label(shape)} bounds a medium inside a shapegroup, but media cannot be instanced; "
+                "take the shape out of the group, and give each place a shape and a medium of its own"
             )
-    return shapes
+    return [s for s in scene.shapes() if not s.is_medium_transition() and not _is_absent(s)
+            and not (absent and s.class_name() == "Instance")]
 
 
 def shape_groups(scene: mi.Scene) -> list[mi.Shape]:
@@ -114,6 +117,15 @@ def _hold_fields_alone(scene: mi.Scene) -> bool:
 def _nrf_medium(shape: mi.Shape) -> NRFMedium | None:
     medium = shape.interior_medium() if shape.is_medium_transition() else None
     return cast(NRFMedium, medium) if getattr(medium, "is_nrf", False) else None
+
+
+def _stock_medium(shape: mi.Shape) -> NRFMedium:
+    """Return Mitsuba's medium inside `shape`. Raises MiNtfError if the shape bounds a medium that is not supported."""
+    if shape.exterior_medium() is not None or shape.interior_medium() is None:
+        raise MiNtfError(f"nrf integrator: {_label(shape)} has an exterior medium, which fills space without an end; "
+                         "put the medium inside a closed shape of its own, or render the scene with volpath")
+    _check_bsdf(shape)
+    return cast(NRFMedium, StockMedium(shape, shape.interior_medium(), _label(shape)))
 
 
 def _check_bounds(medium: NRFMedium, shapes: Sequence[mi.Shape]) -> None:
@@ -178,7 +190,7 @@ def _check_bsdf(shape: mi.Shape) -> None:
     flags, names = shape.bsdf().flags(), ("Diffuse", "Glossy", "DeltaReflection", "DeltaTransmission")
     if any(mi.has_flag(flags, getattr(mi.BSDFFlags, name)) for name in names):
         raise MiNtfError(
-            f"bounding {_label(shape)} has a {shape.bsdf().class_name()} BSDF, but a shape that bounds an nrf "
+            f"bounding {_label(shape)} has a {shape.bsdf().class_name()} BSDF, but a shape that bounds a "
             'medium is no surface; give it <bsdf type="null"/> (the default is diffuse), and add a surface such as '
             "glass as a shape of its own around it"
         )

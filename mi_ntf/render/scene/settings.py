@@ -23,6 +23,7 @@ class Settings:
     map_memory: float
     map_file: str
     max_depth: int
+    rr_depth: int
     bounces: str
     frames: int
     hide_emitters: bool

@@ -95,7 +95,7 @@ def describe(scene: mi.Scene, settings: Settings, sensor: mi.Sensor, spp: int, m
     method, reason = _method(settings, width * height * spp, lights)
     if collocated:
         reason += "; not needed where the camera's own transmittance is the light's"
-    rims = [m.field.header.architecture.fresnel for m in media]
+    rims = [m.field.fresnel for m in media]
     return Effects(
         emitters=tuple(lights.kinds),
         lit=lit,

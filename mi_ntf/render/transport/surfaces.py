@@ -13,8 +13,8 @@ import mitsuba as mi
 from ...infer.types import Array, Color3, Float, Mask, Ray, Vector3
 from ..lights import environment
 from ..lights.emitter_samples import sharp
-from ..lights.recent import Recent, Version
 from ..scene.media import lets_light_through, shape_groups
+from ..scene.recent import Recent, Version
 
 _scenes: WeakKeyDictionary[mi.Integrator, Recent[mi.Scene]] = WeakKeyDictionary()
 

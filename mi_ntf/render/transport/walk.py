@@ -14,9 +14,6 @@ from ...infer.types import Array, Color3, Float, Mask, Ray, UInt32
 from .composition import Composition
 from .shadow import Part
 
-ROULETTE_DEPTH = 5
-"""Depth from which Russian roulette may end paths, as in Mitsuba's path tracers."""
-
 STEPS = 128
 """Most cells across a field's sphere for flights after the first bounce, which are smoother than camera rays."""
 
@@ -184,10 +181,10 @@ class Walk:
         return replace(scattered, weight=weight, distance=dr.zeros(mi.Float, dr.width(pdf))), straight
 
     def _roulette(self, paths: Paths, depth: int) -> Paths:
-        """Return the paths that still carry light; from `ROULETTE_DEPTH` on, a random choice of them."""
+        """Return the paths that still carry light; from `rr_depth` on, a random choice of them."""
         weight = dr.max(paths.weight)
         alive = weight > 0
-        if depth > ROULETTE_DEPTH:
+        if depth > self.scene.settings.rr_depth:
             chance = dr.detach(dr.minimum(weight, 0.95))  # the choice has no derivative
             alive = alive & (paths.rng.next_float32() < chance)
             paths = replace(paths, weight=paths.weight * dr.select(alive, dr.rcp(chance), 0))

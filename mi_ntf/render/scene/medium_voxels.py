@@ -1,0 +1,118 @@
+"""Voxels of the extinction of Mitsuba's media."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...core.errors import MiNtfError
+from ...infer.bake import PART
+
+MASKED = 192
+"""Voxels along the longest side of a medium whose shape is not convex, which its voxels have to resolve."""
+TOLERANCE = 1e-3
+"""Root mean square error of interpolated extinction, relative to the largest extinction, that needs no more voxels."""
+PROBES = 1 << 14
+"""Number of random points at which this error is measured."""
+MOST_VOXELS = 1 << 27
+"""Largest number of voxels that are sampled, half a gigabyte."""
+COLOURED = 1e-4
+"""Difference between the extinctions of two channels, relative to the largest, from which a medium is coloured."""
+MOST_CROSSINGS = 64
+"""Largest number of times that a straight line may cross the shape of a medium."""
+
+
+def extinction_volume(medium: mi.Medium) -> mi.Volume | None:
+    """Return the volume of the extinction of `medium`, None if it shows none."""
+    parameters = mi.traverse(medium)
+    for key, _ in parameters:
+        node = parameters.properties[key][2]
+        while key.startswith("sigma_t") and node is not None:
+            if isinstance(node, mi.Volume):
+                return node
+            node = parameters.hierarchy[node][0]
+    return None
+
+
+def counts_of(medium: mi.Medium, size: np.ndarray, convex: bool) -> np.ndarray:
+    """Return the number of voxels along each axis: those of the medium's own grid, more in a shape that needs them."""
+    volume = extinction_volume(medium)
+    own = np.array(volume.resolution(), int).ravel() if volume is not None else np.full(3, MASKED)
+    if medium.is_homogeneous():
+        own = np.full(3, 1)
+    least = 2 if convex else np.ceil(MASKED * size / size.max()).astype(int)
+    counts: np.ndarray = np.maximum(own, least)
+    return counts
+
+
+def sampled(medium: mi.Medium, low: np.ndarray, high: np.ndarray, counts: np.ndarray, name: str
+            ) -> tuple[np.ndarray, np.ndarray]:
+    """Return the extinction (z, y, x), 1/scene unit, at the voxels of a box, and their number along each axis.
+
+    There are more than `counts` where interpolation would be wrong between them, as in a grid that is turned.
+    """
+    rng = np.random.default_rng(5)
+    probe = rng.uniform(0.5 / counts, 1 - 0.5 / counts, (PROBES, 3))
+    truth = _extinction(medium, low + probe * (high - low), name)
+    while True:
+        index = np.stack(np.meshgrid(*(np.arange(n) for n in counts[::-1]), indexing="ij"), -1)[..., ::-1]
+        values = _extinction(medium, low + (index.reshape(-1, 3) + 0.5) / counts * (high - low), name)
+        values = values.reshape(counts[::-1])
+        error = np.sqrt(np.mean((_interpolated(values, probe * counts - 0.5) - truth) ** 2))
+        if error <= TOLERANCE * max(values.max(), 1e-30) or np.prod(2.0 * counts) > MOST_VOXELS:
+            return values, counts
+        counts = 2 * counts
+
+
+def _extinction(medium: mi.Medium, points: np.ndarray, name: str) -> np.ndarray:
+    """Return the extinction at scene points (k, 3). Raises MiNtfError if it differs between the channels."""
+    result = np.empty(len(points), np.float32)
+    for first in range(0, len(points), PART):
+        part = points[first : first + PART].T.astype(np.float32)
+        mei = dr.zeros(mi.MediumInteraction3f, part.shape[1])
+        mei.p = mi.Point3f(*(mi.Float(c) for c in part))
+        sigma = np.array(mi.Color3f(medium.get_scattering_coefficients(mei)[2])).reshape(3, -1)
+        if np.ptp(sigma, axis=0).max() > COLOURED * max(sigma.max(), 1e-30):
+            raise MiNtfError(f"nrf integrator: the medium of {name} has another sigma_t in each colour channel, which "
+                             "one transmittance cannot hold; give sigma_t one number, and colour the albedo")
+        result[first : first + PART] = sigma[0]
+    return result
+
+
+def _interpolated(values: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Return trilinear `values` (z, y, x) at places (k, 3), x first, in voxels from the first centre."""
+    counts = np.array(values.shape[::-1])
+    cell = np.clip(np.floor(place), 0, np.maximum(counts - 2, 0)).astype(int)
+    fraction = np.clip(place - cell, 0, 1)
+    result = np.zeros(len(place))
+    for corner in np.ndindex(2, 2, 2):
+        x, y, z = np.minimum(cell + corner, counts - 1).T
+        weight = np.prod(np.where(corner, fraction, 1 - fraction), axis=1)
+        result += weight * values[z, y, x]
+    return result
+
+
+def inside(shape: mi.Shape, low: np.ndarray, high: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Return 1 at the voxels (z, y, x) inside a closed shape, 0 outside.
+
+    A ray from a point inside crosses the shape an odd number of times.
+    """
+    scene = mi.load_dict({"type": "scene", "shape": shape})
+    index = np.stack(np.meshgrid(*(np.arange(n) for n in counts[::-1]), indexing="ij"), -1)[..., ::-1].reshape(-1, 3)
+    result = np.zeros(len(index), bool)
+    size = float(np.linalg.norm(high - low))
+    for first in range(0, len(index), PART):
+        points = (low + (index[first : first + PART] + 0.5) / counts * (high - low)).T.astype(np.float32)
+        ray = mi.Ray3f(mi.Point3f(*(mi.Float(c) for c in points)), dr.normalize(mi.Vector3f(0.48, 0.36, 0.8)))
+        odd, active = dr.zeros(mi.Bool, points.shape[1]), mi.Bool(True)
+        for _ in range(MOST_CROSSINGS):
+            hit = scene.ray_intersect_preliminary(ray, active=active)
+            active = active & hit.is_valid()
+            if not dr.any(active):
+                break
+            odd ^= active
+            ray.o = dr.select(active, ray(hit.t + 1e-5 * size), ray.o)
+            dr.eval(odd, active, ray)
+        result[first : first + PART] = np.array(odd)
+    return result.reshape(counts[::-1]).astype(np.float32)

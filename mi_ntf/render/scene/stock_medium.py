@@ -1,0 +1,176 @@
+"""Mitsuba's own participating media as the renderer sees them: voxels of extinction and a phase function."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NoReturn, cast
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...core.architecture import Similarity
+from ...core.errors import MiNtfError
+from ...core.spheres import MIN_HALF_CHORD, fibonacci
+from ...infer.backend import module_of
+from ...infer.convex import Convex, box, planes_of
+from ...infer.shade import Reflectance
+from ...infer.types import Array, Float, Vector, Vector3
+from ...infer.volume import VoxelVolume
+from .. import log
+from . import medium_voxels
+from .frame import Frame
+from .recent import Recent, Version
+
+MARGIN = 1.00001 / (1 - MIN_HALF_CHORD**2) ** 0.5
+"""Radius of the unit sphere over that of the matter: a ray that grazes the matter has a chord that counts."""
+_volumes: Recent[tuple[VoxelVolume, Frame]] = Recent()
+
+
+class Smoke:
+    """Softness of matter without skins."""
+
+    opaque, solid = False, 0.0
+
+    def __call__(self, p: Vector) -> Float:
+        """Return 0 at the points `p`."""
+        return dr.zeros(type(p[0]), dr.width(p[0]))
+
+
+@dataclass(frozen=True)
+class VolumeField:
+    """The part of a :class:`mi_ntf.render.scene.loaded.LoadedField` that a medium without networks has."""
+
+    grid: VoxelVolume
+    name: str
+    softness = Smoke()
+    fresnel = trained = False
+
+    @property
+    def digest(self) -> str:
+        """Hash of the voxels and of the body that they fill."""
+        return self.grid.digest
+
+    @property
+    def header(self) -> NoReturn:
+        """Raise MiNtfError, since no file belongs to the medium."""
+        raise MiNtfError(f"nrf integrator: {self.name} is no trained field, so it has no networks; choose "
+                         "visibility=raymarch, transmittance_map, transmittance_volume or transmittance_atlas, and "
+                         "map_source=field")
+
+    network = header
+
+
+class PhaseLobe:
+    """A phase function of Mitsuba at scene points, for directions in the coordinates of `frame`."""
+
+    def __init__(self, phase: mi.PhaseFunction, frame: Frame, p: Vector3) -> None:
+        self._phase, self._frame, self._p = phase, frame, p
+
+    def _interaction(self, wo: Vector) -> mi.MediumInteraction3f:
+        mei = dr.zeros(mi.MediumInteraction3f)
+        mei.p, mei.wi = self._p, self._frame.direction_to_world(wo)
+        mei.sh_frame = mi.Frame3f(mei.wi)
+        return mei
+
+    def evaluate(self, wi: Vector, wo: Vector) -> tuple[Vector, Float]:
+        """Return value and density of light scattered from `wi` to `wo` (:class:`mi_ntf.infer.shade.Lobe`)."""
+        value, pdf = self._phase.eval_pdf(mi.PhaseFunctionContext(), self._interaction(wo),
+                                          self._frame.direction_to_world(wi))
+        return tuple(mi.Color3f(value)), pdf
+
+    def sample(self, wo: Vector, u1: Float, u2: tuple[Float, Float]) -> Vector:
+        """Return a direction to the light."""
+        d, _, _ = self._phase.sample(mi.PhaseFunctionContext(), self._interaction(wo), u1, mi.Point2f(*u2))
+        return self._frame.direction_to_field(d)
+
+
+class StockMedium:
+    """A ``homogeneous`` or ``heterogeneous`` medium inside `shape`, with the interface of the ``nrf`` medium.
+
+    Notes
+    -----
+    The extinction is sampled at the medium's own voxels and interpolated as Mitsuba does. Albedo and phase function are
+    evaluated by Mitsuba's plugins at the shading points.
+    """
+
+    representation = "grid"
+
+    def __init__(self, shape: mi.Shape, medium: mi.Medium, name: str) -> None:
+        self.path, self._medium = name, medium
+        volume_box = _volume_box(medium)
+        self.source, self.frame = Version(shape).once(
+            _volumes, lambda: _sampled(shape, medium, volume_box, name), str(mi.variant()), medium.class_name(),
+            volume_box.tobytes())
+        self.field = VolumeField(self.source, name)
+
+    def reflectance(self, x: Vector) -> Reflectance:
+        """Return albedo and phase function at field points."""
+        n = dr.width(x[0])
+        p = self.frame.point_to_world(x)
+        scattering, extinction = _coefficients(self._medium, p)
+        albedo = tuple(dr.select(extinction > 0, s / dr.maximum(extinction, 1e-30), 0) for s in scattering)
+        zero, one = dr.zeros(mi.Float, n), dr.ones(mi.Float, n)
+        dr.eval(p)
+        return Reflectance((zero, zero, zero), albedo, one, zero, zero, False,
+                           PhaseLobe(self._medium.phase_function(), self.frame, p))
+
+
+def _coefficients(medium: mi.Medium, p: Vector3) -> tuple[Array, Float]:
+    """Return σ_s (three channels) and σ_t (the red channel) at scene points, 1/scene unit."""
+    mei = dr.zeros(mi.MediumInteraction3f, dr.width(p))
+    mei.p = p
+    scattering, _, extinction = medium.get_scattering_coefficients(mei)
+    return mi.Color3f(scattering), mi.Color3f(extinction).x
+
+
+def _volume_box(medium: mi.Medium) -> np.ndarray:
+    """Return the corners (2, 3) of the box outside of which `medium` has no matter, infinite if there is none."""
+    volume = medium_voxels.extinction_volume(medium)
+    if medium.is_homogeneous() or volume is None:
+        return np.array([[-np.inf] * 3, [np.inf] * 3])
+    return np.array([volume.bbox().min, volume.bbox().max], np.float64).reshape(2, 3)
+
+
+def _sampled(shape: mi.Shape, medium: mi.Medium, volume_box: np.ndarray, name: str) -> tuple[VoxelVolume, Frame]:
+    """Return the density of `medium` inside `shape`, and its placement."""
+    corners = np.array([shape.bbox().min, shape.bbox().max], np.float64).reshape(2, 3)
+    low, high = np.maximum(corners[0], volume_box[0]), np.minimum(corners[1], volume_box[1])
+    if not (high > low).all():
+        raise MiNtfError(f"nrf integrator: {name} and its medium do not overlap; give both the same to_world")
+    ball = shape.class_name() == "Sphere"
+    centre = corners.mean(0) if ball else (low + high) / 2
+    radius = (corners[1, 0] - corners[0, 0]) / 2 if ball else np.linalg.norm(high - low) / 2
+    frame = Frame(Similarity(tuple(centre), float(radius * MARGIN)), np.eye(4), 1.0)
+    planes = None if ball else _planes(shape)
+    convex = ball or planes is not None
+    low_box, high_box = (low, high) if np.isfinite(volume_box).all() else corners
+    counts = medium_voxels.counts_of(medium, high_box - low_box, convex)
+    with log.Work("nrf integrator", f"sampling the medium of {name}"):
+        values, counts = medium_voxels.sampled(medium, low_box, high_box, counts, name)
+        if not convex:
+            values *= medium_voxels.inside(shape, low_box, high_box, counts)
+    bounded = not ball or np.isfinite(volume_box).all()
+    rows = [box(*((c - centre) / frame.length for c in (low, high)))] if bounded else []
+    if planes is not None:
+        rows.append(np.column_stack([planes[:, :3], (planes[:, 3] - planes[:, :3] @ centre) / frame.length]))
+    body = Convex(np.concatenate(rows) if rows else np.zeros((0, 4)), 1 / MARGIN if ball else None, module_of(mi.Float))
+    field_low, field_high = ((c - centre) / frame.length for c in (low_box, high_box))
+    hull = fibonacci(400) / MARGIN * 1.01 if ball else _corners((low - centre) / frame.length,
+                                                                (high - centre) / frame.length)
+    return VoxelVolume(values * np.float32(frame.length), field_low, field_high, body, hull, module_of(mi.Float)), frame
+
+
+def _corners(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return the eight corners (8, 3) of a box."""
+    corners: np.ndarray = np.stack(np.meshgrid(*zip(low, high, strict=True), indexing="ij"), -1).reshape(-1, 3)
+    return corners
+
+
+def _planes(shape: mi.Shape) -> np.ndarray | None:
+    """Return the planes of a convex mesh in scene coordinates, None for any other shape."""
+    if not shape.is_mesh():
+        return None
+    mesh = cast(mi.Mesh, shape)
+    vertices = np.array(mesh.vertex_positions_buffer(), np.float64).reshape(-1, 3)
+    return planes_of(vertices, np.array(mesh.faces_buffer()).reshape(-1, 3).astype(int))
