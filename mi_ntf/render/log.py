@@ -9,7 +9,7 @@ from types import TracebackType
 import drjit as dr
 import mitsuba as mi
 
-from ..core import progress
+from ..core import progress, quantities
 
 INTERVAL = 3.0
 """Seconds between two lines of progress. Shorter work shows none."""
@@ -52,17 +52,19 @@ class Work(progress.Stage):
         self._logs = bool(mi.log_level() <= mi.LogLevel.Info)
         super().__init__(title, seconds=seconds, inner=True, interval=INTERVAL,
                          write=(lambda text: info(f"{who}: {text}")) if self._logs else None)
-        self.ended, self._who, self._waited = title, who, 0.0
+        self.ended, self._who, self._waited, self._slow = title, who, 0.0, False
 
     def update(self, done: float, text: str = "") -> None:
         """Show the fraction `done` of the work that was started, after queued kernels have ended."""
-        if self.visible and time.monotonic() - self._waited > 1:
+        begin = time.monotonic()
+        if self.visible and (self._slow or begin - self._waited > 1):
             dr.sync_thread()
             self._waited = time.monotonic()
+            self._slow = self._waited - begin > 0.3  # parts that take longer lose nothing by waiting for each
         super().update(done, text)
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
                  ) -> None:
         super().__exit__(kind, error, trace)
         if error is None and self._logs and self.ended:
-            info(f"{self._who}: {self.ended} ({self.seconds():.2g} s)")
+            info(f"{self._who}: {self.ended} ({quantities.duration(self.seconds())})")
