@@ -345,7 +345,7 @@ def test_seconds_to_an_error_are_read_with_their_range():
 @pytest.mark.parametrize(("spread", "warned"), [(0.3, True), (0.05, False), (None, False)])
 def test_an_unsteady_machine_is_said(spread, warned):
     result = {"machine": {"spread": spread, "probe_seconds": [0.2, 0.4]}}
-    assert ("the same small render took 0.2 to 0.4 s" in report.unsteady(result)) == warned
+    assert ("the same small render took 0.2 s to 0.4 s" in report.unsteady(result)) == warned
 
 
 @pytest.mark.parametrize(("shift", "said"), [

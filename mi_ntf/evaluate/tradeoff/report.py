@@ -86,8 +86,8 @@ def unsteady(result: Json) -> str:
     spread, probes = result["machine"]["spread"], result["machine"]["probe_seconds"]
     if not spread or spread <= SPREAD:
         return ""
-    return (f"The machine was noisy: the same small render took {min(probes):.2g} to {max(probes):.2g} s, a standard "
-            f"deviation of {spread:.0%}. All seconds are uncertain by as much. Repeat the study while nothing else "
+    return (f"The machine was noisy: the same small render took {duration(min(probes))} to {duration(max(probes))}, a "
+            f"standard deviation of {spread:.0%}. All seconds are uncertain by as much. Repeat the study while nothing else "
             "runs.")
 
 

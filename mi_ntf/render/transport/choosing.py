@@ -15,6 +15,7 @@ from functools import partial
 
 import mitsuba as mi
 
+from ...core.quantities import duration
 from ...infer.visibility import REGISTRY
 from .. import log
 from ..scene.settings import Limits, Settings
@@ -110,8 +111,8 @@ class Chooser:
                 pass
         composition, each = self._look.composition, self._look.each
         if self._by_time and each > self._time_left():
-            log.warn(f"nrf integrator: time_budget is {self._limits.seconds:.3g} s, but one sample a pixel takes about "
-                     f"{each:.3g} s by {composition.effects.visibility}; that will be rendered")
+            log.warn(f"nrf integrator: time_budget is {duration(self._limits.seconds)}, but one sample a pixel takes "
+                     f"about {duration(each)} by {composition.effects.visibility}; that will be rendered")
         return composition, Choice(composition.settings, self._trials, self._best, key)
 
     def explain(self) -> tuple[Composition, Choice]:

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...core import quantities
 from ...core.errors import MiNtfError
 from ...infer.types import Float
 from ...infer.visibility import REGISTRY
@@ -151,16 +152,8 @@ def _method(settings: Settings, rays: int, lights: Lights) -> tuple[str, str]:
     atlas_rays = REGISTRY["transmittance_atlas"].rays(0, 0)
     fewer = shadow_rays <= atlas_rays
     return ("raymarch" if fewer else "transmittance_atlas",
-            f"camera rays times lights are {_rounded(shadow_rays)}, {'no more' if fewer else 'more'} than the "
-            f"{_rounded(atlas_rays)} rays that fill an atlas")
-
-
-def _rounded(number: float) -> str:
-    """Return a number in two digits and words."""
-    for size, word in ((1e9, " billion"), (1e6, " million"), (1e3, " thousand")):
-        if number >= size:
-            return f"{float(f'{number / size:.2g}'):g}{word}"
-    return f"{number:g}"
+            f"camera rays times lights are {quantities.count(shadow_rays)}, {'no more' if fewer else 'more'} than the "
+            f"{quantities.count(atlas_rays)} rays that fill an atlas")
 
 
 def _at_camera(lights: Lights, sensor: mi.Sensor, media: Sequence[NRFMedium]) -> bool:
