@@ -87,8 +87,8 @@ def unsteady(result: Json) -> str:
     if not spread or spread <= SPREAD:
         return ""
     return (f"The machine was noisy: the same small render took {duration(min(probes))} to {duration(max(probes))}, a "
-            f"standard deviation of {spread:.0%}. All seconds are uncertain by as much. Repeat the study while nothing else "
-            "runs.")
+            f"standard deviation of {spread:.0%}. All seconds are uncertain by as much. Repeat the study while "
+            "nothing else runs.")
 
 
 def cells(row: Json) -> list[str]:
