@@ -157,7 +157,7 @@ class Controls:
         except Interrupted:
             self._tell("The error was not measured, because something moved meanwhile.")
         else:
-            self._tell(f"Relative RMSE against raymarch:\n{errors}")
+            self._tell(f"Error against raymarch: {errors}")
 
     def _add_light_folder(self, light: Light) -> None:
         gui, name = self.server.gui, f"{light.number} {light.kind}"
