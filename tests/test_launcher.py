@@ -1,5 +1,6 @@
 """Files that `mi-ntf render` writes: EXR as the program `mitsuba`, and PNG."""
 
+import subprocess
 from pathlib import Path
 
 import mitsuba as mi
@@ -8,6 +9,7 @@ import pytest
 
 from mi_ntf import cli
 
+ROOT = Path(__file__).parents[1]
 SCENE = """<scene version="3.0.0">
     <default name="format" value="openexr"/>
     <integrator type="direct"/>
@@ -58,3 +60,11 @@ def test_other_files_have_the_suffix_of_the_film(scene, capsys):
     assert render("--exposure", "1") == 2
     assert "--exposure is for PNG images" in capsys.readouterr().err
     assert set(scene.parent.iterdir()) == files
+
+
+@pytest.mark.skipif(not (ROOT / ".git").exists(), reason="this is no checkout")
+def test_git_ignores_pictures_beside_the_shipped_scenes():
+    scenes = [*ROOT.glob("scenes/*/scene.xml"), *ROOT.glob("scenes/*/mesh.xml"), *ROOT.glob("docs/gallery/*.xml")]
+    pictures = [str(path.with_suffix(".exr").relative_to(ROOT)) for path in scenes]
+    done = subprocess.run(["git", "check-ignore", *pictures], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.stdout.splitlines() == pictures and pictures
