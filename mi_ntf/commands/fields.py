@@ -1,34 +1,14 @@
 """Commands that make and describe fields: capture, inspect, train, export, info."""
 
+import json
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from mi_ntf.commands import options
-from mi_ntf.commands.options import (
-    Background,
-    Count,
-    DataSet,
-    Define,
-    FieldFile,
-    Flag,
-    FlashOffset,
-    Json,
-    Masks,
-    Mode,
-    OptionalCount,
-    OptionalFile,
-    OptionalFolder,
-    OptionalNumber,
-    OptionalOutput,
-    Output,
-    Overwrite,
-    Scene,
-    Shapes,
-    WorkerOptions,
-    named,
-)
-from mi_ntf.core import extras, files
+from mi_ntf.core import extras, files, progress
+from mi_ntf.core.errors import MiNtfError
 from mi_ntf.jobs.options import Workers
 
 
@@ -36,27 +16,27 @@ from mi_ntf.jobs.options import Workers
 class Capture:
     """Photograph a mesh scene with a flash, as training data for a field."""
 
-    scene: Scene
+    scene: options.Scene
     """Mitsuba scene made of meshes."""
-    folder: DataSet
+    folder: options.DataSet
     """Folder of the data set. An interrupted capture continues in it."""
-    views: Count = 100
+    views: options.Count = 100
     """Number of photographs for training and validation."""
-    size: Count = 128
+    size: options.Count = 128
     """Width and height in pixels."""
-    test_views: Count = 20
+    test_views: options.Count = 20
     """Number of photographs that are held back for tests."""
-    spp: Count = 64
+    spp: options.Count = 64
     """Samples per pixel."""
-    seed: Count = 0
+    seed: options.Count = 0
     """Seed of view directions and samples."""
-    flash_offset: FlashOffset = None
+    flash_offset: options.FlashOffset = None
     """Offset of the flash from the lens: right,up,forward in scene lengths."""
-    shapes: Shapes = ""
+    shapes: options.Shapes = ""
     """Shapes to photograph, as cow,grass, or all but some, as not:floor. The default is all but lights."""
-    mode: Mode = ""
-    define: Define = ()
-    workers: WorkerOptions = field(default_factory=Workers)
+    mode: options.Mode = ""
+    define: options.Define = ()
+    workers: options.WorkerOptions = field(default_factory=Workers)
 
     def run(self) -> None:
         """Render the photographs."""
@@ -79,17 +59,17 @@ class Capture:
 class Inspect:
     """Show a data set before training: cameras, masks, brightness, and warnings."""
 
-    dataset: DataSet
+    dataset: options.DataSet
     """Folder of photographs, in any form that `train` reads."""
-    output: OptionalOutput = None
+    output: options.OptionalOutput = None
     """HTML page to write. The default is DIR-inspect.html in the working folder."""
-    size: OptionalCount = None
+    size: options.OptionalCount = None
     """Scale photographs to this many pixels along their longer side."""
-    masks: Masks = None
-    background: Background = None
-    flash_offset: FlashOffset = None
+    masks: options.Masks = None
+    background: options.Background = None
+    flash_offset: options.FlashOffset = None
     """Offset of the flash from the lens: right,up,forward."""
-    json: Json = False
+    json: options.Json = False
 
     def run(self) -> None:
         """Write the page and print the summary."""
@@ -108,63 +88,74 @@ class Inspect:
 class Train:
     """Train a field and its transmittance network on a data set."""
 
-    dataset: DataSet
+    dataset: options.DataSet
     """Photographs: a capture, NeRF-synthetic, NRHints, nerfstudio (transforms.json), LLFF or COLMAP."""
-    output: Output
+    output: options.Output
     """Field file to write."""
-    preset: Annotated[Literal["fast", "paper"], named()] = "fast"
+    preset: Annotated[Literal["fast", "paper"], options.named()] = "fast"
     """Architecture and schedule."""
-    minutes: OptionalNumber = None
+    minutes: options.OptionalNumber = None
     """Stop after this many minutes."""
-    steps: OptionalCount = None
+    steps: options.OptionalCount = None
     """Stop after this many steps."""
-    seed: Count = 0
+    seed: options.Count = 0
     """Seed of weights and samples."""
     ntf: Annotated[Literal["mixture2", "logistic", "ray", "paper"] | None,
-                   named("{mixture2,logistic,ray,paper}")] = None
+                   options.named("{mixture2,logistic,ray,paper}")] = None
     """Transmittance network in place of the preset's."""
-    no_augmentation: Flag = False
+    no_augmentation: options.Flag = False
     """Learn transmittance on camera rays alone."""
-    no_colour_loss: Flag = False
+    no_colour_loss: options.Flag = False
     """Do not compare pixels lit by the learned transmittance with the photographs."""
-    size: OptionalCount = None
+    size: options.OptionalCount = None
     """Scale photographs to this many pixels along their longer side, in linear light."""
-    masks: Masks = None
-    background: Background = None
-    flash_offset: FlashOffset = None
+    masks: options.Masks = None
+    background: options.Background = None
+    flash_offset: options.FlashOffset = None
     """Offset of the flash from the lens: right,up,forward in the data set's lengths, or `estimate`."""
-    no_gains: Flag = False
+    no_gains: options.Flag = False
     """Assume one exposure and white balance for all photographs, although the flash's intensity is not known."""
-    no_bounces: Flag = False
+    no_bounces: options.Flag = False
     """Assume that the photographs hold no light that the object throws on itself, as in renderings of one bounce."""
-    no_fresnel: Flag = False
+    no_fresnel: options.Flag = False
     """Assume that the materials have no Fresnel effect, as in renderings with lobes of fixed weight."""
-    visibility_mlp: Flag = False
+    visibility_mlp: options.Flag = False
     """Also train NeRV's visibility network, a function of a point and a direction, on the same transmittance."""
-    field: OptionalFile = None
+    field: options.OptionalFile = None
     """Field file whose radiance networks stay. Only its transmittance networks are trained, from new weights."""
-    tensorboard: OptionalFolder = None
+    tensorboard: options.OptionalFolder = None
     """Folder for TensorBoard events: losses, validation, speed, preview pictures."""
-    view: Flag = False
+    view: options.Flag = False
     """Show the field in a browser during training. It needs the extra `view`."""
-    baked: Flag = False
+    baked: options.Flag = False
     """Also put the field's voxels into the file, so that it loads without a bake or a cache."""
-    json: Json = False
+    further: Annotated[bool, options.named(name="continue")] = False
+    """Train the field in FILE further, and replace it. It becomes no worse in validation."""
+    overwrite: options.Overwrite = False
+    json: options.Json = False
 
     def run(self) -> None:
         """Train, write the field file, and print the report."""
+        began = time.monotonic() - time.process_time()  # the minutes count the start of the program
         if self.minutes is not None and self.steps is not None:
             raise options.UsageError("give --minutes or --steps, not both")
+        if self.further and self.overwrite:
+            raise options.UsageError("give --continue or --overwrite, not both")
         estimate = self.flash_offset == "estimate"
         offset = None if estimate else options.parse_offset(self.flash_offset)
         files.check(self.output, (".safetensors",))
+        if self.output.exists() and not (self.further or self.overwrite):
+            raise MiNtfError(f"{self.output} exists; add --continue to train it further or --overwrite to replace it, "
+                             "or choose another name")
         extras.need("train", "training", "torch", "matplotlib", "PIL")
         if self.view:
             extras.need("view", "--view")
-        from mi_ntf.train import train
+        with progress.Stage("starting PyTorch"):
+            from mi_ntf.train import train
 
         report = train(self.dataset, self.output, preset=self.preset, minutes=self.minutes, steps=self.steps,
-                       seed=self.seed, tensorboard=self.tensorboard, field=self.field, ntf=self.ntf,
+                       seed=self.seed, tensorboard=self.tensorboard, field=self.field, further=self.further,
+                       ntf=self.ntf, began=began,
                        augmentation=not self.no_augmentation, colour_loss=not self.no_colour_loss,
                        reading={"size": self.size, "masks": self.masks, "background": self.background,
                                 "flash_offset": offset}, estimate=estimate, gains=not self.no_gains,
@@ -175,28 +166,34 @@ class Train:
                 from mi_ntf.render.commands.bake import bake_fields
 
                 bake_fields(self.output, {})
-            options.print_report(report, self.json, _print_training)
+            options.print_report(report, self.json, self._print_summary)
 
-
-def _print_training(report: Mapping[str, object]) -> None:
-    """Print the length of a training run and the quality of its field."""
-    keys = ("steps_done", "seconds", "kept", "faults", "val", "test", "transmittance")
-    options.print_pairs({key: report[key] for key in keys if report.get(key)})
+    def _print_summary(self, report: Mapping[str, object]) -> None:
+        """Print where the field and its page are, how good the field is, and the next command."""
+        try:
+            capture = json.loads((self.dataset / "capture.json").read_bytes())
+        except (OSError, ValueError):
+            following = f"mi-ntf info {self.output}"
+        else:
+            shapes = f" --shapes {capture['shapes']}" if capture.get("shapes") else ""
+            following = f"mi-ntf swap {capture.get('scene')} {self.output} -o nrf.xml{shapes}"
+        print(f"field: {self.output}", f"page: {self.output.with_suffix('.html')} (open it in a browser)",
+              report.get("verdict", ""), f"next: {following}", sep="\n")
 
 
 @dataclass
 class Export:
     """Write a field's surface as a mesh with albedo and roughness, as for Blender."""
 
-    field_file: FieldFile
-    output: Output
+    field_file: options.FieldFile
+    output: options.Output
     """Mesh to write: .ply (all attributes), .obj, .glb (colours), .stl."""
-    resolution: Count = 256
+    resolution: options.Count = 256
     """Voxels per side of the grid that the surface is extracted from, 32 to 512."""
-    level: OptionalNumber = None
+    level: options.OptionalNumber = None
     """Density of the surface, 1/(radius of the field's sphere). The default is 10, or less in thin matter."""
-    overwrite: Overwrite = False
-    json: Json = False
+    overwrite: options.Overwrite = False
+    json: options.Json = False
 
     def run(self) -> None:
         """Write the mesh and print its figures."""
@@ -212,10 +209,10 @@ class Export:
 class Info:
     """Describe a field file."""
 
-    field_file: FieldFile
-    full: Flag = False
+    field_file: options.FieldFile
+    full: options.Flag = False
     """Also print the networks' shapes and the whole record of the training."""
-    json: Json = False
+    json: options.Json = False
 
     def run(self) -> None:
         """Print the description."""

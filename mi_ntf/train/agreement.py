@@ -20,8 +20,8 @@ BEHIND = 5.0
 MATTER = 0.9
 """Alpha above which a pixel belongs to the object."""
 MOVED = 0.25
-"""RMS shift, pixels, of the photographs against the field from which poses count as inexact. The field follows about
-half of the true shifts."""
+"""Shift, pixels, of the photographs against the field from which poses count as inexact. The field follows about half
+of the true shifts."""
 
 
 @dataclass(frozen=True)
@@ -31,12 +31,18 @@ class Agreement:
     psnr: torch.Tensor
     """PSNR (views,) of the object's pixels, dB; NaN where they are too few."""
     shift: torch.Tensor  # Shifts (views, 2) of the photographs against the field, right and down, in pixels
+    halves: torch.Tensor
+    """Shifts (views, 2, 2) of the left and the right half of the object in each photograph."""
 
     @property
     def moved(self) -> float:
-        """Root mean square of the shifts' lengths; the mean shift counts as the field's."""
-        apart = self.shift - self.shift.median(0).values
-        return float(apart.square().sum(1).mean().sqrt())
+        """Root mean square length of the shifts that the halves of the photographs agree on.
+
+        A wrong pose moves both halves alike. Errors of the field, in which a shift may also be seen, are different
+        ones in each half, and vanish in the mean product. The mean shift of all photographs counts as the field's.
+        """
+        apart = self.halves - self.halves.median(0).values
+        return float((apart[:, 0] * apart[:, 1]).sum(1).mean().clamp(min=0).sqrt())
 
     @property
     def known(self) -> bool:
@@ -52,25 +58,28 @@ class Agreement:
 
 
 @torch.no_grad()
-def survey(field: FieldView, pool: Photographs, gains: torch.Tensor | None, most: float = math.inf) -> Agreement:
-    """Compare some pixels of all photographs with the field, about `most` in all; `gains` are (views, 3)."""
-    generator, psnr, shift = device.generator(8), [], []
-    each = int(max(FEWEST, min(PIXELS, most / pool.views)))
+def survey(field: FieldView, pool: Photographs, gains: torch.Tensor | None, each: int = PIXELS) -> Agreement:
+    """Compare `each` pixels of all photographs with the field, FEWEST at least; `gains` are (views, 3)."""
+    generator, picked, each = device.generator(8), [], max(FEWEST, each)
     for number in range(pool.views):
         pixels, *_ = pool.frame(number)
         matter = pixels[pool.pixels(pixels)[:, 3] > MATTER]
-        pixels = matter[torch.randperm(len(matter), generator=generator)[:each]]
-        if len(pixels) < FEWEST:
-            psnr.append(torch.nan)
-            shift.append(torch.zeros(2))
-            continue
-        rays = pool[pixels]
-        color = field.render(rays, generator).color
-        predicted = srgb(color if gains is None else color * gains[number])
-        target = srgb(rays.target[:, :3])
-        psnr.append(decibels(float((predicted - target).square().mean())))
-        shift.append(_shift(pool, pixels, (target - predicted).mean(1)))
-    return Agreement(torch.tensor(psnr), torch.stack(shift))
+        picked.append(matter[torch.randperm(len(matter), generator=generator)[:each]])
+    rays = pool[torch.cat(picked)]
+    color = field.render(rays, generator).color
+    predicted = srgb(color if gains is None else color * gains[rays.view - pool.first])
+    target = srgb(rays.target[:, :3])
+    counts = [len(pixels) for pixels in picked]
+    square = torch.split((predicted - target).square().mean(1), counts)
+    error = torch.split((target - predicted).mean(1), counts)
+    psnr = [decibels(float(part.mean())) if len(part) >= FEWEST else math.nan for part in square]
+    shift, halves = [], []
+    for pixels, part in zip(picked, error, strict=True):
+        column = pixels % pool.width
+        left = column <= column.median() if len(pixels) else column.bool()
+        shift.append(_shift(pool, pixels, part))
+        halves.append(torch.stack([_shift(pool, pixels[half], part[half]) for half in (left, ~left)]))
+    return Agreement(torch.tensor(psnr), torch.stack(shift), torch.stack(halves))
 
 
 def _shift(pool: Photographs, pixels: torch.Tensor, error: torch.Tensor) -> torch.Tensor:

@@ -56,8 +56,9 @@ class FastConfig:
     """Weight of the specular weight. A rough lobe can replace the diffuse one in flash photographs, and then sends half
     as much light again in all other directions."""
     lobes_from: float = 0.25
-    """Time from which roughness and specular weight are learned. Before normals have formed, highlights in wrong places
-    would drive both to an end of their range, where sigmoids have no slope."""
+    """Time from which roughness and specular weight are learned, and normals from colours, too. Before normals have
+    formed, highlights in wrong places would drive both to an end of their range, where sigmoids have no slope, and dark
+    pixels would turn normals away from the light."""
     smooth: float = 2e-4
     """Weight of the total variation of the planes."""
     shadows_from: float = 0.1
@@ -155,12 +156,3 @@ def configured(preset: str, *, ntf: str | None = None, augmentation: bool = True
     if visibility_mlp:
         architecture = replace(architecture, visibility=VISIBILITY)
     return replace(config, architecture=architecture)
-
-
-def transmittance_alone(config: Config, field: Architecture) -> FastConfig:
-    """Return the settings for a finished `field`: the whole run trains transmittance networks."""
-    if not isinstance(config, FastConfig):
-        raise MiNtfError("--field goes with the preset 'fast' alone: the paper's learns field and transmittance as one")
-    architecture = replace(config.architecture, density=field.density, reflectance=field.reflectance,
-                           fresnel=field.fresnel)
-    return replace(config, architecture=architecture, ntf_from=0.0, ntf_alone=0.0)

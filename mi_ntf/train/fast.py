@@ -1,18 +1,18 @@
 """The recipe ``fast``: planes, an occupancy grid in the visual hull, transmittance after the field."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 
-import numpy as np
 import torch
 
+from ..core import progress
 from ..core.architecture import MAX_LOG_DENSITY
 from ..core.errors import MiNtfError
 from . import device, losses, networks, offset, parallel, rays, volume
 from .bounced import CAMERA_RAYS, Bounced
 from .checkpoint import State
 from .config import FastConfig
+from .finished import FinishedField
 from .flash import Flash
 from .networks import Tensors
 from .normal_targets import NormalTargets
@@ -55,11 +55,11 @@ class Course:
 class Fast:
     """The recipe ``fast``; with `estimate` it searches the position of the flash beside the lens.
 
-    `field` are tensors of a finished field of the same data, whose transmittance networks alone are trained.
+    `finished` is a field of the same data to begin with.
     """
 
     def __init__(self, config: FastConfig, run: Run, estimate: bool = False,
-                 field: Mapping[str, np.ndarray] | None = None):
+                 finished: FinishedField | None = None):
         if estimate and not run.data.on_lens:
             raise MiNtfError("--flash-offset estimate: the data set says where its lights are; leave the option out")
         self.run, self.data, self.clock, self.learner = run, run.data, run.clock, run.learner
@@ -85,8 +85,8 @@ class Fast:
         if config.bounces and self.data.solid:
             self.bounced = Bounced(self.flash, torch.cat([p.light for p in self.data.all]), self.room)
         self.course = Course(steep=not self.data.solid)
-        if field is not None:
-            self._take(field)
+        if finished is not None:
+            self._take(finished)
 
     def _optimizer(self, *names: str) -> torch.optim.Adam:
         tensors = {k: v for k, v in self.networks.tensors.items() if k.split(".")[0] in names}
@@ -97,14 +97,28 @@ class Fast:
             groups.append({"params": [self.gains.logs, self.room], "base": self.config.lr_gains})
         return torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12, fused=True)
 
-    def _take(self, field: Mapping[str, np.ndarray]) -> None:
-        """Take density and reflectance of a finished field."""
-        copy_into(self.networks.tensors,
-                  {k: torch.as_tensor(v) for k, v in field.items() if k.split(".")[0] in FIELD})
+    def _take(self, finished: FinishedField) -> None:
+        """Take density and reflectance of a finished field; for further training, all that it has learned."""
+        kept = {k: v for k, v in finished.tensors.items()
+                if k.split(".")[0] in FIELD or (finished.further and k in self.networks.tensors
+                                                and v.shape == self.networks.tensors[k].shape)}
+        copy_into(self.networks.tensors, {k: torch.as_tensor(v) for k, v in kept.items()})
         for _ in range(11):  # skins fill a fraction of their cells
             self.occupancy.sample(self.networks, self.generator)
         self.occupancy.update(self.networks, self.generator)
+        if finished.further:
+            self.course.steep = True
+            self.course.estimates = sum(time <= self.clock.begin for time in ESTIMATE_TIMES)
+            learned = finished.header.provenance.get("photographs", {})
+            names = [str(name) for name in self.data.train.names or range(self.data.train.views)]
+            if self.gains is not None and set(names) <= set(learned.get("gains", {})):
+                self.gains.resume(torch.tensor([learned["gains"][name] for name in names]))
+            if self.room is not None and "room" in learned:
+                self.room.data = torch.tensor(learned["room"]).log()
+            if self.estimating:
+                self.estimate_flash()
         self.update_bounced()
+        self.bake()
 
     @property
     def elsewhere(self) -> Flash | None:
@@ -189,6 +203,10 @@ class Fast:
     def estimate_flash(self) -> None:
         """Estimate the position of the flash relative to the lens. Use it, or warn if it is assumed at the lens."""
         self.course.estimates += 1
+        with progress.Stage("estimating the flash", inner=True):
+            self._estimate_flash()
+
+    def _estimate_flash(self) -> None:
         self.baked.update(self.networks, self.occupancy)
         self.marched.update(self.networks, self.occupancy)
         pool, notes = self.data.train, self.run.notes
@@ -221,16 +239,18 @@ class Fast:
     def update_bounced(self) -> None:
         """Bring the bounced light up to date."""
         if self.bounced is not None:
-            self.marched.update(self.networks, self.occupancy)
-            sampled = self.sample_rays(CAMERA_RAYS, device.generator(self.course.rounds))
-            self.bounced.update(self.networks, self.marched, sampled, self.course.rounds)
+            with progress.Stage("computing bounced light", inner=True):
+                self.marched.update(self.networks, self.occupancy)
+                sampled = self.sample_rays(CAMERA_RAYS, device.generator(self.course.rounds))
+                self.bounced.update(self.networks, self.marched, sampled, self.course.rounds)
         self.course.rounds += 1
 
     def bake(self) -> None:
         """Bring the baked densities up to date."""
-        self.baked.update(self.networks, self.occupancy)
-        if self.clock.progress >= (self.config.ntf_from if self.at_lens else self.config.shadows_from):
-            self.marched.update(self.networks, self.occupancy)
+        with progress.Stage("baking", inner=True):
+            self.baked.update(self.networks, self.occupancy)
+            if self.clock.progress >= (self.config.ntf_from if self.at_lens else self.config.shadows_from):
+                self.marched.update(self.networks, self.occupancy)
         self.course.last_bake = self.clock.step
 
     def sample_rays(self, count: int, generator: torch.Generator) -> rays.Rays:
@@ -316,7 +336,7 @@ class Fast:
         else:
             learner.terms, image = self.field_loss(batch, samples)
             learner.check("field", learner.terms["colour"] + learner.terms["alpha"])
-            rate = self.fading * min(1.0, (self.clock.step + 1) / 50)
+            rate = self.fading * min(1.0, (self.clock.step - self.clock.first + 1) / 50)
             value += learner.descend("field", total(learner.terms), rate)
         if progress >= c.ntf_from:
             terms = self.ntf_loss(image, batch)

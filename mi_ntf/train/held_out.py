@@ -5,7 +5,6 @@ import torch
 from . import device
 from .losses import tau
 from .networks import Networks, depth_at, free_flight
-from .occupancy import Occupancy
 from .rays import Photographs
 from .transmittance_targets import TransmittanceTargets, chords, uniform_directions
 
@@ -17,17 +16,15 @@ CHUNK = 512
 
 
 @torch.no_grad()
-def score(networks: Networks, occupancy: Occupancy, photographs: Photographs) -> dict[str, float]:
-    """Return ``rms`` and ``bias`` of τ_nt against the marched τ of the field; empty if no ray sees matter.
+def score(networks: Networks, marched: TransmittanceTargets, photographs: Photographs, fraction: float = 1.0
+          ) -> dict[str, float]:
+    """Return ``rms`` and ``bias`` of τ_nt against the `marched` τ of the field; empty if no ray sees matter.
 
-    They are taken over PAIRS pairs of a shading point of the held-out `photographs` and a light in a random
-    direction. `occupancy` comes from :func:`mi_ntf.train.scoring.occupied`.
+    They are taken over a `fraction` of PAIRS pairs of a shading point of the held-out `photographs` and a light in a
+    random direction.
     """
-    generator = device.generator(4)
-    marched = TransmittanceTargets()
-    marched.update(networks, occupancy)
-    errors = [torch.zeros(0)]
-    for _ in range(0, PAIRS, CHUNK):
+    generator, errors = device.generator(4), [torch.zeros(0)]
+    for _ in range(0, max(1, round(fraction * PAIRS)), CHUNK):
         rays = photographs[photographs.random(16 * CHUNK, generator)]
         rays = rays[(rays.target[:, 3] > 0.5).nonzero()[:CHUNK, 0]]
         m, h = chords(rays.o, rays.d)

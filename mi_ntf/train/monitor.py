@@ -1,4 +1,4 @@
-"""Reports of a run while it trains: divergence, progress in the terminal, TensorBoard, pictures in a browser."""
+"""Reports of a run while it trains: divergence, notes, TensorBoard, pictures in a browser."""
 
 import math
 import resource
@@ -6,13 +6,11 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, TypedDict
 
 import torch
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+from ..core import progress
 from ..core.errors import MiNtfError
 
 if TYPE_CHECKING:
@@ -68,44 +66,7 @@ class Notes:
         if text not in self.texts:
             self.texts.append(text)
             if self.shown:
-                note(text)
-
-
-class Display:
-    """Progress bar on standard error with the time left; silent unless `shown`.
-
-    The bar named `name` of a training run also shows loss, validation PSNR and memory.
-    """
-
-    RUN = "step {task.fields[step]}  loss {task.fields[loss]:.4f}  val {task.fields[psnr]:.2f} dB  "
-
-    def __init__(self, shown: bool, name: str = "train"):
-        columns = (TextColumn(name), BarColumn(), TextColumn("{task.percentage:3.0f}%"),
-                   TextColumn((self.RUN if name == "train" else "") + "{task.fields[memory]:.1f} GiB"),
-                   TimeRemainingColumn())
-        self.bar = Progress(*columns, console=Console(stderr=True, quiet=not shown), disable=not shown)
-        self.task = self.bar.add_task(name, total=1.0, step=0, loss=0.0, psnr=float("nan"), memory=0.0)
-
-    def __enter__(self) -> "Display":
-        self.bar.__enter__()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-                 ) -> None:
-        self.bar.__exit__(kind, error, trace)
-
-    def update(self, progress: float, step: int = 0, loss: float = 0.0) -> None:
-        """Show the fraction `progress` that is done."""
-        self.bar.update(self.task, completed=progress, step=step, loss=loss, memory=memory())
-
-    def validated(self, entry: Validation) -> None:
-        """Show the result of a validation."""
-        self.bar.update(self.task, psnr=entry["psnr"])
-        self.say(f"step {entry['step']}: validation {entry['psnr']:.2f} dB")
-
-    def say(self, text: str) -> None:
-        """Print a line above the bar."""
-        self.bar.console.print(text, highlight=False, soft_wrap=True)
+                progress.say(text, text.startswith("warning: "))
 
 
 class Log:
@@ -117,7 +78,7 @@ class Log:
             from .live import Live
 
             self.live = Live()
-            note(f"Open {self.live.address} in a browser to watch the field.")
+            progress.say(f"Open {self.live.address} in a browser to watch the field.")
         self.writer: SummaryWriter | None = None
         self.last = (time.monotonic(), 0, 0)
         if folder is not None:
@@ -167,11 +128,6 @@ class Log:
             self.writer.close()
         if self.live is not None:
             self.live.close()
-
-
-def note(text: str) -> None:
-    """Print `text` on standard error, like all messages of a run."""
-    print(text, file=sys.stderr)
 
 
 def memory() -> float:

@@ -22,8 +22,9 @@ from . import ops
 
 Tensors = dict[str, torch.Tensor]
 """Tensors by their names in the field file."""
-INITIAL_SPECULAR_LOGIT = -3.0
-"""Start of the specular weight: nearly matt, so that highlights have to appear in the photographs first."""
+INITIAL_SPECULAR_LOGIT, INITIAL_ROUGHNESS_LOGIT = -3.0, 3.0
+"""Start of the specular weight and of the roughness, 0.96: nearly matt, so that highlights have to appear in the
+photographs first. A sharper lobe would be brighter than a black surface, whose normals would turn away from it."""
 POINTS_PER_PART = 65536
 """Points that :func:`in_parts` evaluates at once, which bounds the memory."""
 
@@ -243,7 +244,8 @@ def initial(architecture: Architecture, log_density: float, generator: torch.Gen
     for name, net in architecture.networks().items():
         tensors[f"{name}.layers.{len(net.hidden)}.weight"] *= 0.1
     tensors[f"density.layers.{len(architecture.density.hidden)}.bias"] += log_density
-    tensors[f"reflectance.layers.{len(architecture.reflectance.hidden)}.bias"][7] += INITIAL_SPECULAR_LOGIT
+    lobe = tensors[f"reflectance.layers.{len(architecture.reflectance.hidden)}.bias"][6:]
+    lobe += torch.tensor([INITIAL_ROUGHNESS_LOGIT, INITIAL_SPECULAR_LOGIT])
     return Networks(architecture, {k: v.requires_grad_() for k, v in tensors.items()})
 
 

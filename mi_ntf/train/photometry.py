@@ -31,6 +31,11 @@ class Gains:
         self.first = photographs.first
         self.logs = torch.nn.Parameter((logs - logs.mean(0)).clamp(-2, 2))
 
+    @torch.no_grad()
+    def resume(self, gains: torch.Tensor) -> None:
+        """Go on from the `gains` (views, 3) of an earlier run."""
+        self.logs.copy_(gains.log())
+
     def all(self) -> torch.Tensor:
         """Return the gains (views, 3)."""
         return (self.logs - self.logs.mean(0)).exp()

@@ -2,6 +2,7 @@
 
 import functools
 import math
+import time
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -19,9 +20,6 @@ from .training_data import TrainingData
 
 FIELD = ("density", "reflectance")
 """Networks that photographs train; the others learn from the field."""
-SCORING_TIME = 0.09
-"""Fraction of the minutes that is reserved for the scores and the page of the finished field."""
-
 Snapshot = dict[str, Tensors]
 """Copies of tensors, by what they belong to."""
 
@@ -32,8 +30,23 @@ class Clock:
 
     minutes: float = math.inf
     steps: float = math.inf
+    first: int = 0  # Steps that the field was trained for before this run
+    begin: float = 0.0  # Time of the schedule at which this run begins, as a fraction
     step: int = 0
     spent: float = 0.0  # Seconds so far
+    reserve: float = 0.0  # Seconds at the end for the scores and the page of the finished field
+    last: float = field(default_factory=time.monotonic)
+    """Moment up to which `spent` counts."""
+
+    def tick(self) -> None:
+        """Count the time since the last call as spent."""
+        now = time.monotonic()
+        self.spent, self.last = self.spent + now - self.last, now
+
+    @property
+    def left(self) -> float:
+        """Seconds that are left of a run that is limited by time; 0 of other ones."""
+        return max(60 * self.minutes - self.spent - (time.monotonic() - self.last), 0.0) if self.timed else 0.0
 
     @property
     def timed(self) -> bool:
@@ -42,8 +55,9 @@ class Clock:
 
     @property
     def progress(self) -> float:
-        """Fraction of the run that is done, in [0, 1]."""
-        return max(self.step / self.steps, self.spent / (60 * self.minutes * (1 - SCORING_TIME)))
+        """Time of the schedule, as a fraction of a run, in [0, 1]."""
+        done = max((self.step - self.first) / self.steps, self.spent / (60 * self.minutes - self.reserve))
+        return self.begin + (1 - self.begin) * done
 
 
 @dataclass

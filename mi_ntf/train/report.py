@@ -9,7 +9,7 @@ import torch
 from ..data.page import Page
 from ..data.schema import Split
 from . import device
-from .agreement import MOVED, Agreement, survey
+from .agreement import MOVED, PIXELS, Agreement, survey
 from .checkpoint import State
 from .flash import Flash
 from .monitor import Notes, Validation
@@ -29,15 +29,27 @@ LAMPS = 8
 """Positions of the lamp that goes around the object …"""
 LAMP_WIDTH = 180
 """… and the pixels of the longer side of these pictures."""
+GOOD, USABLE = 30.0, 25.0
+"""PSNR of the test views, dB, from which a field is good, and from which it is usable."""
 
 
-def complaints(agreement: Agreement, splits: dict[str, Split]) -> list[str]:
-    """Return a sentence for each fault of the photographs."""
+def verdict(psnr: float) -> str:
+    """Return a sentence on the quality of a field, by the PSNR of its test views in dB."""
+    if psnr >= GOOD:
+        return f"test views {psnr:.1f} dB: good"
+    if psnr >= USABLE:
+        return f"test views {psnr:.1f} dB: usable; more minutes with --continue make it finer"
+    return (f"test views {psnr:.1f} dB: poor; train for longer with --continue, or look at the photographs with "
+            "`mi-ntf inspect`")
+
+
+def complaints(agreement: Agreement, splits: dict[str, Split], posed: bool = False) -> list[str]:
+    """Return a sentence for each fault of the photographs; `posed` is true if their poses are known to be exact."""
     if not agreement.known:
         return ["warning: the field has hardly learned the photographs, whose poses and masks cannot be judged by it; "
-                "train for longer, or look at them with `mi-ntf inspect`"]
+                "train for longer with --continue, or look at them with `mi-ntf inspect`"]
     texts, names = [], splits["train"].names
-    if agreement.moved > MOVED:
+    if agreement.moved > MOVED and not posed:
         width = splits["train"].focal.mean()
         degrees = float(torch.rad2deg(torch.tensor(agreement.moved / width)))
         texts.append(f"warning: the photographs are moved against each other by {agreement.moved:.2g} pixels "
@@ -52,14 +64,27 @@ def complaints(agreement: Agreement, splits: dict[str, Split]) -> list[str]:
     return texts
 
 
-def judge(field: FieldView, data: TrainingData, gains: torch.Tensor | None, notes: Notes, report: Report, most: float
-          ) -> Agreement:
-    """Judge the photographs by the finished `field`, from about `most` pixels; add the result to `report` and `notes`.
+def scored_pixels(data: TrainingData) -> int:
+    """Return the number of pixels that scores and :func:`judge` render."""
+    return 2 * len(data.photographs["val"]) + 2 * len(data.photographs["test"]) + PIXELS * len(data.splits["train"].c2w)
 
-    `gains` (views, 3) are those of the photographs, if they are learned.
+
+def page_pixels(data: TrainingData) -> int:
+    """Return the number of pixels that :func:`publish` renders; those under the lamp count twice, with shadows."""
+    pool = data.photographs["test"]
+    shown, lit = (len(pool.frame(0, _stride(pool, width))[0]) for width in (WIDTH, LAMP_WIDTH))
+    return 2 * SHOWN * shown + 2 * LAMPS * lit
+
+
+def judge(field: FieldView, data: TrainingData, gains: torch.Tensor | None, notes: Notes, report: Report,
+          detail: float = 1.0) -> Agreement:
+    """Judge the photographs by the finished `field`; add the result to `report` and `notes`.
+
+    `gains` (views, 3) are those of the photographs, if they are learned. `detail` is the fraction of the pixels to
+    compare.
     """
-    agreement = survey(field, data.train, gains, most)
-    for text in complaints(agreement, data.splits):
+    agreement = survey(field, data.train, gains, round(detail * PIXELS))
+    for text in complaints(agreement, data.splits, data.posed):
         notes.add(text)
     report["notes"] = notes.texts
     report["photographs"] = {"moved": round(agreement.moved, 3)}
@@ -67,23 +92,31 @@ def judge(field: FieldView, data: TrainingData, gains: torch.Tensor | None, note
         names = data.train.names or tuple(map(str, range(len(gains))))
         values = ([round(v, 4) for v in row] for row in gains.tolist())
         report["photographs"]["gains"] = dict(zip(names, values, strict=True))
+    bounced = field.light.bounced
+    if bounced is not None and bounced.room is not None:
+        report["photographs"]["room"] = bounced.room.detach().exp().tolist()
     return agreement
 
 
 def publish(field: FieldView, data: TrainingData, gains: torch.Tensor | None, agreement: Agreement, report: Report,
-            trace: list[tuple[int, float]], out: Path) -> None:
-    """Write the page beside the field file `out`; `trace` holds steps and running means of the loss."""
+            trace: list[tuple[int, float]], marched: TransmittanceTargets, out: Path, detail: float = 1.0) -> None:
+    """Write the page beside the field file `out`.
+
+    `trace` holds steps and running means of the loss, `marched` the density of the field. Pictures have the fraction
+    `detail` of their pixels.
+    """
     page = Page(out.name)
     _summary(page, report, field.light.fit)
-    _test_views(page, field, data.photographs["test"])
-    _turning_lamp(page, field, data.photographs["test"])
+    _test_views(page, field, data.photographs["test"], detail)
+    _turning_lamp(page, field, data.photographs["test"], marched, detail)
     _curves(page, report["history"], trace)
     _photographs(page, data.train.names, agreement, gains)
     page.write(out.with_suffix(".html"))
 
 
 def _summary(page: Page, report: Report, fit: bool) -> None:
-    """Add scores, notes and faults; `fit` is true if gains were fitted to held-out photographs."""
+    """Add verdict, scores, notes and faults; `fit` is true if gains were fitted to held-out photographs."""
+    page.text(f"{report['verdict'].capitalize()}.")
     rows: list[list[object]] = [["steps", report["steps_done"]], ["minutes", f"{report['seconds'] / 60:.1f}"]]
     for name, title in (("val", "validation"), ("test", "test views")):
         scores = report[name]
@@ -98,11 +131,11 @@ def _summary(page: Page, report: Report, fit: bool) -> None:
         page.warning(f"step {fault['step']}: {fault['reason']}; rolled back")
 
 
-def _test_views(page: Page, field: FieldView, photographs: Photographs) -> None:
+def _test_views(page: Page, field: FieldView, photographs: Photographs, detail: float) -> None:
     """Add photographs beside renderings of the field."""
     page.section("Test views")
     for number in torch.linspace(0, photographs.views - 1, min(SHOWN, photographs.views)).round().long().tolist():
-        rays, shape = _rays(photographs, number, WIDTH)
+        rays, shape = _rays(photographs, number, WIDTH, detail)
         pixels = _render(field, rays)
         target = rays.target[:, :3]
         color = pixels.color * fitted(pixels.color, target) if field.light.fit else pixels.color
@@ -113,13 +146,12 @@ def _test_views(page: Page, field: FieldView, photographs: Photographs) -> None:
             ("normals", (pixels.normal + pixels.alpha[:, None]) / 2), ("albedo", srgb(pixels.albedo)))], 200)
 
 
-def _turning_lamp(page: Page, field: FieldView, photographs: Photographs) -> None:
+def _turning_lamp(page: Page, field: FieldView, photographs: Photographs, marched: TransmittanceTargets, detail: float
+                  ) -> None:
     """Add the first photograph under a lamp that goes around the object, at the camera's height and distance."""
     page.section("Under a turning lamp")
-    rays, shape = _rays(photographs, 0, LAMP_WIDTH)
+    rays, shape = _rays(photographs, 0, LAMP_WIDTH, detail)
     rays = replace(rays, view=torch.zeros_like(rays.view))
-    marched = TransmittanceTargets()
-    marched.update(field.networks, field.occupancy)
     lamp = Flash([photographs], field.light.flash is None or field.light.flash.solid, marched)
     camera = lamp.camera[0]
     up = lamp.rotation[0, :, 1]
@@ -162,10 +194,15 @@ def _photographs(page: Page, names: tuple[str, ...], agreement: Agreement, gains
                folded=f"{len(rows)} photographs")
 
 
-def _rays(photographs: Photographs, number: int, width: int) -> tuple[Rays, tuple[int, int]]:
-    """Return the rays of photograph `number`, scaled to about `width` pixels, and the picture's shape."""
-    stride = max(1, round(max(photographs.height, photographs.width) / width))
-    pixels, rows, columns = photographs.frame(number, stride)
+def _stride(photographs: Photographs, width: float) -> int:
+    """Return the number of pixels per pixel of a picture whose longer side has about `width` of them."""
+    longer: int = max(photographs.height, photographs.width)
+    return max(1, round(longer / width))
+
+
+def _rays(photographs: Photographs, number: int, width: int, detail: float) -> tuple[Rays, tuple[int, int]]:
+    """Return the rays of photograph `number`, scaled to about `width` pixels at `detail` 1, and the picture's shape."""
+    pixels, rows, columns = photographs.frame(number, _stride(photographs, width * detail**0.5))
     return photographs[pixels], (rows, columns)
 
 

@@ -1,7 +1,6 @@
 """Reproduction error of photographs: PSNR of images rendered from the networks alone, as the renderer does."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -102,11 +101,11 @@ def occupied(networks: Networks) -> Occupancy:
 
 @torch.no_grad()
 def score(field: FieldView, photographs: Photographs, most: float = math.inf, views: int | None = None,
-          passes: int = 2, tell: Callable[[float], None] = lambda done: None) -> Scores:
+          passes: int = 2) -> Scores:
     """Compare the field with the photographs of a split, or the first `views` of them.
 
     At most `most` pixels are compared, random ones, the same in every call. Each is the mean of `passes` jittered
-    evaluations. `tell` is called with the fraction that is done.
+    evaluations.
     """
     count = photographs.views if views is None else min(views, photographs.views)
     each, generator = [], device.generator(1)
@@ -125,7 +124,6 @@ def score(field: FieldView, photographs: Photographs, most: float = math.inf, vi
         each.append((decibels(float(error.mean())), decibels(float((color - target[:, :3]).square().mean())),
                      decibels(float(error[matter].mean())) if bool(matter.any()) else math.nan,
                      float((alpha - target[:, 3])[known].square().mean())))
-        tell((number + 1) / count)
     whole, linear, object_, mean_square = torch.tensor(each).T
     return Scores(float(whole.mean()), float(linear.mean()), float(object_.nanmean()),
                   math.sqrt(float(mean_square.nanmean())), tuple(whole.tolist()))

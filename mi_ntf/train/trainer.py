@@ -2,30 +2,29 @@
 
 import copy
 import dataclasses
-import hashlib
 import json
 import math
 import os
 import time
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypedDict
 
-import numpy as np
 import torch
 
-from ..core import field_file, files
-from ..core.architecture import Header
+from ..core import files, progress
 from ..core.errors import MiNtfError
 from ..data.schema import fingerprint
-from . import checkpoint, device, held_out, networks, parallel, scoring
+from . import checkpoint, device, parallel, scoring
 from .checkpoint import State
-from .config import Config, FastConfig, configured, transmittance_alone
+from .config import Config, FastConfig, configured
 from .fast import Fast
+from .finish import finish
+from .finished import FinishedField
 from .hierarchical import Hierarchical
-from .monitor import Display, Fault, Log, Notes, Validation
-from .recipe import SCORING_TIME, Clock, Learner, Recipe, Run, Snapshot, copy_into
-from .report import Report, judge, publish
+from .monitor import Fault, Log, Notes, Validation
+from .pace import Pace
+from .recipe import Clock, Learner, Recipe, Run, copy_into
+from .record import FaultEntry, Record
+from .report import Report
 from .scoring import FieldView
 from .training_data import Reading, TrainingData
 
@@ -37,19 +36,13 @@ LATEST = 75.0
 """… or, where steps are slow, a copy made for it after this time."""
 FAULTS = 3
 """Rolled-back faults after which the next one ends the run."""
-VALIDATED = 1 << 17
-"""Pixels of a validation during the run."""
-SCORED = 1 << 14
-"""Least number of pixels by which a split of the finished field is scored, in the shortest runs."""
-BETTER = 0.02
-"""Validation gain, dB, for which an earlier field replaces the last one."""
 
 
 def train(dataset: Path, out: Path, *, preset: str = "fast", minutes: float | None = None, steps: int | None = None,
-          seed: int = 0, tensorboard: Path | None = None, field: Path | None = None, reading: Reading | None = None,
-          estimate: bool = False, view: bool = False, ntf: str | None = None, augmentation: bool = True,
-          colour_loss: bool = True, visibility_mlp: bool = False, bounces: bool = True, fresnel: bool = True,
-          gains: bool = True) -> Report:
+          seed: int = 0, tensorboard: Path | None = None, field: Path | None = None, further: bool = False,
+          reading: Reading | None = None, estimate: bool = False, view: bool = False, ntf: str | None = None,
+          augmentation: bool = True, colour_loss: bool = True, visibility_mlp: bool = False, bounces: bool = True,
+          fresnel: bool = True, gains: bool = True, began: float | None = None) -> Report:
     """Train a field on the photographs in `dataset`, write it to `out`, and return the report, which its header holds.
 
     Parameters
@@ -60,6 +53,8 @@ def train(dataset: Path, out: Path, *, preset: str = "fast", minutes: float | No
         Folder for TensorBoard events.
     field
         Field file to keep as it is; its transmittance networks alone are trained, from the beginning.
+    further
+        Begin with the field in `out`, train all of it further, and replace it. It becomes no worse in validation.
     reading
         Options of :func:`mi_ntf.data.readers.load_dataset`.
     estimate
@@ -68,6 +63,8 @@ def train(dataset: Path, out: Path, *, preset: str = "fast", minutes: float | No
         Show the field in a browser while it learns.
     ntf, augmentation, colour_loss, visibility_mlp, bounces, fresnel, gains
         Changes of the preset, see :func:`mi_ntf.train.config.configured`.
+    began
+        Moment of `time.monotonic` from which `minutes` count; by default that of the call.
 
     Notes
     -----
@@ -79,9 +76,13 @@ def train(dataset: Path, out: Path, *, preset: str = "fast", minutes: float | No
     """
     config = configured(preset, ntf=ntf, augmentation=augmentation, colour_loss=colour_loss,
                         visibility_mlp=visibility_mlp, bounces=bounces, fresnel=fresnel, gains=gains)
-    finished = None if field is None else FinishedField.load(field)
+    if further and field is not None:
+        raise MiNtfError("--continue trains all of a field and --field its transmittance alone; give one of them")
+    if further and not out.exists() and Path(f"{out}.ckpt").exists():
+        raise MiNtfError(f"{out} is not finished yet; leave out --continue, and its training goes on")
+    finished = FinishedField.load(out, True) if further else FinishedField.load(field) if field is not None else None
     if finished is not None:
-        config = transmittance_alone(config, finished.header.architecture)
+        config = finished.configured(config, ntf)
     if minutes is not None and steps is not None:
         raise MiNtfError(f"both --minutes {minutes:g} and --steps {steps} are given; a run is limited by one of them")
     limit = steps if steps is not None else 10.0 if minutes is None else minutes
@@ -93,60 +94,8 @@ def train(dataset: Path, out: Path, *, preset: str = "fast", minutes: float | No
         torch.set_num_threads(_threads() if steps is None and parallel.count() == 1 else 1)
         trainer = Trainer(Path(dataset), Path(out), config, preset, minutes=None if steps is not None else float(limit),
                           steps=steps, seed=seed, tensorboard=tensorboard, finished=finished, reading=reading,
-                          estimate=estimate, view=view)
-        trainer.resume()
-        trainer.loop()
-        return trainer.finish() if parallel.first() else {}
-
-
-@dataclass(frozen=True)
-class FinishedField:
-    """A field file whose density and reflectance a run keeps."""
-
-    path: Path
-    header: Header
-    tensors: dict[str, np.ndarray]
-
-    @classmethod
-    def load(cls, path: Path) -> "FinishedField":
-        """Read the field file `path`. Raises MiNtfError."""
-        return cls(path, *field_file.load(path))
-
-    def check(self, data: TrainingData) -> None:
-        """Raise MiNtfError if the field was not trained on the data set `data`."""
-        here, there = ((*s.center, s.radius) for s in (data.similarity, self.header.similarity))
-        if max(abs(a - b) for a, b in zip(here, there, strict=True)) > 1e-4 * data.similarity.radius:
-            raise MiNtfError(f"{self.path} has its unit sphere (centre, radius) at {there}, the data set has it at "
-                             f"{here}; --field needs the data set that the field was trained on")
-
-
-class FaultEntry(TypedDict):
-    """Entry of the list of faults."""
-
-    step: int
-    reason: str
-
-
-class Best(TypedDict):
-    """The field of the best validation so far."""
-
-    psnr: float
-    entry: Validation
-    snapshot: Snapshot
-
-
-@dataclass
-class Record:
-    """Course of a run; part of checkpoints."""
-
-    history: list[Validation] = field(default_factory=list)
-    trace: list[tuple[int, float]] = field(default_factory=list)
-    """Steps and running means of the loss, a hundred in a run."""
-    faults: list[FaultEntry] = field(default_factory=list)
-    validated: float = 0.0  # Progress at the last validation
-    best: Best | None = None
-    chosen: Validation | None = None
-    """Validation of the finished field; None before."""
+                          estimate=estimate, view=view, began=began)
+        return trainer.run()
 
 
 class Trainer:
@@ -158,88 +107,115 @@ class Trainer:
     def __init__(self, dataset: Path, out: Path, config: Config, preset: str, *, minutes: float | None = None,
                  steps: int | None = None, seed: int = 0, tensorboard: Path | None = None,
                  finished: FinishedField | None = None, reading: Reading | None = None, estimate: bool = False,
-                 view: bool = False):
-        start = time.monotonic()
+                 view: bool = False, began: float | None = None):
+        self.clock = clock = Clock(minutes or math.inf, steps or math.inf)
+        clock.last = clock.last if began is None else began
         self.log = Log(tensorboard if parallel.first() else None, view and parallel.first())
         self.notes = Notes(parallel.first())
         reading = reading or {}
         if estimate and reading.get("flash_offset") is None:
             reading = {**reading, "flash_offset": "estimate"}
-        self.data = TrainingData.load(dataset, self.notes, reading)
-        self.clock = Clock(minutes or math.inf, steps or math.inf, spent=time.monotonic() - start)
+        with self.stage("reading photographs"):
+            self.data = TrainingData.load(dataset, self.notes, reading)
+        self.pace = Pace(clock, self.data)
         self.learner = Learner(self.clock)
         self.generator = device.generator(seed)
         if finished is not None:
             finished.check(self.data)
-        run = Run(self.data, self.clock, self.learner, self.notes, self.generator)
+            clock.first = clock.step = finished.steps
+            clock.begin = finished.begin(minutes, steps)
+        self.parts = run = Run(self.data, self.clock, self.learner, self.notes, self.generator)
         self.recipe: Recipe
         if isinstance(config, FastConfig):
-            self.recipe = Fast(config, run, estimate, None if finished is None else finished.tensors)
+            with self.stage("preparing the field"):
+                self.recipe = Fast(config, run, estimate, finished)
         else:
             self.recipe = Hierarchical(config, run, estimate)
         self.out, self.checkpoint, self.finished = out, Path(f"{out}.ckpt"), finished
-        digest = None if finished is None else hashlib.sha256(finished.path.read_bytes()).hexdigest()
+        digest = None if finished is None else finished.digest()
         self.settings: State = {"preset": preset, "minutes": minutes, "steps": steps, "seed": seed,
                                 "views": {k: len(s.images) for k, s in self.data.splits.items()}}
         identity = self.settings | {"config": dataclasses.asdict(config), "field": digest, "estimate": estimate,
                                     "data": fingerprint(self.data.splits)}
         self.identity: State = json.loads(json.dumps(identity, sort_keys=True))
         self.record = Record()
+        if finished is not None and finished.further:  # its field is the first to be validated
+            self.record = Record(history=finished.header.provenance.get("history", []), validated=-1.0)
         self.good: State = {}  # Latest good state of the run
-        self.speed = 0.0  # Pixels a second of the last validation
         self.last = math.nan  # PSNR of the last validation, dB
         self.saved = time.monotonic()  # Time of the last checkpoint
+
+    def run(self) -> Report:
+        """Continue a checkpoint if there is one, train to the limit, write the field and return its report."""
+        self.resume()
+        try:
+            self.loop()
+            return self.finish() if parallel.first() else {}
+        except KeyboardInterrupt:
+            if not self.good:
+                raise
+            self.save()
+            clock = self.clock
+            limit = f"{clock.minutes:g} min" if clock.timed else f"{clock.first + clock.steps:g}"
+            raise KeyboardInterrupt(f"stopped at step {self.good['step']} of {limit}; the same command goes on"
+                                    ) from None
+
+    def finish(self) -> Report:
+        """Write the field and its page, delete the checkpoint, and return the report."""
+        report = finish(self.parts, self.recipe, self.record, self.pace, self.finished, self.settings, self.out)
+        checkpoint.delete(self.checkpoint)
+        return report
+
+    def stage(self, title: str) -> progress.Stage:
+        """Return the stage `title` of the run, whose time left is that of the run, or estimated if it has steps."""
+        return progress.Stage(title, seconds=self.clock.left, shown=parallel.first())
 
     def loop(self) -> None:
         """Step until the limit; show progress, validate, save checkpoints, roll back faults."""
         clock = self.clock
-        if not clock.step and self.finished is None:
-            self.recipe.carve()
-        self.log.start(clock.step)
-        self.keep()
-        self.saved, traced, average = time.monotonic(), clock.progress, math.nan
-        with Display(parallel.first()) as display:
-            try:
-                while clock.progress < 1:
-                    try:
-                        value = self.turn(display)
-                    except Fault as fault:
-                        display.say(self.roll_back(fault))
-                        continue
-                    average = value if math.isnan(average) else 0.98 * average + 0.02 * value
-                    if clock.progress - traced > 0.01:
-                        traced = clock.progress
-                        self.record.trace.append((clock.step, average))
-                    if clock.step % 20 == 0:
-                        display.update(clock.progress, clock.step, average)
-                    if self.due():
-                        self.save()
-                        self.saved = time.monotonic()
-                if self.record.chosen is None:  # field and transmittance have learnt together to the end
-                    display.validated(self.validate())
-                    display.say(self.choose())
-                display.update(clock.progress, clock.step, 0.0 if math.isnan(average) else average)
-            except KeyboardInterrupt:
-                self.save()
-                raise
+        with self.stage("training") as stage:
+            if not clock.step and self.finished is None:
+                with progress.Stage("shaping the visual hull", inner=True):
+                    self.recipe.carve()
+            self.log.start(clock.step)
+            self.keep()
+            self.saved, traced, average = time.monotonic(), clock.progress, math.nan
+            while clock.progress < 1:
+                try:
+                    value = self.turn()
+                except Fault as fault:
+                    self.say(self.roll_back(fault), warning=True)
+                    continue
+                average = value if math.isnan(average) else 0.98 * average + 0.02 * value
+                if clock.progress - traced > 0.01:
+                    traced = clock.progress
+                    self.record.trace.append((clock.step, average))
+                stage.update(clock.progress, f"step {clock.step}, loss {average:.3f}, validation " +
+                             ("–" if math.isnan(self.last) else f"{self.last:.1f} dB"))
+                if self.due():
+                    self.save()
+                    self.saved = time.monotonic()
+            if self.record.chosen is None:  # field and transmittance have learnt together to the end
+                self.validate()
+                self.choose()
         self.log.close()
 
-    def turn(self, display: Display) -> float:
+    def turn(self) -> float:
         """Take one step, do what is due around it, and return the loss. Raises Fault."""
-        start, clock, record = time.monotonic(), self.clock, self.record
+        clock, record = self.clock, self.record
         finished = clock.progress >= self.recipe.field_until
         validate = record.chosen is None if finished else clock.progress - record.validated > 0.1
         if validate:
             record.validated = clock.progress
-            display.validated(self.validate())
+            self.validate()
             if finished:
-                display.say(self.choose())
+                self.choose()
         value = self.recipe.advance()
         clock.step += 1
         if clock.step % 20 == 0:
             self.log_scalars()
             self.log.show(clock.step, self.last, self.picture)
-        clock.spent += time.monotonic() - start
+        clock.tick()
         if clock.timed:
             clock.spent = parallel.agreed(clock.spent)
             if validate:
@@ -268,18 +244,23 @@ class Trainer:
         recipe = self.recipe
         return FieldView(recipe.networks, recipe.occupied(), recipe.config.step, recipe.light)
 
-    def validate(self) -> Validation:
+    def validate(self) -> None:
         """Measure the PSNR of some validation views, and remember the field if it is the best so far."""
-        pool, start, record = self.data.photographs["val"], time.monotonic(), self.record
+        pool, record, field = self.data.photographs["val"], self.record, self.view
         views = min(4, pool.views)
-        self.last = scoring.score(self.view, pool, VALIDATED, views, 1).srgb
-        self.speed = min(VALIDATED, views * pool.height * pool.width) / max(time.monotonic() - start, 1e-6)
+        with progress.Stage("validating", inner=True):
+            if self.pace.speed == math.inf:
+                pixels = self.pace.rehearse(self.recipe.networks, field, pool, views)
+                record.pixels = record.pixels if record.history else pixels
+            self.last = self.pace.score(field, pool, record.pixels, views, 1).srgb
+        if self.clock.progress < self.recipe.field_until:  # later, the schedule must not go back
+            self.pace.reserve()
         entry: Validation = {"step": self.clock.step, "psnr": round(self.last, 4)}
         record.history.append(entry)
         self.log.validated(entry, self.picture)
         if record.best is None or self.last > record.best["psnr"]:
             record.best = {"psnr": self.last, "entry": entry, "snapshot": self.recipe.snapshot()}
-        return entry
+        self.say(f"step {entry['step']}: validation {entry['psnr']:.2f} dB")
 
     def picture(self) -> torch.Tensor:
         """Return a small picture (h, w, 3), sRGB: a held-out photograph, the field's, and its normals."""
@@ -290,17 +271,23 @@ class Trainer:
         parts = scoring.srgb(rays.target[:, :3]), scoring.srgb(rendered.color), (rendered.normal + 1) / 2
         return torch.cat([p.view(rows, columns, 3) for p in parts], 1).clamp(0, 1)
 
-    def choose(self) -> str:
-        """Finish the field, which is that of the best validation if the last one is worse; return a message."""
+    def choose(self) -> None:
+        """Finish the field: that of the best validation."""
         record, step = self.record, self.clock.step
         best, record.best = record.best, None
         record.chosen = record.history[-1]
-        if best is None or best["psnr"] - self.last <= BETTER:
-            return f"step {step}: the field is finished"
-        record.chosen = best["entry"]
-        self.recipe.adopt(best["snapshot"])
-        return (f"step {step}: the field is finished; the one of step {record.chosen['step']} is kept, since it is "
-                f"better by {best['psnr'] - self.last:.2f} dB in validation")
+        text = f"step {step}: the field is finished"
+        if best is not None and best["psnr"] > self.last:
+            record.chosen = best["entry"]
+            self.recipe.adopt(best["snapshot"])
+            text += (f"; the one of step {record.chosen['step']} is kept, since it is better by "
+                     f"{best['psnr'] - self.last:.2f} dB in validation")
+        self.say(text)
+
+    def say(self, text: str, warning: bool = False) -> None:
+        """Print a line, in the first of several processes."""
+        if parallel.first():
+            progress.say(text, warning)
 
     def state(self) -> State:
         """Return a copy of all that decides the next step: a run that restores it is the same run."""
@@ -353,44 +340,17 @@ class Trainer:
 
     def resume(self) -> None:
         """Continue a checkpoint if there is one. Raises MiNtfError if it belongs to another run."""
-        state, reading = checkpoint.read(self.checkpoint, self.identity), self.clock.spent
+        state = checkpoint.read(self.checkpoint, self.identity)
+        self.clock.tick()
+        reading = self.clock.spent
         if state is not None:
             self.restore(state)
             self.clock.spent += reading
+            self.say(f"goes on from step {self.clock.step}")
         step = self.clock.step
         if parallel.agreed(step) != step:
             raise MiNtfError(f"{self.checkpoint} is at step {step} for this process and at another for the first; "
                              "put it where all processes see it, or delete it")
-
-    def finish(self) -> Report:
-        """Write the field, read it back, measure it, and store the report in its header."""
-        data, recipe, record = self.data, self.recipe, self.record
-        architecture, tensors = recipe.config.architecture, networks.to_tensors(recipe.networks)
-        report: Report = dict(self.settings)
-        if self.finished is not None:
-            report["field"] = self.finished.header.provenance
-        report |= {"bounces": recipe.light.bounced is not None, "steps_done": self.clock.step,
-                   "seconds": round(self.clock.spent, 1), "history": record.history, "kept": record.chosen,
-                   "faults": record.faults}
-        header = Header(architecture, data.similarity, report)
-        field_file.save(self.out, header, tensors)
-        stored = networks.from_tensors(architecture, field_file.load(self.out)[1])
-        field = FieldView(stored, scoring.occupied(stored), recipe.config.step, recipe.light)
-        # There is time to look at this many pixels of a split, of both splits twice each.
-        most = max(SCORED, self.speed * 60 * self.clock.minutes * SCORING_TIME / 10) if self.clock.timed else math.inf
-        with Display(parallel.first(), "score") as display:
-            for i, name in enumerate(("val", "test")):
-                def tell(done: float, splits: int = i) -> None:
-                    display.update((splits + done) / 2)
-
-                report[name] = scoring.score(field, data.photographs[name], most, tell=tell).rounded()
-        report["transmittance"] = held_out.score(stored, field.occupancy, data.photographs["val"])
-        gains = None if recipe.gains is None else recipe.gains.all().detach()
-        agreement = judge(field, data, gains, self.notes, report, most)
-        field_file.save(self.out, header, tensors)
-        publish(field, data, gains, agreement, report, record.trace, self.out)
-        checkpoint.delete(self.checkpoint)
-        return report
 
 
 def _threads() -> int:

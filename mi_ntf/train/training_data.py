@@ -38,6 +38,7 @@ class TrainingData:
     """Fraction of the object's pixels that nothing shines through: 0.9 and more of solid objects, 0.01 of a cloud."""
     exposure: float  # Factor that brings the bright parts of the object to 1
     on_lens: bool  # True if all lights are at their lenses, as far as the data set tells
+    posed: bool  # True if the poses are exact, since `mi-ntf capture` has rendered the photographs
 
     @classmethod
     def load(cls, folder: Path, notes: Notes, reading: Reading) -> "TrainingData":
@@ -54,7 +55,8 @@ class TrainingData:
         opaque = float((matter[:, 3] > 0.99).float().mean()) if len(matter) else 1.0
         bright = matter[matter[:, 3] > 0.5][:, :3].mean(1)
         exposure = 1 / max(float(bright.quantile(0.95)) if 0 < len(bright) else 1.0, 1e-6)
-        return cls(splits, photographs, opaque, exposure, all(p.on_lens for p in photographs.values()))
+        return cls(splits, photographs, opaque, exposure, all(p.on_lens for p in photographs.values()),
+                   (folder / "capture.json").is_file())
 
     @property
     def solid(self) -> bool:

@@ -130,7 +130,9 @@ def render(networks: Networks, rays: Rays, samples: Samples, bounced: Bounced | 
     """Render colour and alpha of `rays` from packed samples.
 
     `bounced` are further bounces of the light, sampled with `generator`. Without `lobes`, roughness and specular weight
-    get no gradient. `flash` are lights beside the lenses; without it, the light is at the lens.
+    get no gradient, and colours give none to normals: dark pixels then mean a dark albedo. Where a normal has turned
+    away from the light, neither of them would learn from colours any more. `flash` are lights beside the lenses;
+    without it, the light is at the lens.
     """
     ray, t, width = samples
     x = torch.addcmul(rays.o[ray], rays.d[ray], t[:, None])
@@ -141,7 +143,10 @@ def render(networks: Networks, rays: Rays, samples: Samples, bounced: Bounced | 
     near = (w.detach() > MIN_WEIGHT).nonzero()[:, 0]
     ray, t, x, w, view = ray[near], t[near], x[near], w[near], rays.view[ray[near]]
     reflectance = networks.reflectance(x)
-    shaded = Reflectance(*reflectance[:2], *(v.detach() for v in reflectance[2:])) if not lobes else reflectance
+    shaded = reflectance
+    if not lobes:
+        reflectance = Reflectance(*reflectance[:2], *(v.detach() for v in reflectance[2:]))
+        shaded = reflectance._replace(normal=reflectance.normal.detach())
     if flash is None:
         radiance = shade(shaded, rays.d[ray], t, rays.light[ray], networks.fresnel)
         color = scatter_sum(v[near, None] * radiance, ray, len(rays))
@@ -154,7 +159,7 @@ def render(networks: Networks, rays: Rays, samples: Samples, bounced: Bounced | 
         radiosity = shaded.diffuse_albedo(networks.fresnel) * irradiance * microfacet.INV_PI
         indirect = scatter_sum(w[:, None] * radiosity, ray, len(rays))
         color = color + indirect
-    return Image(color, alpha, x, ray, near, w, shaded, radiance, raw, indirect)
+    return Image(color, alpha, x, ray, near, w, reflectance, radiance, raw, indirect)
 
 
 def _lit(flash: Flash, rays: Rays, ray: torch.Tensor, w: torch.Tensor, x: torch.Tensor, normal: torch.Tensor

@@ -26,7 +26,7 @@ trainer.KEEP, trainer.INTERVAL = 4, 0.0
 
 def main(dataset: str, out: str, steps: str, death: str = "") -> None:
     losses, writes = {}, []
-    advance, finish, replace = fast.Fast.advance, trainer.Trainer.finish, os.replace
+    advance, finish, replace = fast.Fast.advance, trainer.finish, os.replace
 
     def die_if(event: str) -> None:
         if event == death:
@@ -43,12 +43,12 @@ def main(dataset: str, out: str, steps: str, death: str = "") -> None:
         die_if(f"write {len(writes)}")
         replace(source, target)
 
-    def finished(run):
-        np.savez(f"{out}.npz", **networks.to_tensors(run.recipe.networks))
-        Path(f"{out}.json").write_text(json.dumps({"losses": losses, "history": run.record.history}))
-        return finish(run)
+    def finished(run, recipe, record, *rest):
+        np.savez(f"{out}.npz", **networks.to_tensors(recipe.networks))
+        Path(f"{out}.json").write_text(json.dumps({"losses": losses, "history": record.history}))
+        return finish(run, recipe, record, *rest)
 
-    fast.Fast.advance, trainer.Trainer.finish, os.replace = recorded, finished, replaced
+    fast.Fast.advance, trainer.finish, os.replace = recorded, finished, replaced
     fast.Fast.carve = functools.partialmethod(fast.Fast.carve, steps=20)
     two_spheres.coarsen(pytest.MonkeyPatch())
     two_spheres.glance(pytest.MonkeyPatch())

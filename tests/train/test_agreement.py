@@ -90,6 +90,34 @@ def test_known_shifts_are_found(size):
     np.testing.assert_allclose(together.shift.median(0).values, [0.4, -0.3], atol=0.15)
 
 
+def test_poses_of_captures_are_not_doubted():
+    """The renderer has placed the cameras: what looks like a shift is an error of the field."""
+    actual, said = survey(pictures(0.8 * RANDOM))
+    assert len(said) == 1
+    split = shots.split(pictures(0.8 * RANDOM), FOCAL, C2W, names=NAMES)
+    assert report.complaints(actual, {"train": split}, posed=True) == []
+
+
+def test_errors_of_the_field_are_no_shift():
+    """One half of each photograph is moved, in another direction each, as it looks where edges of the field are soft.
+
+    The halves do not agree on a shift, so the poses are not doubted.
+    """
+    still, moved = pictures(np.zeros((VIEWS, 2))), pictures(0.8 * RANDOM)
+    still[:, :, :SIDE // 2] = moved[:, :, :SIDE // 2]
+    actual, said = survey(still)
+    apart = actual.shift - actual.shift.median(0).values
+    assert float(apart.square().sum(1).mean().sqrt()) > agreement.MOVED
+    assert actual.moved < agreement.MOVED and not any("moved against" in text for text in said)
+
+
+@pytest.mark.parametrize(("psnr", "words"), [
+    (31.2, "31.2 dB: good"), (30.0, "good"), (29.9, "usable"), (25.0, "usable"),
+    (24.9, "poor; train for longer with --continue, or look at the photographs with `mi-ntf inspect`")])
+def test_a_verdict_in_words(psnr, words):
+    assert words in report.verdict(psnr)
+
+
 def test_a_spoiled_photograph_is_named():
     """A photograph of another place, in turn; the noise of the others is allowed for."""
     rng = np.random.default_rng(4)

@@ -10,9 +10,10 @@ torch = pytest.importorskip("torch", reason="training needs PyTorch: pip install
 from train import two_spheres  # noqa: E402
 
 from mi_ntf.core import field_file  # noqa: E402
+from mi_ntf.core.architecture import Header, Similarity  # noqa: E402
 from mi_ntf.core.errors import MiNtfError  # noqa: E402
 from mi_ntf.data import schema  # noqa: E402
-from mi_ntf.train import checkpoint, config, train, trainer  # noqa: E402
+from mi_ntf.train import checkpoint, config, networks, train, trainer  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -31,6 +32,24 @@ def test_short_run_learns_the_spheres(photographs, tmp_path):
     assert report["faults"] == [] and report["kept"] == report["history"][-1]
     assert out.stat().st_size < 4e6
     assert {*tmp_path.iterdir()} == {out, out.with_suffix(".html")}, "checkpoint and temporary files are gone"
+
+
+@pytest.mark.slow
+def test_a_black_object_has_a_dark_albedo_and_true_normals(tmp_path, monkeypatch):
+    """The smaller sphere is black. Normals that had turned away from the light would make it as dark."""
+    white, (center, radius, _) = two_spheres.SPHERES
+    monkeypatch.setattr(two_spheres, "SPHERES", (white, (center, radius, (0.03, 0.03, 0.03))))
+    two_spheres.coarsen(monkeypatch)
+    folder = two_spheres.write(tmp_path / "set", {"train": 16, "val": 1, "test": 1}, size=32)
+    train(folder, tmp_path / "f", steps=150)
+    header, tensors = field_file.load(tmp_path / "f")
+    outward = torch.nn.functional.normalize(torch.randn(1000, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    outward = outward[(outward * torch.tensor([0.65, 0.25, -0.3])).sum(1) > 0]  # not towards the other sphere
+    point = torch.tensor(center) + radius * outward
+    learned = networks.from_tensors(header.architecture, tensors).reflectance(point)
+    angle = torch.rad2deg(torch.acos((learned.normal * outward).sum(1).clamp(-1, 1)))
+    # measured: LEARNED
+    assert float(angle.median()) < 40 and float(learned.albedo.mean(1).median()) < 0.2
 
 
 @pytest.mark.slow
@@ -56,6 +75,64 @@ def test_a_finished_field_learns_another_transmittance(photographs, tmp_path, mo
         train(other, tmp_path / "f", steps=1, field=old)
     with pytest.raises(MiNtfError, match="--field goes with the preset 'fast' alone"):
         train(photographs, tmp_path / "f", steps=1, field=old, preset="paper")
+
+
+@pytest.mark.slow
+def test_a_finished_field_is_trained_further(tmp_path, monkeypatch):
+    """Further training begins with the field's validation, goes on with its steps, and never returns a worse field.
+
+    Its learning rates are not back at the first ones, and the transmittance network goes on from the field's.
+    """
+    two_spheres.coarsen(monkeypatch)
+    photographs = two_spheres.write(tmp_path / "set", {"train": 8, "val": 2, "test": 1}, size=24)
+    out = tmp_path / "field"
+    before = train(photographs, out, steps=40)
+    first = trainer.FinishedField.load(out, further=True)
+    run = trainer.Trainer(photographs, out, first.configured(config.PRESETS["fast"], None), "fast", steps=40,
+                          finished=first)
+    assert run.clock.progress == 0.5 and run.recipe.fading < 0.15
+    for name, value in first.tensors.items():
+        assert np.array_equal(run.recipe.networks.tensors[name].detach().numpy(), value), name
+    after = train(photographs, out, steps=40, further=True)
+    start, *further = after["history"][len(before["history"]):]
+    assert start["step"] == 40 and start["psnr"] == pytest.approx(before["kept"]["psnr"], abs=0.5)
+    assert after["kept"]["psnr"] == max(entry["psnr"] for entry in (start, *further)) > start["psnr"]
+    assert after["val"]["srgb"] > before["val"]["srgb"] and after["steps_done"] == 80
+    assert after["seconds"] > before["seconds"] and {*tmp_path.iterdir()} == {photographs, out, tmp_path / "field.html"}
+
+
+@pytest.fixture
+def blob(tmp_path):
+    """A field of one step, and its photographs."""
+    photographs = two_spheres.write(tmp_path / "set", {"train": 2, "val": 1, "test": 1}, size=8)
+    architecture = config.PRESETS["fast"].architecture
+    tensors = networks.to_tensors(networks.initial(architecture, 0.0, torch.Generator().manual_seed(0)))
+    field_file.save(tmp_path / "f", Header(architecture, Similarity((0, 0, 0), 1.0), {"steps_done": 90, "seconds": 30}),
+                    tensors)
+    return photographs, tmp_path / "f"
+
+
+@pytest.mark.parametrize(("limit", "begin"), [
+    ({"steps": 30}, 0.5), ({"steps": 270}, 0.25), ({"minutes": 1.0}, 1 / 3), ({"minutes": 0.1}, 0.5)])
+def test_further_training_begins_where_one_longer_run_would_be(blob, limit, begin):
+    """It begins at the half of the schedule at the latest."""
+    field = trainer.FinishedField.load(blob[1], further=True)
+    assert field.begin(limit.get("minutes"), limit.get("steps")) == pytest.approx(begin)
+
+
+def test_a_field_that_cannot_be_trained_further_is_an_error(blob, tmp_path):
+    photographs, field = blob
+    with pytest.raises(MiNtfError, match="--continue goes with the preset 'fast' alone"):
+        train(photographs, field, steps=1, further=True, preset="paper")
+    with pytest.raises(MiNtfError, match="--continue trains all of a field and --field its transmittance alone"):
+        train(photographs, field, steps=1, further=True, field=field)
+    (tmp_path / "g.ckpt").touch()
+    with pytest.raises(MiNtfError, match="g is not finished yet; leave out --continue, and its training goes on"):
+        train(photographs, tmp_path / "g", steps=1, further=True)
+    other = Header(field_file.load_header(field).architecture, Similarity((0, 0, 0), 2.0))
+    field_file.save(field, other, field_file.load(field)[1])
+    with pytest.raises(MiNtfError, match="--continue needs the data set that the field was trained on"):
+        train(photographs, field, steps=1, further=True)
 
 
 def run(photographs, out, steps):

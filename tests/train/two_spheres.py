@@ -27,8 +27,8 @@ def glance(monkeypatch) -> None:
 
     whole = scoring.score
 
-    def score(field, photographs, most, views=None, passes=1, tell=None):
-        return whole(field, photographs, 500 if views is None else most, views, passes)
+    def score(field, photographs, most, views=None, passes=1):
+        return whole(field, photographs, min(most, 500), views, passes)
 
     monkeypatch.setattr(scoring, "score", score)
 

@@ -1,0 +1,64 @@
+"""Time of a run: the schedule, what is reserved for scores and page, and the whole of `--minutes`."""
+
+import math
+import time
+
+import pytest
+
+torch = pytest.importorskip("torch", reason="training needs PyTorch: pip install 'mi-ntf[train]'")
+
+from train import two_spheres  # noqa: E402
+
+from mi_ntf.train import pace, train  # noqa: E402
+from mi_ntf.train.monitor import Notes  # noqa: E402
+from mi_ntf.train.recipe import Clock  # noqa: E402
+from mi_ntf.train.training_data import TrainingData  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory):
+    return two_spheres.write(tmp_path_factory.mktemp("spheres"), {"train": 4, "val": 1, "test": 1}, size=16)
+
+
+def test_the_schedule_ends_before_the_reserved_time():
+    clock = Clock(minutes=2.0, spent=30.0, reserve=20.0)
+    assert clock.progress == pytest.approx(0.3) and clock.left == pytest.approx(90.0, abs=1.0)
+    clock.begin = 0.5
+    assert clock.progress == pytest.approx(0.65)
+    assert Clock(steps=40, first=100, step=110, begin=0.5).progress == pytest.approx(0.625)
+    assert Clock(steps=40).left == 0.0
+
+
+def test_time_between_steps_counts():
+    clock = Clock(minutes=1.0, last=time.monotonic() - 3.0)
+    assert clock.left == pytest.approx(57.0, abs=1.0)
+    clock.tick()
+    assert clock.spent == pytest.approx(3.0, abs=1.0) and clock.left == pytest.approx(57.0, abs=1.0)
+
+
+def test_pixels_fit_into_the_time_that_is_left(photographs):
+    """Slow machines reserve more time, and render fewer pixels; a run in steps renders all of them."""
+    data = TrainingData.load(photographs, Notes(False), {})
+    run = pace.Pace(Clock(minutes=1.0), data)
+    assert run.clock.reserve == pytest.approx(60 * pace.FINISH_TIME)
+    run.fixed, reserved = 2.0, []
+    for run.speed in (1e9, 1e5, 2e4, 1e3, 1.0):
+        run.reserve()
+        reserved.append(run.clock.reserve)
+    assert reserved[0] == pytest.approx(2.0, abs=0.01) and reserved == sorted(reserved)
+    assert reserved[-1] == 30.0  # half of the run
+    run.speed = 1000.0
+    assert run.detail(10000.0, run.clock.left - 5.0) == pytest.approx(0.5, abs=0.05)
+    assert run.detail(1e9, 0.0) == pace.LEAST and run.detail(1.0, 0.0) == 1.0
+    assert pace.Pace(Clock(steps=10), data).detail(math.inf, 0.0) == 1.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("minutes", [0.5, 1.0])
+def test_a_run_ends_in_time(tmp_path, minutes):
+    """The minutes include reading, scores and page; 5 % more are allowed, and half a second."""
+    folder = two_spheres.write(tmp_path / "set", {"train": 16, "val": 4, "test": 8}, size=96)
+    start = time.monotonic()
+    report = train(folder, tmp_path / "f", minutes=minutes)
+    assert 0.8 * 60 * minutes < time.monotonic() - start < 1.05 * 60 * minutes + 0.5
+    assert report["seconds"] < 60 * minutes
