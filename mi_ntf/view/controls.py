@@ -5,12 +5,14 @@ from __future__ import annotations
 import html
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 import viser
 from viser import transforms
 
+from mi_ntf.core.errors import MiNtfError
 from mi_ntf.infer.visibility import names
 from mi_ntf.page_server import Background, serve
 
@@ -49,6 +51,7 @@ class Controls:
         self.server, self.url = serve(f"mi-ntf: {session.path.name}", host, port)
         self.background = Background(self.server)
         self._cameras: dict[int, tuple[Pose, tuple[int, int]]] = {}  # pose and window of each browser, by its number
+        self._saved: set[Path] = set()
         self.gizmos: dict[str, Gizmo] = {}
         self.viewer = Viewer(session, self._show, self._tell, samples,
                              lambda: {name: gizmo.handles.position for name, gizmo in self.gizmos.items()})
@@ -231,7 +234,10 @@ class Controls:
 
     def _save(self, name: str, camera: bool) -> None:
         out = beside_scene(self.session, name)
+        if out.exists() and out not in self._saved:
+            raise MiNtfError(f"{out} exists, and this view did not write it; choose another name")
         save(self.session, out, camera=camera)
+        self._saved.add(out)
         self._tell(f"Saved {out}")
 
     def _return_to_scene(self, event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:

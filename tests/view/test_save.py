@@ -168,7 +168,13 @@ def test_a_page_saves_beside_the_scene_alone(scene, tmp_path):
         for name in ("../out.xml", str(tmp_path / "out.xml"), "deep/out.xml", "blobs.safetensors", "out", ".", ""):
             with pytest.raises(MiNtfError, match=r"name is .*; scenes are saved beside the opened one: give a name"):
                 controls._save(name, False)
-        controls._save("out.xml", False)
+        scene(SECOND, name="other.xml")
+        for name in ("other.xml", "scene.xml"):
+            with pytest.raises(MiNtfError, match=rf"{name} exists, and this view did not write it; choose"):
+                controls._save(name, False)
+        (folder / "out.xml").unlink(missing_ok=True)
+        for _ in range(2):
+            controls._save("out.xml", False)
         assert (folder / "out.xml").is_file()
         assert not list(tmp_path.iterdir()) and not (folder.parent / "out.xml").exists()
     finally:
