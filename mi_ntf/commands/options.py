@@ -22,13 +22,17 @@ class UsageError(Exception):
     """Arguments that parse but do not fit together (exit code 2)."""
 
 
-def named(metavar: str | None = None, text: str | None = None, aliases: tuple[str, ...] = ()) -> object:
-    """Return the annotation of an option: the name of its value, its help, and no default where there is none."""
+def named(metavar: str | None = None, text: str | None = None, aliases: tuple[str, ...] = (), name: str | None = None
+          ) -> object:
+    """Return the annotation of an option: the name of its value, its help, and no default where there is none.
+
+    `name` is the option's, where Python does not allow it.
+    """
 
     def default(label: str) -> str:
         return "" if label in ("None", "False", "''") else f"(default: {label.removesuffix('.0')})"
 
-    return arg(metavar=metavar, help=text, aliases=aliases or None, help_behavior_hint=default)
+    return arg(name=name, metavar=metavar, help=text, aliases=aliases or None, help_behavior_hint=default)
 
 
 Scene = Annotated[Positional[Path], named("SCENE.xml")]

@@ -116,7 +116,7 @@ def publish(field: FieldView, data: TrainingData, gains: torch.Tensor | None, ag
 
 def _summary(page: Page, report: Report, fit: bool) -> None:
     """Add verdict, scores, notes and faults; `fit` is true if gains were fitted to held-out photographs."""
-    page.text(f"{report['verdict'].capitalize()}.")
+    page.text(f"Quality of the {report['verdict']}.")
     rows: list[list[object]] = [["steps", report["steps_done"]], ["minutes", f"{report['seconds'] / 60:.1f}"]]
     for name, title in (("val", "validation"), ("test", "test views")):
         scores = report[name]
