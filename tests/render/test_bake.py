@@ -1,6 +1,7 @@
 """Maps on disk: files that a scene names, the cache, and parts of the lights that fit into memory."""
 
 import dataclasses
+import json
 import os
 from types import SimpleNamespace
 
@@ -223,6 +224,9 @@ def test_bake_command(path, tmp_path, capsys):
     parts = OpenEXR.File(str(tmp_path / "maps.exr")).parts
     assert [p.header["name"] for p in parts] == ["light 0", "light 1"]
     assert 300 < parts[0].channels["b"].pixels.size <= 400
+    assert cli.main(["bake", str(scene), "-o", str(tmp_path / "again.exr"), "--json"]) == 0
+    silent = capsys.readouterr()
+    assert json.loads(silent.out)["lights"] == 2 and silent.err == ""
     assert cli.main(["bake", str(scene), "-o", str(scene / "maps.exr")]) == 1
     assert "cannot make the folder" in capsys.readouterr().err
 
