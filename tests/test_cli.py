@@ -326,13 +326,13 @@ def test_training_ends_with_the_files_a_verdict_and_the_next_command(calls: list
                                                                      manifest, following):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys.modules["mi_ntf.train"], "train",
-                        lambda *_, **__: {"verdict": "test views 31.2 dB: good"})
+                        lambda *_, **__: {"verdict": "the field is good: test views have 31.2 dB"})
     Path("d").mkdir()
     if manifest:
         Path("d/capture.json").write_text(manifest)
     assert cli.main("train d -o out/f.safetensors".split()) == 0
     assert capsys.readouterr().out.splitlines() == [
-        "field: out/f.safetensors", "page: out/f.html (open it in a browser)", "test views 31.2 dB: good",
+        "field: out/f.safetensors", "page: out/f.html (open it in a browser)", "the field is good: test views have 31.2 dB",
         f"next: {following}"]
 
 

@@ -36,11 +36,11 @@ GOOD, USABLE = 30.0, 25.0
 def verdict(psnr: float) -> str:
     """Return a sentence on the quality of a field, by the PSNR of its test views in dB."""
     if psnr >= GOOD:
-        return f"test views {psnr:.1f} dB: good"
+        return f"the field is good: test views have {psnr:.1f} dB"
     if psnr >= USABLE:
-        return f"test views {psnr:.1f} dB: usable; more minutes with --continue make it finer"
-    return (f"test views {psnr:.1f} dB: poor; train for longer with --continue, or look at the photographs with "
-            "`mi-ntf inspect`")
+        return f"the field is usable: test views have {psnr:.1f} dB; more minutes with --continue make it finer"
+    return (f"the field is poor: test views have {psnr:.1f} dB; train for longer with --continue, or look at the "
+            "photographs with `mi-ntf inspect`")
 
 
 def complaints(agreement: Agreement, splits: dict[str, Split], posed: bool = False) -> list[str]:
@@ -116,7 +116,7 @@ def publish(field: FieldView, data: TrainingData, gains: torch.Tensor | None, ag
 
 def _summary(page: Page, report: Report, fit: bool) -> None:
     """Add verdict, scores, notes and faults; `fit` is true if gains were fitted to held-out photographs."""
-    page.text(f"Quality of the {report['verdict']}.")
+    page.text(f"{report['verdict']}.".replace("the", "The", 1))
     rows: list[list[object]] = [["steps", report["steps_done"]], ["minutes", f"{report['seconds'] / 60:.1f}"]]
     for name, title in (("val", "validation"), ("test", "test views")):
         scores = report[name]

@@ -112,8 +112,8 @@ def test_errors_of_the_field_are_no_shift():
 
 
 @pytest.mark.parametrize(("psnr", "words"), [
-    (31.2, "31.2 dB: good"), (30.0, "good"), (29.9, "usable"), (25.0, "usable"),
-    (24.9, "poor; train for longer with --continue, or look at the photographs with `mi-ntf inspect`")])
+    (31.2, "the field is good: test views have 31.2 dB"), (30.0, "good"), (29.9, "usable"), (25.0, "usable"),
+    (24.9, "poor: test views have 24.9 dB; train for longer with --continue, or look at the photographs")])
 def test_a_verdict_in_words(psnr, words):
     assert words in report.verdict(psnr)
 
