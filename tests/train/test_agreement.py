@@ -5,11 +5,13 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="training needs PyTorch: pip install 'mi-ntf[train]'")
 
-from train import shots  # noqa: E402
+from train import shots, two_spheres  # noqa: E402
 
 from mi_ntf.data import schema  # noqa: E402
 from mi_ntf.data.images import levels  # noqa: E402
 from mi_ntf.train import agreement, report, scoring  # noqa: E402
+from mi_ntf.train.monitor import Notes  # noqa: E402
+from mi_ntf.train.training_data import TrainingData  # noqa: E402
 
 VIEWS, SIDE, FOCAL, BALL = 9, 40, 45.0, 0.95
 C2W = shots.around(VIEWS, 3.0, seed=6)
@@ -90,8 +92,12 @@ def test_known_shifts_are_found(size):
     np.testing.assert_allclose(together.shift.median(0).values, [0.4, -0.3], atol=0.15)
 
 
-def test_poses_of_captures_are_not_doubted():
+def test_poses_of_captures_are_not_doubted(tmp_path):
     """The renderer has placed the cameras: what looks like a shift is an error of the field."""
+    folder = two_spheres.write(tmp_path / "set", {"train": 2, "val": 1, "test": 1}, size=8)
+    assert not TrainingData.load(folder, Notes(False), {}).posed
+    (folder / "capture.json").write_text("{}")
+    assert TrainingData.load(folder, Notes(False), {}).posed
     actual, said = survey(pictures(0.8 * RANDOM))
     assert len(said) == 1
     split = shots.split(pictures(0.8 * RANDOM), FOCAL, C2W, names=NAMES)
