@@ -332,8 +332,8 @@ def test_training_ends_with_the_files_a_verdict_and_the_next_command(calls: list
         Path("d/capture.json").write_text(manifest)
     assert cli.main("train d -o out/f.safetensors".split()) == 0
     assert capsys.readouterr().out.splitlines() == [
-        "field: out/f.safetensors", "page: out/f.html (open it in a browser)", "the field is good: test views have 31.2 dB",
-        f"next: {following}"]
+        "field: out/f.safetensors", "page: out/f.html (open it in a browser)",
+        "the field is good: test views have 31.2 dB", f"next: {following}"]
 
 
 def test_missing_extra_points_to_doctor(calls: list, monkeypatch, capsys):
