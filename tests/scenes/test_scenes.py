@@ -13,7 +13,7 @@ from scipy.ndimage import binary_erosion, binary_fill_holes, label, map_coordina
 
 from mi_ntf.core import field_file
 from mi_ntf.data import capture as cap
-from mi_ntf.data import images, schema
+from mi_ntf.data import capture_scene, images, schema
 from mi_ntf.data.readers import load_dataset
 from mi_ntf.data.schema import read_image
 
@@ -44,8 +44,8 @@ def script(path: Path):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_field_sphere_is_the_captures_similarity(name):
-    shapes, _ = cap._load(SCENES / name / "mesh.xml")
-    center, radius = cap.bounding_sphere(cap._outline(shapes))
+    shapes = capture_scene.load(SCENES / name / "mesh.xml").shapes
+    center, radius = cap.bounding_sphere(capture_scene.outline(shapes))
     written_center, written_radius = sphere_of(SCENES / name / "scene.xml")
     # nine digits are written; the vertices are float32
     np.testing.assert_allclose(written_center, center, atol=1e-6)
@@ -63,6 +63,20 @@ def test_mesh_scene_renders_its_reference(name, light):
     # under the point light): 32 paths x 256 pixels a block leave 2.4 %. A shift of 8 pixels costs 60 % and more.
     error = np.sqrt(((blocks[0] - blocks[1]) ** 2).mean((0, 1))) / blocks[1].mean((0, 1))
     assert (error < 0.05).all(), error
+
+
+@pytest.mark.parametrize("path", sorted(SCENES.glob("*/*.xml")), ids=lambda path: f"{path.parent.name}/{path.stem}")
+def test_cameras_lights_and_shapes_have_ids(path):
+    """Parameters without an id have names such as ``object_94808915120464``, which differ in each process."""
+    root = ET.parse(path).getroot()
+    assert all(root.findall(kind) == root.findall(f"{kind}[@id]") for kind in ("sensor", "emitter", "shape"))
+
+
+def test_parameters_of_a_shipped_scene_have_names():
+    """Keys of `mi.traverse` begin with the ids of the scene file."""
+    keys = mi.traverse(mi.load_file(str(SCENES / "knot/mesh.xml"), res="8")).keys()
+    assert {"camera.to_world", "lamp.position", "ivory_mesh.vertex_normals"} <= set(keys)
+    assert not [key for key in keys if key.startswith("object_")]
 
 
 @pytest.mark.parametrize("name", NAMES)
