@@ -31,14 +31,14 @@ def field(name: str, to_world, scale: float = 1.0) -> dict:
 def load(size: int, spp: int, max_depth: int, visibility: str = "raymarch") -> mi.Scene:
     """Return the scene. A `max_depth` of 4 allows three bounces."""
     tiles = {"type": "checkerboard", "color0": 0.25, "color1": 0.6, "to_uv": PLACE().scale([8, 8, 1])}
-    view = PLACE().look_at([-1.2, 1.9, 4.6], [0.1, 0.6, 0], [0, 1, 0])
+    view = PLACE().look_at([-1.2, 1.9, 5.4], [0.15, 0.72, 0], [0, 1, 0])
     above = PLACE().look_at([-2.2, 3.2, 1.5], [0, 0.5, 0], [0, 1, 0]).scale(0.5)
     warm, sampler = {"type": "rgb", "value": [18, 16, 13]}, {"type": "multijitter", "sample_count": spp}
     metal, film = {"type": "roughconductor", "alpha": 0.05}, {"type": "hdrfilm", "width": size * 3 // 2, "height": size}
     return mi.load_dict({
         "type": "scene",
         "integrator": {"type": "nrf", "visibility": visibility, "light_samples": 4, "max_depth": max_depth},
-        "sensor": {"type": "perspective", "fov": 36, "to_world": view, "film": film, "sampler": sampler},
+        "sensor": {"type": "perspective", "fov": 40, "to_world": view, "film": film, "sampler": sampler},
         "statue": field("statue", PLACE()),
         "globe": field("globe", PLACE().translate([1.35, 0, 0.35]).rotate([0, 1, 0], 40), 0.7),
         "knot": field("knot", PLACE().translate([-1.15, 0, 0.6]), 0.55),

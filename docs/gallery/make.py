@@ -32,7 +32,7 @@ def main(names: tyro.conf.Positional[tuple[str, ...]] = (), size: int = 400, spp
         pixels = np.array(mi.util.convert_to_bitmap(mi.TensorXf(pixels), uint8_srgb=name != "normals"))
         if pixels.dtype != np.uint8:
             pixels = (255 * np.clip(pixels, 0, 1) + 0.5).astype(np.uint8)
-        Image.fromarray(pixels).save(out / f"{name}.jpg", quality=85, optimize=True)
+        Image.fromarray(pixels).save(out / f"{name}.jpg", quality=92, optimize=True)
         print(f"{name} {time.perf_counter() - start:.1f} s", flush=True)
 
 
