@@ -5,9 +5,9 @@ from dataclasses import asdict, dataclass
 
 import torch
 
-from ..core import progress
 from ..core.architecture import MAX_LOG_DENSITY
 from ..core.errors import MiNtfError
+from ..core.progress import Stage
 from . import device, losses, networks, offset, parallel, rays, volume
 from .bounced import CAMERA_RAYS, Bounced
 from .checkpoint import State
@@ -198,15 +198,12 @@ class Fast:
                 self.update_bounced()
         unknown = self.data.solid and (self.estimating or not self.data.splits["train"].located)
         if unknown and course.estimates < len(ESTIMATE_TIMES) and progress >= ESTIMATE_TIMES[course.estimates]:
-            self.estimate_flash()
+            with Stage("estimating the flash", inner=True):
+                self.estimate_flash()
 
     def estimate_flash(self) -> None:
         """Estimate the position of the flash relative to the lens. Use it, or warn if it is assumed at the lens."""
         self.course.estimates += 1
-        with progress.Stage("estimating the flash", inner=True):
-            self._estimate_flash()
-
-    def _estimate_flash(self) -> None:
         self.baked.update(self.networks, self.occupancy)
         self.marched.update(self.networks, self.occupancy)
         pool, notes = self.data.train, self.run.notes
@@ -239,7 +236,7 @@ class Fast:
     def update_bounced(self) -> None:
         """Bring the bounced light up to date."""
         if self.bounced is not None:
-            with progress.Stage("computing bounced light", inner=True):
+            with Stage("computing bounced light", inner=True):
                 self.marched.update(self.networks, self.occupancy)
                 sampled = self.sample_rays(CAMERA_RAYS, device.generator(self.course.rounds))
                 self.bounced.update(self.networks, self.marched, sampled, self.course.rounds)
@@ -247,7 +244,7 @@ class Fast:
 
     def bake(self) -> None:
         """Bring the baked densities up to date."""
-        with progress.Stage("baking", inner=True):
+        with Stage("baking", inner=True):
             self.baked.update(self.networks, self.occupancy)
             if self.clock.progress >= (self.config.ntf_from if self.at_lens else self.config.shadows_from):
                 self.marched.update(self.networks, self.occupancy)
