@@ -10,6 +10,7 @@ from multiprocessing import resource_tracker
 from .errors import root
 
 _pressed = threading.Event()
+_deferred = False
 _signals: socket.socket | None = None
 """Numbers of the signals that have come, as bytes."""
 
@@ -54,16 +55,21 @@ def kept_from_others() -> Iterator[None]:
     at its end.
     """
     resource_tracker.ensure_running()  # otherwise the first process starts one, which lets Ctrl-C through again
+    global _deferred
+    _deferred = True  # other threads of this process may still receive the signal
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        _deferred = False
+    check()
 
 
 def _press(_number: int, _frame: object) -> None:
     _pressed.set()
-    raise KeyboardInterrupt
+    if not _deferred:
+        raise KeyboardInterrupt
 
 
 def caused(error: BaseException) -> bool:
