@@ -1,6 +1,6 @@
 """Render three fields with a floor, a metal ball, a lamp and a sky, which shade and light each other.
 
-    python examples/three_fields.py [--out out/three_fields.png] [--size 320] [--spp 16] [--max-depth 4]
+    python examples/three_fields.py [--out out/three_fields.png] [--size 320] [--spp 64] [--max-depth 4]
 """
 
 from pathlib import Path
@@ -49,7 +49,7 @@ def load(size: int, spp: int, max_depth: int, visibility: str = "raymarch") -> m
         "sky": {"type": "envmap", "filename": str(SCENES / "common" / "env.exr"), "scale": 0.5}})  # fmt: skip
 
 
-def main(out: Path = Path("out/three_fields.png"), size: int = 320, spp: int = 16, max_depth: int = 4) -> None:
+def main(out: Path = Path("out/three_fields.png"), size: int = 320, spp: int = 64, max_depth: int = 4) -> None:
     """Render and save the picture."""
     out.parent.mkdir(parents=True, exist_ok=True)
     mi.util.write_bitmap(str(out), mi.render(load(size, spp, max_depth))[..., :3], write_async=False)

@@ -1,6 +1,6 @@
 """docs/skull.jpg: a photograph that training did not see, and the field under a lamp and a sky.
 
-    python scenes/skull/make_picture.py skull_flash/images/33.jpg
+    python scenes/skull/make_picture.py skull_flash/images/17.jpg
 """
 
 from pathlib import Path
