@@ -54,11 +54,10 @@ def test_pixels_fit_into_the_time_that_is_left(photographs):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("minutes", [0.5, 1.0])
-def test_a_run_ends_in_time(tmp_path, minutes):
-    """The minutes include reading, scores and page; 5 % more are allowed, and half a second."""
+def test_a_run_ends_in_time(tmp_path):
+    """The minute includes reading, scores and page; 5 % more are allowed."""
     folder = two_spheres.write(tmp_path / "set", {"train": 16, "val": 4, "test": 8}, size=96)
     start = time.monotonic()
-    report = train(folder, tmp_path / "f", minutes=minutes)
-    assert 0.8 * 60 * minutes < time.monotonic() - start < 1.05 * 60 * minutes + 0.5
-    assert report["seconds"] < 60 * minutes
+    report = train(folder, tmp_path / "f", minutes=1.0)
+    seconds = time.monotonic() - start
+    assert 48 < seconds < 63 and report["seconds"] < 60
