@@ -99,10 +99,10 @@ class Fast:
 
     def _take(self, finished: FinishedField) -> None:
         """Take density and reflectance of a finished field; for further training, all that it has learned."""
-        kept = {k: v for k, v in finished.tensors.items()
+        tensors = {k: v for k, v in finished.tensors.items()
                 if k.split(".")[0] in FIELD or (finished.further and k in self.networks.tensors
                                                 and v.shape == self.networks.tensors[k].shape)}
-        copy_into(self.networks.tensors, {k: torch.as_tensor(v) for k, v in kept.items()})
+        copy_into(self.networks.tensors, {k: torch.as_tensor(v) for k, v in tensors.items()})
         for _ in range(11):  # skins fill a fraction of their cells
             self.occupancy.sample(self.networks, self.generator)
         self.occupancy.update(self.networks, self.generator)
