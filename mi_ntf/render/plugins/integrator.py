@@ -79,15 +79,15 @@ their shadows are marched then. Other parameters with gradients are refused, and
 that let light through.
 
 Mitsuba's ``homogeneous`` and ``heterogeneous`` media are lit in the same way, inside spheres, meshes and other closed
-shapes with a ``null`` BSDF, with any phase function: under single scattering and more, the picture is that of
-``volpath``. Their extinction is sampled at the voxels of their grid, or at 192 voxels across a shape that is not
-convex. Maps follow them where a cell of the march (2/`samples` of the bounding sphere's radius) is thinner than a mean
-free path; denser media need ``raymarch``.
+shapes, with any phase function: under single scattering and more, the picture is that of ``volpath``. A shape whose
+BSDF is not ``null`` is a surface, too. Their extinction is sampled at the voxels of their grid, or at 192 voxels across
+a shape that is not convex or has more than 16 planes. Maps follow them where a cell of the march (2/`samples` of the
+bounding sphere's radius) is thinner than a mean free path; denser media need ``raymarch``.
 
-Does not support: media with another extinction in each colour, exterior media, surfaces that bound media, media in a
-``shapegroup``; instances that move a field of their ``shapegroup``; a place inside another integrator, such as ``aov``
-or ``moment`` (use `aovs`); spectral and polarised variants; derivatives with respect to fields and turning
-environments; ``timed_sunsky``; environments whose `to_world` shears or, among surfaces, scales.
+Does not support: media with another extinction in each colour, exterior media, media in a ``shapegroup``; instances
+that move a field of their ``shapegroup``; a place inside another integrator, such as ``aov`` or ``moment`` (use
+`aovs`); spectral and polarised variants; derivatives with respect to fields and turning environments;
+``timed_sunsky``; environments whose `to_world` shears or, among surfaces, scales.
 
 .. code-block:: xml
 

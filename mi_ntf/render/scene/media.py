@@ -71,8 +71,8 @@ def find_media(scene: mi.Scene) -> list[NRFMedium]:
 def ordinary_shapes(scene: mi.Scene) -> list[mi.Shape]:
     """Return the shapes that rays can meet.
 
-    Bounds of media, shapes with a ``null`` BSDF that emit nothing, and instances of groups are left out if the groups
-    hold fields alone. Raises MiNtfError if a shape in a group bounds another medium than a field.
+    Bounds of ``nrf`` media, shapes with a ``null`` BSDF that emit nothing, and instances of groups are left out if the
+    groups hold fields alone. Raises MiNtfError if a shape in a group bounds another medium than a field.
     """
     absent = _hold_fields_alone(scene)
     for shape in _grouped(scene):
@@ -81,7 +81,7 @@ def ordinary_shapes(scene: mi.Scene) -> list[mi.Shape]:
                 f"nrf integrator: {_label(shape)} bounds a medium inside a shapegroup, but media cannot be instanced; "
                 "take the shape out of the group, and give each place a shape and a medium of its own"
             )
-    return [s for s in scene.shapes() if not s.is_medium_transition() and not _is_absent(s)
+    return [s for s in scene.shapes() if _nrf_medium(s) is None and not _is_absent(s)
             and not (absent and s.class_name() == "Instance")]
 
 
@@ -99,7 +99,7 @@ def lets_light_through(scene: mi.Scene) -> bool:
 
 def _is_absent(shape: mi.Shape) -> bool:
     """Return True if a shape neither scatters light nor emits it."""
-    simple = shape.class_name() != "Instance" and not shape.is_medium_transition() and not shape.is_emitter()
+    simple = shape.class_name() != "Instance" and not shape.is_emitter()
     return simple and str(shape.bsdf().class_name()) == "Null"
 
 
@@ -124,7 +124,6 @@ def _stock_medium(shape: mi.Shape) -> NRFMedium:
     if shape.exterior_medium() is not None or shape.interior_medium() is None:
         raise MiNtfError(f"nrf integrator: {_label(shape)} has an exterior medium, which fills space without an end; "
                          "put the medium inside a closed shape of its own, or render the scene with volpath")
-    _check_bsdf(shape)
     return cast(NRFMedium, StockMedium(shape, shape.interior_medium(), _label(shape)))
 
 
