@@ -152,8 +152,8 @@ def print_check(result: Check) -> None:
 
 def print_summary(summary: Summary) -> None:
     """Print the result of :func:`run`."""
-    kept = f", {summary.existing} of them from an earlier run" if summary.existing else ""
-    print(f"frames: {summary.folder} ({summary.images}{kept})")
+    existing = f", {summary.existing} of them from an earlier run" if summary.existing else ""
+    print(f"frames: {summary.folder} ({summary.images}{existing})")
     if summary.first is not None:
         others = "" if summary.each is None else f"; each other one {duration(summary.each)} (median)"
         print(f"time: {duration(summary.seconds)}; the first frame {duration(summary.first)}{others}")
