@@ -126,7 +126,7 @@ def test_rooms_of_the_renderer_import_those_before_them(file: Path):
 
 
 def test_no_module_imports_itself_by_way_of_others():
-    """Not even inside a function."""
+    """No import inside a function closes a circle either."""
     graph = {}
     for file in FILES:
         name = ".".join(file.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__")

@@ -204,7 +204,7 @@ def test_further_light_of_the_reference_is_traced(folder):
 
 
 def test_the_exported_mesh_stands_where_the_field_is(folder):
-    """Of a field that is turned and of two beside each other, silhouettes are the same; and a ball is as bright."""
+    """Silhouettes of a turned field and of two fields side by side are the same, and a ball is as bright."""
     for name, least in (("moved", 0.9), ("many", 0.85)):
         subject = Subject(folder / f"{name}.xml", {"res": "64"})
         made = ExportedMesh(subject.scene(1), subject.media, folder)

@@ -331,7 +331,7 @@ def refused(words):
 @pytest.mark.slow
 @pytest.mark.parametrize("command", ["capture", "bake", "train"])
 def test_a_command_on_a_full_disk(field, tmp_path, disk, command):
-    """It names the file, leaves no half one, and ends where it should once there is room."""
+    """A command on a full disk names the file, leaves no half one, and succeeds once there is room."""
     folder, resize = disk
     if command == "train":
         pytest.importorskip("torch", reason="training needs PyTorch: pip install 'mi-ntf[train]'")

@@ -83,7 +83,7 @@ def test_types(path, plugin, name):
 
 @pytest.mark.parametrize(("plugin", "name"), [c for c in CASES if c[1] in RANGES], ids=lambda v: str(v))
 def test_ranges(path, plugin, name):
-    """Both ends are legal, one step beyond is not; nor is what is no number at all."""
+    """The ends of a range are legal. One step beyond is refused, and so is text that is no number."""
     whole = name not in NUMBERS
     low, high = RANGES[name]
     element = '<integer name="{}" value="{}"/>' if whole else '<float name="{}" value="{!r}"/>'

@@ -130,7 +130,7 @@ def test_other_errors_of_a_render_stay_as_they_are(path):
 
 
 def test_an_interrupted_render_is_interrupted(path, monkeypatch):
-    """Not a RuntimeError, on which loops over frames go on."""
+    """The error is no RuntimeError, on which loops over frames go on."""
     def interrupt(*_):
         raise KeyboardInterrupt
 

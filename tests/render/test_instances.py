@@ -71,7 +71,7 @@ def test_a_field_in_a_group_is_what_is_written_out(blobs, options):
 
 
 def test_a_field_that_an_instance_moves_or_shares_is_refused(blobs):
-    """It is refused also beside the same field outside, and beside a ball in its group."""
+    """A moved field is refused also beside the same field outside, and beside a ball in its group."""
     for field, shapes in ((None, grouped(blobs, (2.5, 0, 0))), (blobs, grouped(blobs)),
                           (None, grouped(blobs, ball=ball(center=PLACES[1])))):
         with pytest.raises(MiNtfError, match=r'"inner" bounds an nrf medium inside a shapegroup.*take the'):

@@ -52,7 +52,7 @@ def write(folder, name="scene.xml", **fill):
 
 @pytest.mark.parametrize("visibility", ["raymarch", "neural_transmittance", "transmittance_map", "none"])
 def test_equals_rendering_from_python(folder, variant, visibility, tmp_path):
-    """Same scene, same seed, other process and other working directory: equal to 1e-4."""
+    """The same scene and seed give the same picture to 1e-4 in another process and working directory."""
     path = write(folder)
     out = tmp_path / "stock.exr"
     done = run_program("mitsuba", "-m", "llvm_ad_rgb", "-D", f"visibility={visibility}", "-o", out, path, cwd=tmp_path)
@@ -81,7 +81,7 @@ def test_a_field_in_the_working_folder_is_not_taken_for_the_scenes_own(folder, t
 
 
 def test_our_program_writes_what_it_achieved_into_the_header(folder, tmp_path):
-    """And the picture of the stock program."""
+    """The picture is that of the stock program."""
     options = NRF["options"] + '<float name="noise_threshold" value="0.05"/>'
     path = write(folder, "noise.xml", options=options)
     words = ("-m", "llvm_ad_rgb", "-D", "visibility=raymarch")
@@ -95,7 +95,7 @@ def test_our_program_writes_what_it_achieved_into_the_header(folder, tmp_path):
 
 
 def test_it_says_what_it_does(folder, tmp_path):
-    """What is loaded, what `auto` chose and why, what is built, and the seconds of it; the film is developed last."""
+    """The log names what is loaded, what `auto` chose and why, and what is built with its seconds; the film comes last."""
     path = write(folder)
     done = run_program("mitsuba", "-m", "llvm_ad_rgb", "-D", "visibility=auto", "-o", tmp_path / "a.exr", path,
                        cwd=tmp_path)
@@ -248,7 +248,7 @@ def test_a_switch_shows_the_frames(folder, tmp_path, program):
 
 
 def test_from_python_an_error_stays_an_exception(folder, variant):
-    """Of a type that tells it, also out of one of Dr.Jit's loops."""
+    """The exception has its own type, also where it leaves one of Dr.Jit's loops."""
     path = folder / "outside.xml"
     path.write_text(SCENE.format(**NRF).replace('"radius" value="1.5"', '"radius" value="0.5"'))
     loaded = variant.load_file(str(path))

@@ -213,7 +213,7 @@ def test_all_but_a_floor_is_replaced(own):
 
 
 def test_materials_that_others_refer_to_are_kept_out_of_replaced_shapes(own):
-    """Where the floor's material is a $name, all that it may name stays; light_fire.xml needs the flame."""
+    """Everything that a floor's material given as $name may refer to stays; light_fire.xml needs the flame."""
     assert [b.get("id") for b in _swap(own, own / "scene.xml").findall("bsdf")] == ["flame"]
     for floor, bsdfs, textures in (("hide", ["hide", "flame"], []), ("spots", ["flame"], ["spots"]),
                                    ("$mat", ["hide", "blade", "unused", "flame"], [])):

@@ -115,7 +115,7 @@ def blob(tmp_path):
 @pytest.mark.parametrize(("limit", "begin"), [
     ({"steps": 30}, 0.5), ({"steps": 270}, 0.25), ({"minutes": 1.0}, 1 / 3), ({"minutes": 0.1}, 0.5)])
 def test_further_training_begins_where_one_longer_run_would_be(blob, limit, begin):
-    """It begins at the half of the schedule at the latest."""
+    """A continued training begins at the half of the schedule at the latest."""
     field = trainer.FinishedField.load(blob[1], further=True)
     assert field.begin(limit.get("minutes"), limit.get("steps")) == pytest.approx(begin)
 

@@ -59,7 +59,7 @@ def test_the_resolution_rises_again_when_previews_are_fast(kind):
 
 
 def test_a_single_slow_preview_changes_nothing():
-    """It may have compiled kernels."""
+    """A single slow preview may have compiled kernels."""
     renderer = Renderer(overhead=0.1)
     viewer = Viewer(renderer, lambda *_: None, print)
     for renderer.overhead in (0.1, 1.0, 0.1, 1.0, 0.1):
