@@ -95,7 +95,7 @@ def test_our_program_writes_what_it_achieved_into_the_header(folder, tmp_path):
 
 
 def test_it_says_what_it_does(folder, tmp_path):
-    """The log names what is loaded, what `auto` chose and why, and what is built with its seconds; the film comes last."""
+    """The log names what is loaded, what `auto` chose and why, and what is built, with seconds; the film is last."""
     path = write(folder)
     done = run_program("mitsuba", "-m", "llvm_ad_rgb", "-D", "visibility=auto", "-o", tmp_path / "a.exr", path,
                        cwd=tmp_path)
