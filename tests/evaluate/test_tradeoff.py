@@ -8,7 +8,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import threading
 import time
 from html.parser import HTMLParser
 from pathlib import Path
@@ -376,8 +375,8 @@ def test_a_budget_that_is_none_is_bad_usage(folder):
 
 
 def test_the_bound_is_no_choice(folder, tmp_path):
-    """It is left out of the front, though nothing is faster or more accurate."""
-    begun = study.Study(ways.Subject(folder / "one.xml", {}), tmp_path, 9.0, None, lambda *a: None, threading.Event())
+    """The bound of no visibility is left out of the front, though nothing is faster or more accurate."""
+    begun = study.Study(ways.Subject(folder / "one.xml", {}), tmp_path, 9.0, None)
     begun.state.add("picture", {"shrink": 1})
     begun.state.add("reference", {})
     for method, seconds in (("none", 0.1), ("raymarch", 1.0), ("volpath", 2.0)):

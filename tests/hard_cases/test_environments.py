@@ -12,7 +12,8 @@ from helpers.variants import VARIANT
 
 import mi_ntf.render
 from mi_ntf.core.errors import MiNtfError
-from mi_ntf.render.lights import environment, light_gradients, light_rows, recent, scene_lights, sun
+from mi_ntf.render.lights import environment, light_gradients, light_rows, scene_lights, sun
+from mi_ntf.render.scene import recent
 
 
 @pytest.fixture(autouse=True)

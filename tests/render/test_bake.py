@@ -267,8 +267,8 @@ def test_scene_names_its_map_file(path, tmp_path):
 
     plain = scene()
     (medium,) = find_media(plain)
-    options = building.options(plain.integrator().context.settings)
     rows = lights_module.Lights(plain, [medium], 0, 512).table(medium.frame)
+    options = building.options(building.resolved(plain.integrator().context.settings, rows.count, [medium]))
     map_file.write(tmp_path / "maps.exr", medium, rows, options, [build(medium, rows, options)])
     np.testing.assert_array_equal(scenes.render(scene(map_file=str(tmp_path / "maps.exr"))), scenes.render(plain))
     lights["sun"]["direction"] = [0, -1, 0]
