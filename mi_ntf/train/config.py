@@ -56,9 +56,9 @@ class FastConfig:
     """Weight of the specular weight. A rough lobe can replace the diffuse one in flash photographs, and then sends half
     as much light again in all other directions."""
     lobes_from: float = 0.25
-    """Time from which roughness and specular weight are learned, and normals from colours, too. Before normals have
-    formed, highlights in wrong places would drive both to an end of their range, where sigmoids have no slope, and dark
-    pixels would turn normals away from the light."""
+    """Time from which roughness and specular weight are learned, and from which colours may turn normals away from the
+    light. Before normals have formed, highlights in wrong places would drive both to an end of their range, where
+    sigmoids have no slope, and dark pixels would turn normals away from the light."""
     smooth: float = 2e-4
     """Weight of the total variation of the planes."""
     shadows_from: float = 0.1

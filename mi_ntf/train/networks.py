@@ -22,8 +22,8 @@ from . import ops
 
 Tensors = dict[str, torch.Tensor]
 """Tensors by their names in the field file."""
-INITIAL_SPECULAR_LOGIT, INITIAL_ROUGHNESS_LOGIT = -3.0, 3.0
-"""Start of the specular weight and of the roughness, 0.96: nearly matt, so that highlights have to appear in the
+INITIAL_SPECULAR_LOGIT, INITIAL_ROUGHNESS_LOGIT = -3.0, 1.5
+"""Start of the specular weight and of the roughness, 0.86: nearly matt, so that highlights have to appear in the
 photographs first. A sharper lobe would be brighter than a black surface, whose normals would turn away from it."""
 POINTS_PER_PART = 65536
 """Points that :func:`in_parts` evaluates at once, which bounds the memory."""

