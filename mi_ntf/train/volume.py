@@ -166,7 +166,7 @@ def _turned_to(normal: torch.Tensor, light: torch.Tensor) -> torch.Tensor:
     """Return `normal` (n, 3), whose gradient has no part that would turn it away from `light` (n, 3)."""
     result = normal.view_as(normal)
     if result.requires_grad:
-        result.register_hook(lambda g: g - (g * light).sum(1, keepdim=True).clamp(min=0) * light)
+        result.register_hook(lambda g: g - (g * light).sum(1, keepdim=True).clamp(min=0) * light)  # type: ignore[no-untyped-call]
     return result
 
 
