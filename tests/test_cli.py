@@ -5,15 +5,14 @@ import re
 import sys
 import types
 import typing
-from importlib.metadata import version
 from pathlib import Path
 from unittest.mock import ANY
 
 import pytest
-from helpers.programs import run_on_one_core, run_program
+from helpers.programs import run_program
 
 import mi_ntf
-from mi_ntf import cli, doctor
+from mi_ntf import cli
 from mi_ntf.commands import fields
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.jobs import Workers
@@ -239,58 +238,6 @@ def test_choices_of_the_training_are_those_of_the_help():
     assert typing.get_args(typing.get_args(hints["ntf"])[0]) == tuple(config.NTF)
 
 
-@pytest.mark.parametrize(("line", "name", "right"), [
-    ("train d -o f.png", "f.png", ".safetensors"),
-    ("export f.safetensors -o m.png", "m.png", ".ply, .obj, .glb or .stl"),
-    ("swap s.xml f.safetensors -o n.exr", "n.exr", ".xml"),
-    ("bake s.xml -o m.png", "m.png", ".exr"),
-    ("inspect d -o p.txt", "p.txt", ".html"),
-    ("compare a.exr b.exr -o c.exr", "c.exr", ".png"),
-])
-def test_a_wrong_suffix_is_an_error_before_the_work(line, name, right, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    assert cli.main(line.split()) == 1
-    assert f"{name}: the name ends in '.{name[-3:]}', expected {right}" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("line", ["export f.safetensors -o new/m.ply", "swap s.xml f.safetensors -o new/n.xml",
-                                  "bake s.xml -o new/m.exr"])
-def test_a_finished_file_is_replaced_only_on_request(line, tmp_path, monkeypatch, capsys):
-    """The folder is made; then the scene or field that does not exist ends the work."""
-    monkeypatch.chdir(tmp_path)
-    path = tmp_path / line.split()[-1]
-    assert cli.main(line.split()) == 1
-    assert "does not exist" in capsys.readouterr().err and path.parent.is_dir()
-    path.write_text("finished")
-    assert cli.main(line.split()) == 1
-    assert f"new/{path.name} exists; choose another name, or add --overwrite to replace it" in capsys.readouterr().err
-    assert cli.main([*line.split(), "--overwrite"]) == 1
-    assert "does not exist" in capsys.readouterr().err and path.read_text() == "finished"
-
-
-@pytest.mark.parametrize(("line", "module", "extra"), [
-    ("train d -o f.safetensors", "torch", "train"),
-    ("train d -o f.safetensors --view", "viser", "view"),
-    ("inspect d", "matplotlib", "train"),
-    ("view s.xml", "viser", "view"),
-    ("export f.safetensors -o m.ply", "trimesh", "mesh"),
-    ("compare a.exr b.exr", "skimage", "eval"),
-    ("compare a.exr b.exr -o c.png", "matplotlib", "eval"),
-    ("tradeoff s.xml", "matplotlib", "eval"),
-    ("sequence s.xml -o d --film f.mp4", "imageio_ffmpeg", "video"),
-    ("sequence s.xml -o d --engine dask --workers 2", "distributed", "cluster"),
-    ("capture s.xml d --engine submitit --workers 2", "submitit", "cluster"),
-])
-def test_a_missing_extra_is_named_before_the_work(line, module, extra, tmp_path, monkeypatch, capsys):
-    """None of the scenes, fields and photographs exists, which would be the next error."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(sys.modules, module, None)
-    assert cli.main(line.split()) == 1
-    message = capsys.readouterr().err
-    assert message.endswith(f"needs the extra `{extra}` ({module} missing): run pip install 'mi-ntf[{extra}]'\n")
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.parametrize("error", [MiNtfError("the field is bad"), OSError("the field is bad")])
 def test_failed_work_is_1_and_one_line(calls: list, monkeypatch, capsys, error: Exception):
     def fail(path):
@@ -365,36 +312,3 @@ def test_render_names_an_unknown_variant(tmp_path: Path):
     done = run_program("mi-ntf", "render", "-m", "llvm_rgb", "nothing.xml", cwd=tmp_path)
     assert done.returncode == 1
     assert "unknown variant 'llvm_rgb'; this Mitsuba has scalar_rgb" in done.stderr
-
-
-def test_doctor_as_json(tmp_path: Path):
-    done = run_program("mi-ntf", "doctor", "--json", cwd=tmp_path)
-    report = json.loads(done.stdout)
-    checks = {check["name"]: check for check in report["checks"]}
-    assert done.returncode == 0 and report["ok"]
-    assert checks["mitsuba"]["found"] == version("mitsuba")
-    assert checks["bridge"]["found"].startswith(f"built for mitsuba {version('mitsuba')} ")
-    assert all(check["remedy"] == "" for check in checks.values() if check["needed"])
-
-
-def test_doctor_knows_what_one_core_does(tmp_path: Path):
-    done = run_on_one_core("mi-ntf", "doctor", "--json", cwd=tmp_path)
-    report = json.loads(done.stdout)
-    check = {check["name"]: check for check in report["checks"]}["cores"]
-    assert report["ok"] and (check["ok"], check["found"]) == (False, "1")
-    assert "`mitsuba -t 3`" in check["remedy"] and "drjit.set_thread_count(2)" in check["remedy"]
-
-
-def test_doctor_survives_a_missing_llvm(tmp_path: Path):
-    done = run_program("mi-ntf", "doctor", "--json", cwd=tmp_path, DRJIT_LIBLLVM_PATH=str(tmp_path / "nothing.so"))
-    llvm = next(check for check in json.loads(done.stdout)["checks"] if check["name"] == "LLVM")
-    assert done.returncode == 1
-    assert not llvm["ok"]
-    assert "libllvm19" in llvm["remedy"]
-
-
-def test_doctor_prints_a_remedy_on_one_line(capsys):
-    remedy = "a command " + "that is long " * 20 + "and whole"
-    check = doctor.Check("thing", False, True, "broken", remedy)
-    doctor.print_table(doctor.Report(False, "1", [check]))
-    assert f"thing: {remedy}" in capsys.readouterr().out

@@ -73,7 +73,7 @@ def test_under_json_nothing_is_shown_but_warnings(capsys):
 
 
 def test_the_first_frame_which_compiles_does_not_count_for_the_time_that_is_left():
-    """With it, 116 frames of 10 ms would take 8 s and more after four of them."""
+    """The first frame would make 116 frames of 10 ms seem to take 8 s and more after four of them."""
     with progress.Stage("frames", 120, shown=False) as stage:
         time.sleep(0.3)
         stage.advance()

@@ -361,7 +361,7 @@ def test_a_reference_that_is_missing_is_refused(folder, tmp_path):
 
 
 def test_a_captured_mesh_adds_the_exported_one_and_a_second_error(folder, tmp_path):
-    """Any scene of other shapes stands for the captured mesh."""
+    """A scene of other shapes stands for the captured mesh."""
     result = study.tradeoff(folder / "one.xml", tmp_path, {"res": "16"}, 1.0, folder / "one.xml")
     rows = {r["method"]: r for r in result["ways"]}
     assert rows["mesh"]["points"] and "mi-ntf export " in rows["mesh"]["command"]

@@ -123,7 +123,7 @@ def check_finite(architecture: Architecture, tensors: dict) -> None:
 
 
 def dataset(folder: Path):
-    """One data set of each form with its frames cut to a few, one of them behind a lens; of LLFF the whole."""
+    """Return a data set of each form, cut to a few frames (LLFF whole); one set has a lens with distortion."""
     import cv2  # noqa: F401, for the limit of memory to count it
     from data import forms
 

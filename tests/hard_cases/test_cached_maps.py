@@ -84,7 +84,7 @@ def test_a_damaged_map_is_made_anew(medium, cache, warnings, damage):
 
 
 def test_every_flipped_bit_is_noticed(medium, cache, rng):
-    """Of the header and of the texels; one light's map under another's name as well."""
+    """Header, texels and a map under the name of another light's are damaged in turn."""
     texels(medium)
     (file,) = cache.iterdir()
     name, data = file.stem, file.read_bytes()
@@ -144,7 +144,7 @@ def test_several_media_of_one_file_bake_it_once(tmp_path, monkeypatch, apart):
 
 
 def test_the_cache_is_of_many_threads(monkeypatch):
-    """All get their maps while others come and go, and nothing is kept of those that went."""
+    """Every thread gets its maps while others come and go, and nothing is kept of those that went."""
     monkeypatch.setenv("MI_NTF_CACHE", "memory")
     map_cache.forget()
 

@@ -177,7 +177,7 @@ def test_seed_forms(blobs, form, check):
 @pytest.mark.parametrize("spp", [1, 2, 3, 1000, 2**16 + 1, pytest.param(2**21, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("sampler", OPTIONS["sampler"])
 def test_numbers_of_samples(fog, spp, sampler, check):
-    """One pixel through the middle of the fog, and all its rays alike: exact with any number of samples."""
+    """The pixel looks through the middle of the fog and its rays are alike, so any number of samples is exact."""
     sensor = {**pictures.camera((0, 0, 4), fov=1e-3, size=1), "sampler": {"type": sampler}}
     image = pictures.render("none", {"sensor": sensor, **fog}, spp=spp, hide_emitters=False, max_depth=1)
     check(f"{spp} samples of {sampler}", "camera march", "radiance", image[..., :3] - np.exp(-1.6), 1e-5)

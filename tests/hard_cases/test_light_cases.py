@@ -229,7 +229,7 @@ def test_parameters_that_derivatives_leave_out_are_refused(blobs, kind, key, opt
 
 
 def derivative(scene, parameters, set_to, h: float):
-    """Of the picture's mean as `set_to(t)` sets the parameter: forward at 0, and by differences of ± `h`."""
+    """Return derivatives of the picture's mean by the t of `set_to(t)`: forward at 0, and by differences of ± `h`."""
     t = mi.Float(0)
     dr.enable_grad(t)
     set_to(t)

@@ -50,7 +50,7 @@ def white_ball(folder, log_density: float, radius: float):
 @given(log_density=st.sampled_from([0.5, 2.0, 4.0, 6.0]), radius=st.sampled_from([0.25, 0.6]))
 @FEW
 def test_white_furnace(name, depth, tmp_path_factory, log_density, radius):
-    """Where light of radiance 1 comes from everywhere, nothing is brighter: means of 4×4 pixels, sky and all."""
+    """Nothing is brighter than light of radiance 1 that comes from everywhere, in means of 4×4 pixels."""
     loaded = scenes.scene(
         white_ball(tmp_path_factory.getbasetemp(), log_density, radius),
         integrator(name, max_depth=depth, hide_emitters=False), {"sky": {"type": "constant"}},

@@ -145,7 +145,7 @@ def test_rigid_motion_and_scale(name, balls, seed):
 
 
 def _placement(rng) -> Frame:
-    """Any rotation, up to three radii away, any size from 10⁻³ to 10³."""
+    """The picture follows any rotation, shifts of up to three radii, and sizes from 10⁻³ to 10³."""
     rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     matrix = np.eye(4)
     scale = 10 ** rng.uniform(-3, 3)
@@ -211,7 +211,7 @@ def test_linear_in_intensity(name, balls, seed, factor):
 @given(balls=MIXED, seed=SEEDS)
 @FEW
 def test_sum_over_lights(name, balls, seed):
-    """All at once, each alone, and in two runs: one picture, to the rounding of eight terms."""
+    """Lights at once, each alone, and in two runs give one picture, to the rounding of eight terms."""
     medium, lights = balls.medium(), rf.lights(seed)
     points = _points(seed, medium)
 

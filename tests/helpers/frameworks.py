@@ -27,7 +27,7 @@ def torch(function, inputs):
 
 
 def drjit(function, inputs):
-    """As :func:`torch`."""
+    """Return values and derivatives of `function` in Dr.Jit, in the form of :func:`torch`."""
     mi = pytest.importorskip("mitsuba")
     import drjit as dr
 

@@ -70,7 +70,7 @@ def test_a_convex_body_gets_nothing_and_pictures_have_no_more_noise(skin):
 
 @pytest.mark.slow
 def test_light_at_the_camera_takes_its_short_way(skin):
-    """One march for view and light gives the same picture as a light beside the camera."""
+    """A single march for view and light gives the same picture as a light beside the camera."""
     flash = {"type": "point", "intensity": 40.0}
     pictures_ = [
         pictures.render("raymarch", {"sensor": look(), "flash": {**flash, "position": [x, 0.8, 4.0]}, **pair(skin)},

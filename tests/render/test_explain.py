@@ -125,7 +125,7 @@ def test_table_names_every_effect_within_the_columns_of_the_terminal(capsys, mon
 
 @pytest.mark.slow
 def test_measured_beside_predicted(tmp_path, capsys):
-    """It runs in its own process, since Dr.Jit counts the memory of the whole process."""
+    """The command runs in its own process, since Dr.Jit counts the memory of the whole process."""
     words = ("-Dvisibility=transmittance_map", "-Dlight=point", "-Dres=128", "-Dspp=16", "-Ddepth=2", "--measure",
              "--json")
     done = run_program("mi-ntf", "explain", SCENE, *words, cwd=tmp_path)

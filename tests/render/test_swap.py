@@ -245,7 +245,7 @@ def test_a_wrong_name_of_a_shape_lists_the_names(own):
 
 
 def test_capture_and_swap_give_shapes_the_same_names(folder):
-    """One reads Mitsuba's own parse, the other the XML."""
+    """Capture reads Mitsuba's own parse, and swap reads the XML."""
     mi = pytest.importorskip("mitsuba")
     mi.set_variant(VARIANT)
     (folder / "mesh.xml").write_text("""<scene version="3.9.0"> <default name="name" value="b"/>

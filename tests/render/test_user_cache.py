@@ -98,7 +98,7 @@ def test_off(path, bakes, cache, monkeypatch):
 
 
 def test_two_processes_leave_one_good_entry(path, cache):
-    """Both load at once, and both get the field; a third reads what they left."""
+    """Two processes that load at once get the field, and a third one reads what they left."""
     script = (f"import mitsuba as mi; mi.set_variant({VARIANT!r}); import mi_ntf.render as r; r.register()\n"
               f"from mi_ntf.render.scene import loaded; print(loaded.load({str(path)!r}, 64).grid.majorant)")
     both = [subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) for _ in range(2)]

@@ -105,7 +105,7 @@ def test_poses_of_captures_are_not_doubted(tmp_path):
 
 
 def test_errors_of_the_field_are_no_shift():
-    """One half of each photograph is moved, in another direction each, as it looks where edges of the field are soft.
+    """Half of each photograph is moved, each in another direction, as it looks where edges of the field are soft.
 
     The halves do not agree on a shift, so the poses are not doubted.
     """

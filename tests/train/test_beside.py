@@ -66,7 +66,7 @@ def test_gains_of_the_photographs_are_found(learned):
 
 
 def test_a_checkpoint_beside_the_lens_continues_bit_for_bit(tmp_path, monkeypatch):
-    """With the flash's place searched, gains, the room and shadows: all that decides the next step is in it."""
+    """A checkpoint holds all that decides the next step: the flash's place, gains, the room and shadows."""
     two_spheres.coarsen(monkeypatch)
     photographs = two_spheres.write(tmp_path / "set", {"train": 8, "val": 1, "test": 1}, 24, OFFSET,
                                     ("pl_pos", "pl_intensity"))

@@ -234,7 +234,7 @@ def test_transmittance_loss_leaves_the_field_alone(kind):
 
 @pytest.mark.parametrize("rim", [False, True])
 def test_lobes_wait_for_normals(rim):
-    """Without lobes, roughness and specular weight (rows 6 and 7) learn nothing, and no normal turns from the light.
+    """Roughness and specular weight (rows 6 and 7) learn nothing without lobes, and no normal turns from the light.
 
     Colours that are too dark still turn normals (rows 0 to 2) towards it, and the albedo learns.
     """
