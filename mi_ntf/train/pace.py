@@ -18,9 +18,9 @@ from .training_data import TrainingData
 PROBED = 1 << 12
 """Pixels from which the speed is first measured; a validation has no fewer."""
 VALIDATION_TIME = 0.01
-"""Fraction of the minutes that one of the ten validations may take, and …"""
+"""Fraction of the minutes that one of the ten validations may take."""
 FINISH_TIME = 0.09
-"""… that scores and page may take if not all of their pixels fit."""
+"""Fraction of the minutes that scores and page may take if not all of their pixels fit."""
 LEAST = 1 / 16
 """Least fraction of these pixels: pictures are a quarter as wide."""
 
