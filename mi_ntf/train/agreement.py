@@ -10,9 +10,9 @@ from .rays import Photographs
 from .scoring import FieldView, decibels, srgb
 
 PIXELS = 1000
-"""Pixels of each photograph that are compared, …"""
+"""Largest number of pixels of a photograph that are compared."""
 FEWEST = 50
-"""… and the fewest, below which a photograph is not judged."""
+"""Number of compared pixels below which a photograph is not judged."""
 KNOWN = 20.0
 """PSNR of the median photograph, dB, above which the field is good enough to judge photographs."""
 BEHIND = 5.0

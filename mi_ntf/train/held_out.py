@@ -10,9 +10,9 @@ from .transmittance_targets import TransmittanceTargets, chords, uniform_directi
 
 STEPS = 2048
 PAIRS = 4096
-"""Pairs of a shading point and a light, at most …"""
+"""Largest number of pairs of a shading point and a light."""
 CHUNK = 512
-"""… and how many of them are evaluated at once."""
+"""Number of pairs that are evaluated at once."""
 
 
 @torch.no_grad()

@@ -19,9 +19,9 @@ from .rays import Photographs, Rays
 from .transmittance_targets import TransmittanceTargets, walk
 
 POINTS = 3000
-"""Points that are observed, at most …"""
+"""Largest number of points that are observed."""
 FEWEST = 100
-"""… and the fewest from which a position is estimated."""
+"""Least number of points from which a position is estimated."""
 SPREAD = 0.12
 """Scale of the robust cost (Geman and McClure): larger errors of ln I hardly count. Noise and slightly wrong normals
 are below it."""

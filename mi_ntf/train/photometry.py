@@ -8,9 +8,9 @@ from .rays import Photographs
 SATURATED = float(LINEAR[250])
 """Linear value from which an 8-bit level may stand for anything brighter."""
 BLACK = float(LINEAR[3])
-"""Linear value below which levels are mostly the camera's noise …"""
+"""Linear value below which levels are mostly the camera's noise."""
 BLACK_WEIGHT = 0.25
-"""… and the weight of such pixels."""
+"""Weight of pixels below this value."""
 
 
 class Gains:

@@ -22,13 +22,13 @@ from .transmittance_targets import TransmittanceTargets
 Report = State
 """Report of a run, in JSON types."""
 SHOWN = 3
-"""Test photographs on the page …"""
+"""Number of test photographs on the page."""
 WIDTH = 256
-"""… and the pixels of their longer side."""
+"""Pixels of the longer side of these photographs."""
 LAMPS = 8
-"""Positions of the lamp that goes around the object …"""
+"""Positions of the lamp that goes around the object."""
 LAMP_WIDTH = 180
-"""… and the pixels of the longer side of these pictures."""
+"""Pixels of the longer side of the pictures under this lamp."""
 GOOD, USABLE = 30.0, 25.0
 """PSNR of the test views, dB, from which a field is good, and from which it is usable."""
 

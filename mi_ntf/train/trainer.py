@@ -31,9 +31,9 @@ from .training_data import Reading, TrainingData
 KEEP = 128
 """Steps between two copies of the run's state in memory, to which a fault rolls back."""
 INTERVAL = 50.0
-"""Seconds between two checkpoints, each the latest copy in memory …"""
+"""Seconds between two checkpoints, each of which is the latest copy in memory."""
 LATEST = 75.0
-"""… or, where steps are slow, a copy made for it after this time."""
+"""Seconds after which slow steps get a copy of their own for the checkpoint."""
 FAULTS = 3
 """Rolled-back faults after which the next one ends the run."""
 
