@@ -138,11 +138,7 @@ class Controls:
         self._link(stops, "stops", lambda v: setattr(viewer, "stops", v), "shown")
         self._link(split, "split", lambda v: setattr(viewer, "split", v), "shown")
 
-        async def measure(_event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
-            self._tell("Measuring the error against raymarch …")
-            viewer.change("error", self._measure, "shown")
-
-        error.on_click(measure)
+        error.on_click(self._on_error_button)
 
     def _link(self, handle: viser.GuiInputHandle[T], name: str, do: Callable[[T], object], kind: str = "other") -> None:
         """Call `do` with the value of a control after each change by a browser."""
@@ -153,6 +149,10 @@ class Controls:
                 self.viewer.change(name, lambda: do(value), kind)
 
         handle.on_update(update)
+
+    async def _on_error_button(self, _event: viser.GuiEvent[viser.GuiButtonHandle] | None) -> None:
+        self._tell("Measuring the error against raymarch …")
+        self.viewer.change("error", self._measure, "shown")
 
     def _measure(self) -> None:
         try:

@@ -1,6 +1,8 @@
 """A saved scene is the scene that was seen."""
 
+import asyncio
 import dataclasses
+import re
 from xml.etree import ElementTree as ET
 
 import mitsuba as mi
@@ -177,5 +179,16 @@ def test_a_page_saves_beside_the_scene_alone(scene, tmp_path):
             controls._save("out.xml", False)
         assert (folder / "out.xml").is_file()
         assert not list(tmp_path.iterdir()) and not (folder.parent / "out.xml").exists()
+    finally:
+        controls.server.stop()
+
+
+def test_the_error_is_announced_before_it_is_measured(scene):
+    controls = Controls(Session(scene(POINT), {}, 32), port=8291)
+    try:
+        asyncio.run(controls._on_error_button(None))  # nothing renders: the loop of this view was not started
+        assert "Measuring the error against raymarch" in controls._answer.content
+        controls.viewer.step()
+        assert re.search(r"Error against raymarch: transmittance_map \d+\.\d\d %", controls._answer.content)
     finally:
         controls.server.stop()
