@@ -166,6 +166,8 @@ def _built(shapes: list[mi.Shape]) -> mi.Scene:
     # Mitsuba refuses a scene in which all emitters have the weight 0, as those of these shapes may. It also gives
     # objects the names of their keys.
     names = [shape.id() for shape in shapes]
+    if str(mi.variant()).startswith("cuda"):
+        _mark_groups_changed(shapes)
     objects = {"unused": _unused_emitter(str(mi.variant())), **{f"shape_{i}": s for i, s in enumerate(shapes)}}
     try:
         scene: mi.Scene = mi.load_dict({"type": "scene", **objects}, optimize=False)
@@ -173,6 +175,19 @@ def _built(shapes: list[mi.Shape]) -> mi.Scene:
     finally:
         for shape, name in zip(shapes, names, strict=True):
             shape.set_id(name)
+
+
+def _mark_groups_changed(shapes: Sequence[mi.Shape]) -> None:
+    """Make the next scene of `shapes` build the geometry of their groups.
+
+    Mitsuba 3.9 builds a group on a GPU for the first scene that holds it, and again only if a shape in it has changed
+    (`scene_optix.inl`). A second scene of the same group would read outside of its memory.
+    """
+    for group in (s for s in shapes if s.class_name() == "ShapeGroupPlugin"):
+        for part in (node for node in mi.traverse(group).hierarchy if isinstance(node, mi.Shape) and node is not group):
+            # Normals are named as well, since a mesh would otherwise compute them anew.
+            part.parameters_changed(["to_world", "vertex_positions", "vertex_normals", "positions", "normals"])
+        group.parameters_changed([])
 
 
 def _power(a: Float, b: Float) -> Float:
