@@ -23,6 +23,7 @@ from mi_ntf.core import spheres
 from mi_ntf.core.architecture import PAPER, Architecture, Header
 from mi_ntf.infer import march, ops, shade
 from mi_ntf.infer.bundle import Strand, safe_inverse
+from mi_ntf.infer.grid import InSphere
 from mi_ntf.infer.network import NetworkField
 from mi_ntf.infer.profile import DepthProfile
 from mi_ntf.infer.visibility.raymarch import MAX_OPTICAL_DEPTH
@@ -85,7 +86,7 @@ def random_network(hidden: tuple[int, ...], seed: int = 0) -> NetworkField:
     return NetworkField(Header(architecture), tensors, mi)
 
 
-class PaperField:
+class PaperField(InSphere):
     """A field with the values of `shape` (:class:`mi_ntf.infer.grid.GridField`) at the price of a network's queries."""
 
     def __init__(self, shape: Any, network: NetworkField):
