@@ -12,14 +12,14 @@ import sys
 import textwrap
 import traceback
 from collections.abc import Sequence
-from contextlib import redirect_stdout, suppress
+from contextlib import redirect_stderr, redirect_stdout, suppress
 from typing import Protocol
 
 import tyro
 from tyro.conf import FlagCreatePairsOff
 
 from mi_ntf import __version__
-from mi_ntf.commands import analysis, fields, machine, scenes
+from mi_ntf.commands import analysis, fields, machine, scenes, usage
 from mi_ntf.commands.options import UsageError
 from mi_ntf.core import errors, interruption, progress
 
@@ -70,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def parse(words: list[str]) -> Command:
-    """Return the command of a command line. Raises UsageError, or SystemExit as argparse does."""
+    """Return the command of a command line. Raises UsageError, or SystemExit after a help."""
     name = words[0] if words else ""
     if name in ("", "-h", "--help"):
         print(overview(), file=sys.stdout if name else sys.stderr)
@@ -87,7 +87,12 @@ def parse(words: list[str]) -> Command:
     if {"-h", "--help"} & set(words):
         print(description(name))
         raise SystemExit(0)
-    return _parsed(name, words[1:])
+    box = io.StringIO()
+    try:
+        with redirect_stderr(box):
+            return _parsed(name, words[1:])
+    except SystemExit:
+        raise UsageError(usage.sentence(name, words[1:], box.getvalue())) from None
 
 
 def overview() -> str:

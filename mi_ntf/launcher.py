@@ -14,13 +14,14 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import NoReturn
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import OpenEXR
 
-from mi_ntf.commands.options import SCENE_HELP, SceneOptions
+from mi_ntf.commands.options import SCENE_HELP, SceneOptions, UsageError
 from mi_ntf.core import files, ops, progress, srgb
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.core.variants import enough_threads
@@ -33,9 +34,17 @@ SUFFIXES = {"OpenEXR": ".exr", "RGBE": ".rgbe", "PFM": ".pfm"}
 """Suffix of the files that a film writes, by its ``file_format``."""
 
 
+class _Parser(argparse.ArgumentParser):
+    """Parser that answers bad usage with one sentence, without the line of usage."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raise UsageError."""
+        raise UsageError(f"{message}; `{self.prog} -h` describes the options")
+
+
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the stock program's command line and of further options."""
-    p = argparse.ArgumentParser("mi-ntf render", description="Render Mitsuba scenes with the flags of the program "
+    p = _Parser("mi-ntf render", description="Render Mitsuba scenes with the flags of the program "
                                 "`mitsuba` and some more.")
     p.add_argument("scenes", nargs="+", metavar="SCENE.xml", help="Scenes to render, one after the other.")
     p.add_argument("-m", "--mode", default="", metavar="VARIANT", help=SCENE_HELP["mode"])
@@ -70,7 +79,7 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str]) -> None:
     """Run the command line `arguments` (without the program's name).
 
-    Raises MiNtfError, OSError or RuntimeError if the work failed and SystemExit(2) on bad usage.
+    Raises MiNtfError, OSError or RuntimeError if the work failed and UsageError on bad usage.
     """
     p = parser()
     args = p.parse_args(arguments)

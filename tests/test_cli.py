@@ -181,6 +181,36 @@ def test_bad_usage_is_2(calls: list, line: str):
     assert calls == []
 
 
+@pytest.mark.parametrize(("line", "said"), [
+    ("train x", "train needs -o FILE"),
+    ("capture", "capture needs SCENE.xml and DIR"),
+    ("train x -o", "--output needs a value"),
+    ("train x -o f --minutes ten", "--minutes is 'ten', must be a number"),
+    ("inspect x --size=2.5", "--size is '2.5', must be a whole number"),
+    ("explain x --env-scale z", "--env-scale is 'z', must be a number"),
+    ("train x -o f --preset slow", "--preset is 'slow', must be fast or paper"),
+    ("train x -o f --ntf slow", "--ntf is 'slow', must be logistic, mixture2, paper or ray"),
+    ("train x -o f --background white", "--background is 'white', must be black"),
+    ("sequence x -o d --engine pbs", "--engine is 'pbs', must be dask, local or submitit"),
+    ("train x -o f --minuts=3", "train has no option --minuts; did you mean --minutes?"),
+    ("train x -o f --zzz", "train has no option --zzz"),
+    ("capture a b c", "capture has no place for 'c': it is one argument too many"),
+    ("render", "the following arguments are required: SCENE.xml"),
+    ("render --env-rotate far x", "argument --env-rotate: invalid float value: 'far'"),
+])
+def test_bad_usage_is_one_sentence_with_option_value_and_what_is_legal(line: str, said: str, capsys):
+    assert cli.main(line.split()) == 2
+    remedy = "" if said.endswith("?") else f"; `mi-ntf {line.split()[0]} -h` describes the options"
+    assert capsys.readouterr().err == f"mi-ntf: error: {said}{remedy}\n"
+
+
+@pytest.mark.parametrize("name", cli.COMMANDS)
+def test_every_command_answers_bad_usage_with_one_line(name: str, capsys):
+    for words in ([name, "--no-such-option"], [name, *["a"] * 9, "--size"]):
+        assert cli.main(words) == 2
+        assert re.fullmatch(r"mi-ntf: error: .*\n", capsys.readouterr().err)
+
+
 HELP = re.compile(r"^  (?:--?\w|SCENE\.xml|[A-Z]{3,}\b)")
 """Beginning of the lines of a help that name an argument."""
 
