@@ -87,7 +87,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list:
             {"preset": "fast", "minutes": None, "steps": None, "seed": 0, "tensorboard": None, "field": None,
              "further": False, "began": ANY, "ntf": None, "augmentation": True, "colour_loss": True,
              "visibility_mlp": False, "bounces": True, "fresnel": True, "gains": False, "estimate": True, "view": False,
-             "reading": {"size": 768, "masks": None, "background": "black", "flash_offset": None}},
+             "reading": {"size": 768, "masks": None, "background": "black", "flash_offset": "estimate"}},
         ),
         (
             "train data -o f.safetensors --masks m --flash-offset 0.1,0.2,-0.3",
@@ -165,7 +165,7 @@ def test_limits_of_compare_decide_the_exit_code(calls: list, capsys: pytest.Capt
         "train data -o f.safetensors --flash-offset 1,2",
         "train data -o f.safetensors --flash-offset up",
         "capture s.xml data --flash-offset estimate",
-        "inspect data --flash-offset estimate",
+        "inspect data --flash-offset up",
         "compare a.exr b.exr --masked",
         "compare a.exr b.exr --max-psnr 30",
         "compare a.exr b.exr --max-flip little",
@@ -296,15 +296,21 @@ def test_a_finished_field_is_trained_further_or_replaced_only_on_request(calls: 
 
 @pytest.mark.parametrize(("manifest", "following"), [
     (None, "mi-ntf info out/f.safetensors"),
+    ('{"scene": "gone.xml", "folder": ".."}', "mi-ntf info out/f.safetensors"),
     ('{"scene": "m.xml"}', "mi-ntf swap m.xml out/f.safetensors -o nrf.xml"),
     ('{"scene": "m.xml", "shapes": "not:floor"}', "mi-ntf swap m.xml out/f.safetensors -o nrf.xml --shapes not:floor"),
+    ('{"scene": "n.xml", "folder": "../a scene", "parameters": {"size": "2"}}',
+     "mi-ntf swap 'a scene/n.xml' out/f.safetensors -o nrf.xml -D size=2"),
 ])
 def test_training_ends_with_the_files_a_verdict_and_the_next_command(calls: list, tmp_path, monkeypatch, capsys,
                                                                      manifest, following):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys.modules["mi_ntf.train"], "train",
                         lambda *_, **__: {"verdict": "the field is good: test views have 31.2 dB"})
-    Path("d").mkdir()
+    for folder in (Path("d"), Path("a scene")):
+        folder.mkdir()
+    for scene in (Path("m.xml"), Path("a scene/n.xml")):
+        scene.touch()
     if manifest:
         Path("d/capture.json").write_text(manifest)
     assert cli.main("train d -o out/f.safetensors".split()) == 0

@@ -1,9 +1,12 @@
 """Commands that make and describe fields: capture, inspect, train, export, info."""
 
 import json
+import os
+import shlex
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated, Literal
 
 from mi_ntf.commands import options
@@ -67,13 +70,12 @@ class Inspect:
     """Scale photographs to this many pixels along their longer side."""
     masks: options.Masks = None
     background: options.Background = None
-    flash_offset: options.FlashOffset = None
-    """Offset of the flash from the lens: right,up,forward."""
+    flash_offset: options.FlashOrEstimate = None
     json: options.Json = False
 
     def run(self) -> None:
         """Write the page and print the summary."""
-        offset = options.parse_offset(self.flash_offset)
+        offset = options.flash_of(self.flash_offset)
         if self.output is not None:
             files.check(self.output, (".html",))
         extras.need("train", "the page of a data set", "matplotlib", "PIL")
@@ -111,8 +113,7 @@ class Train:
     """Scale photographs to this many pixels along their longer side, in linear light."""
     masks: options.Masks = None
     background: options.Background = None
-    flash_offset: options.FlashOffset = None
-    """Offset of the flash from the lens: right,up,forward in the data set's lengths, or `estimate`."""
+    flash_offset: options.FlashOrEstimate = None
     no_gains: options.Flag = False
     """Assume one exposure and white balance for all photographs, although the flash's intensity is not known."""
     no_bounces: options.Flag = False
@@ -141,8 +142,7 @@ class Train:
             raise options.UsageError("give --minutes or --steps, not both")
         if self.further and self.overwrite:
             raise options.UsageError("give --continue or --overwrite, not both")
-        estimate = self.flash_offset == "estimate"
-        offset = None if estimate else options.parse_offset(self.flash_offset)
+        offset = options.flash_of(self.flash_offset)
         files.check(self.output, (".safetensors",))
         if self.output.exists() and not (self.further or self.overwrite):
             raise MiNtfError(f"{self.output} exists; add --continue to train it further or --overwrite to replace it, "
@@ -158,7 +158,7 @@ class Train:
                        ntf=self.ntf, began=began,
                        augmentation=not self.no_augmentation, colour_loss=not self.no_colour_loss,
                        reading={"size": self.size, "masks": self.masks, "background": self.background,
-                                "flash_offset": offset}, estimate=estimate, gains=not self.no_gains,
+                                "flash_offset": offset}, estimate=offset == "estimate", gains=not self.no_gains,
                        visibility_mlp=self.visibility_mlp, bounces=not self.no_bounces,
                        fresnel=not self.no_fresnel, view=self.view)
         if report:  # under torchrun, only the first process has one
@@ -170,15 +170,24 @@ class Train:
 
     def _print_summary(self, report: Mapping[str, object]) -> None:
         """Print where the field and its page are, how good the field is, and the next command."""
+        print(f"field: {self.output}", f"page: {self.output.with_suffix('.html')} (open it in a browser)",
+              report.get("verdict", ""), f"next: {self._following()}", sep="\n")
+
+    def _following(self) -> str:
+        """Return the command that puts the field into its scene, for the working folder; for photographs, another."""
         try:
             capture = json.loads((self.dataset / "capture.json").read_bytes())
         except (OSError, ValueError):
-            following = f"mi-ntf info {self.output}"
-        else:
-            shapes = f" --shapes {capture['shapes']}" if capture.get("shapes") else ""
-            following = f"mi-ntf swap {capture.get('scene')} {self.output} -o nrf.xml{shapes}"
-        print(f"field: {self.output}", f"page: {self.output.with_suffix('.html')} (open it in a browser)",
-              report.get("verdict", ""), f"next: {following}", sep="\n")
+            capture = {}
+        folder = [self.dataset.resolve(), capture["folder"]] if "folder" in capture else []
+        scene = Path(os.path.relpath(Path(*folder, capture.get("scene", ""))))
+        if not scene.is_file():
+            return shlex.join(["mi-ntf", "info", str(self.output)])
+        words = ["mi-ntf", "swap", str(scene), str(self.output), "-o", "nrf.xml"]
+        words += ["--shapes", capture["shapes"]] if capture.get("shapes") else []
+        for name, value in capture.get("parameters", {}).items():
+            words += ["-D", f"{name}={value}"]
+        return shlex.join(words)
 
 
 @dataclass

@@ -54,6 +54,8 @@ Masks = Annotated[Path | None, named("DIR", "Folder of masks with the names of t
 Background = Annotated[Literal["black"] | None, named(
     "{black}", "For photographs without masks that were taken with a flash in a dark room.")]
 FlashOffset = Annotated[str | None, named("R,U,F")]
+FlashOrEstimate = Annotated[str | None, named(
+    "R,U,F", "Offset of the flash from the lens: right,up,forward in the data set's lengths, or `estimate`.")]
 
 SCENE_HELP = {
     "mode": "Mitsuba's variant. The default is the first available of " + " and ".join(VARIANTS) + ".",
@@ -136,6 +138,11 @@ def parse_offset(text: str | None) -> tuple[float, float, float] | None:
         raise UsageError(f"--flash-offset is '{text}', expected three numbers right,up,forward (write "
                          "--flash-offset=-1,2,0 where the first is negative)") from None
     return right, up, forward
+
+
+def flash_of(text: str | None) -> tuple[float, float, float] | Literal["estimate"] | None:
+    """Return an offset as :func:`parse_offset` does, or "estimate"."""
+    return "estimate" if text == "estimate" else parse_offset(text)
 
 
 def print_report(report: Report, as_json: bool, print_table: Callable[[Report], None]) -> None:

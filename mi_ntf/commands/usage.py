@@ -16,18 +16,18 @@ def sentence(command: str, words: list[str], box: str) -> str:
     text, rest = " ".join(" ".join(lines[:end]).split()), " ".join(lines[end:])
     if text.startswith("Missing from"):
         names = [name[1].split(", ")[0] for line in lines[:end] if (name := _NAMES.match(line))]
-        said = f"{command} needs {' and '.join(names)}"
+        fault = f"{command} needs {' and '.join(names)}"
     elif missing := re.search(r"Missing value for argument '([^']+)'", text):
-        said = f"{missing[1].split('/')[-1]} needs a value"
+        fault = f"{missing[1].split('/')[-1]} needs a value"
     elif unknown := re.match(r"Unrecognized (?:or misplaced )?options: (.*)", text):
-        said = _unknown(command, words, unknown[1], rest)
+        fault = _unknown(command, words, unknown[1], rest)
     elif refused := re.match(r"Error parsing (\S+):", text) or re.search(r" for argument '([^']+)'", text):
         option = refused[1].split("/")[-1]
         legal = _legal(text)
-        said = f"{option} is {_value(words, option)!r}, must be {legal}" if legal else text
+        fault = f"{option} is {_value(words, option)!r}, must be {legal}" if legal else text
     else:
-        said = text
-    return said if said.endswith("?") else f"{said.rstrip('.')}; `mi-ntf {command} -h` describes the options"
+        fault = text
+    return fault if fault.endswith("?") else f"{fault.rstrip('.')}; `mi-ntf {command} -h` describes the options"
 
 
 def _unknown(command: str, words: list[str], listed: str, rest: str) -> str:

@@ -8,6 +8,7 @@ this file and `capture_scene` use Mitsuba.
 """
 
 import json
+import os
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -48,11 +49,14 @@ def _studio(subject: capture_scene.Subject, angle: float, size: int) -> "mi.Scen
     return scene
 
 
-def _open_manifest(out: Path, settings: dict[str, object]) -> None:
-    """Write the settings to `capture.json`, or compare them with those of the run that this one resumes."""
+def _open_manifest(out: Path, settings: dict[str, object], origin: dict[str, object]) -> None:
+    """Write settings and `origin` to `capture.json`, or compare settings with those of the run that this one resumes.
+
+    The `origin` tells `mi-ntf train` the command that puts the field into the scene. It may change.
+    """
     path = out / "capture.json"
     if not path.exists():
-        files.write(path, json.dumps(settings, indent=1) + "\n")
+        files.write(path, json.dumps(settings | origin, indent=1) + "\n")
         return
     try:
         before = {"flash_offset": [0.0, 0.0, 0.0], "shapes": ""}  # which old files lack
@@ -187,7 +191,9 @@ def capture(scene: Path, out: Path, *, views: int = 100, size: int = 128, test_v
     files.make_folder(out)
     _open_manifest(out, {"scene": Path(scene).name, "shapes": shapes, "object": request.object,
                          "integrator": " ".join(str(session.studio.integrator()).split()), "views": views, "size": size,
-                         "test_views": test_views, "spp": spp, "seed": seed, "flash_offset": session.offset.tolist()})
+                         "test_views": test_views, "spp": spp, "seed": seed, "flash_offset": session.offset.tolist()},
+                   {"folder": Path(os.path.relpath(Path(scene).resolve().parent, out.resolve())).as_posix(),
+                    "parameters": parameters or {}})
     missing = [index for index, frame in enumerate(frames) if not (out / frame.file).exists()]
     _sessions[:] = [session]
     try:

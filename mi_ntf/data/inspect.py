@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from mi_ntf.core import files, progress
+from mi_ntf.core.errors import MiNtfError
 from mi_ntf.data import assumptions, inspect_figures, measures
 from mi_ntf.data.measures import Numbers, Splits, percent
 from mi_ntf.data.page import Page
@@ -21,10 +22,11 @@ POINTS = 2000  # of the reconstructed points, in the figure of the cameras
 def inspect(folder: Path, out: Path | None = None, **options: Any) -> Numbers:
     """Read the data set in `folder` with `options` of :func:`load_dataset`, write the page and return the numbers.
 
-    The page `out` is DIR-inspect.html in the current folder by default. Options that are None are ignored. The keys of
-    the result are "folder", "form", "said" (sentences of the reader), "assumed" (the assumptions among them),
-    "warnings", "page", "next" (the command that trains), "views" (one mapping for each photograph) and those of
-    :func:`measures.numbers`. Raises MiNtfError if the data set has a fault, or the page cannot be written.
+    The page `out` is DIR-inspect.html in the current folder by default. Options that are None are ignored. The result
+    has "folder", "form", "warnings", "page" and the keys of :func:`measures.numbers`. "said" are sentences of the
+    reader, "assumed" the assumptions among them. "estimate" is true if training is to estimate the place of the flash.
+    "next" is the command that trains, and "views" has one mapping for each photograph. Raises MiNtfError if the data
+    set has a fault, or the page cannot be written.
     """
     folder = Path(folder)
     out = Path(f"{folder.resolve().name}-inspect.html") if out is None else Path(out)
@@ -38,9 +40,13 @@ def _inspect(folder: Path, out: Path, options: dict[str, Any]) -> Numbers:
     splits = load_dataset(folder, messages.append, **{k: v for k, v in options.items() if v is not None})
     rows = measures.measure(splits)
     numbers = measures.numbers(splits, rows)
+    estimate = options.get("flash_offset") == "estimate"
+    if estimate and numbers["flash_degrees"]:
+        raise MiNtfError(f"--flash-offset estimate: {folder} says where its lights are; leave the option out")
     form, _ = find_form(folder)
     data = {"folder": str(folder), "form": form.name, "said": messages,
-            "assumed": [text for text in messages if text.startswith(assumptions.PREFIX)], **numbers,
+            "assumed": [text for text in messages if text.startswith(assumptions.PREFIX)],
+            "estimate": estimate, **numbers,
             "warnings": measures.warnings(numbers, rows), "page": str(out),
             "next": _next(folder, splits["train"].located, options),
             "views": [{key: _plain(value) for key, value in row._asdict().items()} for row in rows]}
@@ -65,10 +71,10 @@ def _next(folder: Path, located: bool, options: dict[str, Any]) -> str:
     words = ["mi-ntf", "train", str(folder), "-o", f"{folder.resolve().name}.safetensors"]
     for key in ("size", "masks", "background"):
         words += [f"--{key}", str(options[key])] if options.get(key) is not None else []
-    if flash is not None:
-        words.append(f"--flash-offset={','.join(f'{v:g}' for v in flash)}")
-    elif not located:
+    if not located or flash == "estimate":
         words += ["--flash-offset", "estimate"]
+    elif flash is not None:
+        words.append(f"--flash-offset={','.join(f'{v:g}' for v in flash)}")
     return shlex.join([*words, "--minutes", "10"])
 
 
@@ -86,8 +92,9 @@ def summary(data: Numbers) -> list[tuple[str, str]]:
         ("cameras to object", f"{_range(data['distance'])} radii; the median is {length:.4g} of the data set's "
                               "lengths"),
         ("pixel at the object", f"{_range(data['pixel'])} radii"),
-        ("flash beside the lens", "not known; taken to be at the lens" if data["flash_degrees"] is None else
-         f"{_range(data['flash_degrees'], 1, '.1f')} degrees, seen from the object"),
+        ("flash beside the lens", f"{_range(data['flash_degrees'], 1, '.1f')} degrees, seen from the object" if
+         data["flash_degrees"] else "not known; training will estimate it, since that takes the object's shape" if
+         data.get("estimate") else "not known; taken to be at the lens"),
         ("largest gap of cameras", f"{data['gap']['degrees']:.0f} degrees"),
         ("brightness, largest / smallest", f"{' '.join(map(_number, ratio))} (R G B)"),
         ("colour, largest / smallest", f"{_number(balance['red_over_green'])} (R/G) "

@@ -26,6 +26,8 @@ BOUNCE_TIMES = (0.3, 0.45, 0.6, 0.75)
 """Times, as fractions of the run, at which bounced light is computed: the skin has formed, and albedo follows."""
 BOUNCE_SECONDS = 20.0
 """Seconds of a run for each of these rounds, which take a few each; the shortest runs do without."""
+BOUNCE_COST = 2.0
+"""Expected time of the first round, relative to that of shaping the visual hull; later ones take that of the last."""
 ESTIMATE_TIMES = (0.1, 0.2, 0.3, 0.4, 0.55)
 """Times at which the position of the flash is estimated, if it is unknown. Position and shape improve in turns."""
 NOTICED = 6.0
@@ -50,6 +52,7 @@ class Course:
     last_bake: int = 0  # Step of the last bake
     samples_per_ray: float = 30.0
     meeting: float = 0.5  # Fraction of the sampled pixels whose rays meet the hull
+    bounce: float = 0.0  # Time that a round of bounced light takes, as a fraction of the run; 0 in runs given in steps
 
 
 class Fast:
@@ -169,6 +172,8 @@ class Fast:
     def carve(self, steps: int = 300, points: int = 4096) -> None:
         """Give the density the shape of the visual hull, by regression of ln σ: seconds that save minutes."""
         occupancy, generator = self.occupancy, self.generator
+        self.clock.count()
+        before = self.clock.progress
         for step in range(steps):
             inside = occupancy.index[torch.randint(len(occupancy.index), (points,), generator=generator)]
             x = torch.cat([occupancy.positions(inside, generator), occupancy.must_be_empty(points, generator)])
@@ -177,6 +182,8 @@ class Fast:
             target[points:] = LOG_EMPTY - 2
             self.learner.descend("field", (raw - target).square().mean(), 1 - 0.9 * step / steps)
         self.learner.optimizers["field"] = self._optimizer(*FIELD)
+        self.clock.count()
+        self.course.bounce = BOUNCE_COST * (self.clock.progress - before)
 
     def refresh(self) -> None:
         """Bring all that is computed from the density without gradients up to date."""
@@ -192,14 +199,30 @@ class Fast:
             self.bake()
         if finished:
             return
-        if course.rounds < len(BOUNCE_TIMES) and progress >= BOUNCE_TIMES[course.rounds]:
-            # Runs given in steps do not depend on the time that they take.
-            if not self.clock.timed or self.clock.spent >= BOUNCE_SECONDS * (course.rounds + 1):
-                self.update_bounced()
+        self.find_light()
+
+    def find_light(self) -> None:
+        """Estimate the position of the flash and compute bounced light, where one is due and there is time.
+
+        In a slow run several rounds may be due at once. The last of them stands for all.
+        """
+        course, clock = self.course, self.clock
+        due = sum(time <= clock.progress for time in ESTIMATE_TIMES)
         unknown = self.data.solid and (self.estimating or not self.data.splits["train"].located)
-        if unknown and course.estimates < len(ESTIMATE_TIMES) and progress >= ESTIMATE_TIMES[course.estimates]:
+        if unknown and course.estimates < due:
+            course.estimates = due - 1
             with Stage("estimating the flash", inner=True):
                 self.estimate_flash()
+            clock.count()
+        due = sum(time <= clock.progress for time in BOUNCE_TIMES)
+        # Runs given in steps do not depend on the time that they take.
+        due = 0 if clock.timed and clock.spent < BOUNCE_SECONDS * (course.rounds + 1) else due
+        before = clock.progress
+        if course.rounds < due and before + course.bounce < self.field_until:
+            course.rounds = due - 1
+            self.update_bounced()
+            clock.count()
+            course.bounce = clock.progress - before
 
     def estimate_flash(self) -> None:
         """Estimate the position of the flash relative to the lens. Use it, or warn if it is assumed at the lens."""

@@ -43,6 +43,12 @@ class Clock:
         now = time.monotonic()
         self.spent, self.last = self.spent + now - self.last, now
 
+    def count(self) -> None:
+        """Count the time up to now as spent, and agree on it in all processes if it limits the run."""
+        self.tick()
+        if self.timed:
+            self.spent = parallel.agreed(self.spent)
+
     @property
     def left(self) -> float:
         """Seconds that are left of a run that is limited by time; 0 of other ones."""

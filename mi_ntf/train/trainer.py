@@ -215,11 +215,9 @@ class Trainer:
         if clock.step % 20 == 0:
             self.log_scalars()
             self.log.show(clock.step, self.last, self.picture)
-        clock.tick()
-        if clock.timed:
-            clock.spent = parallel.agreed(clock.spent)
-            if validate:
-                record.validated = clock.progress  # the next validation is a tenth of the run later than its end
+        clock.count()
+        if clock.timed and validate:
+            record.validated = clock.progress  # the next validation is a tenth of the run later than its end
         if clock.step % KEEP == 0 or clock.progress >= 1 or self.due():
             self.keep()
         return value

@@ -286,6 +286,16 @@ def test_photographs_that_are_not_finite_are_not_written(tmp_path):
     assert not list((tmp_path / "out").rglob("*.exr"))
 
 
+def test_the_manifest_says_where_the_scene_is_from_the_data_set(tmp_path):
+    """A capture goes on although its folder was moved: the place is not compared."""
+    scene, out = write(tmp_path), tmp_path / "sets" / "out"
+    small(scene, out)
+    manifest = json.loads((out / "capture.json").read_text())
+    assert (out / manifest["folder"] / manifest["scene"]).resolve() == scene.resolve() and manifest["parameters"] == {}
+    out.rename(tmp_path / "moved")
+    assert small(scene, tmp_path / "moved")["rendered"] == 0
+
+
 @pytest.mark.parametrize("text", ["", "[1, 2]", "{", "3"])
 def test_a_damaged_note_of_the_settings(tmp_path, text):
     scene, out = write(tmp_path), tmp_path / "out"

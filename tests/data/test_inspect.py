@@ -245,8 +245,9 @@ def test_every_form(tmp_path, monkeypatch, form, capsys):
     (forms.capture, {}, ""),
     (forms.blender, {}, "--flash-offset estimate "),
     (forms.colmap, {"flash_offset": (-1, 1.5, 0), "size": 16}, "--size 16 --flash-offset=-1,1.5,0 "),
+    (forms.colmap, {"flash_offset": "estimate"}, "--flash-offset estimate "),
     (forms.colmap, {"masks": "masks"}, "--masks '{folder}/masks' --flash-offset estimate "),
-], ids=["capture", "place of the flash not known", "options", "masks"])
+], ids=["capture", "place of the flash not known", "options", "estimate", "masks"])
 def test_the_next_command_has_the_same_options(tmp_path, form, options, more):
     folder = form(tmp_path / "a set")
     if "masks" in options:
@@ -254,6 +255,14 @@ def test_the_next_command_has_the_same_options(tmp_path, form, options, more):
     numbers = inspect(folder, tmp_path / "page.html", **options)
     assert numbers["next"] == (f"mi-ntf train '{folder}' -o 'a set.safetensors' " + more.format(folder=folder)
                                + "--minutes 10")
+
+
+def test_the_place_of_the_flash_is_estimated_by_training_and_only_if_it_is_not_known(tmp_path):
+    numbers = inspect(forms.colmap(tmp_path / "set"), tmp_path / "page.html", flash_offset="estimate")
+    assert dict(summary(numbers))["flash beside the lens"] == (
+        "not known; training will estimate it, since that takes the object's shape")
+    with pytest.raises(MiNtfError, match=r"--flash-offset estimate: .*known says where its lights are; leave the"):
+        inspect(forms.capture(tmp_path / "known"), tmp_path / "page.html", flash_offset="estimate")
 
 
 def test_a_page_that_cannot_be_written_is_told_before_the_work(tmp_path):

@@ -9,9 +9,10 @@ torch = pytest.importorskip("torch", reason="training needs PyTorch: pip install
 
 from train import two_spheres  # noqa: E402
 
-from mi_ntf.train import pace, train  # noqa: E402
+from mi_ntf.train import fast, pace, train  # noqa: E402
+from mi_ntf.train.config import FastConfig  # noqa: E402
 from mi_ntf.train.monitor import Notes  # noqa: E402
-from mi_ntf.train.recipe import Clock  # noqa: E402
+from mi_ntf.train.recipe import Clock, Learner, Run  # noqa: E402
 from mi_ntf.train.training_data import TrainingData  # noqa: E402
 
 
@@ -51,6 +52,29 @@ def test_pixels_fit_into_the_time_that_is_left(photographs):
     assert run.detail(10000.0, run.clock.left - 5.0) == pytest.approx(0.5, abs=0.05)
     assert run.detail(1e9, 0.0) == pace.LEAST and run.detail(1.0, 0.0) == 1.0
     assert pace.Pace(Clock(steps=10), data).detail(math.inf, 0.0) == 1.0
+
+
+@pytest.mark.parametrize(("spent", "bounce", "done"), [
+    (5.0, 0.0, []), (25.0, 0.0, ["flash", "bounce"]), (50.0, 0.0, ["flash", "bounce"]), (50.0, 0.2, ["flash"])])
+def test_slow_runs_find_the_light_once_and_only_if_there_is_time(photographs, spent, bounce, done, monkeypatch):
+    """Several rounds are due at once where a step takes long; a round that does not fit any more is left out."""
+    clock = Clock(minutes=1.0, spent=spent)
+    run = Run(TrainingData.load(photographs, Notes(False), {}), clock, Learner(clock), Notes(False),
+              torch.Generator().manual_seed(0))
+    recipe, work = fast.Fast(FastConfig(), run, estimate=True), []
+    clock.spent, clock.last, recipe.course.bounce = spent, time.monotonic(), bounce
+
+    def stand_in(name, counter):
+        def function():
+            work.append(name)
+            setattr(recipe.course, counter, getattr(recipe.course, counter) + 1)
+        return function
+
+    monkeypatch.setattr(recipe, "estimate_flash", stand_in("flash", "estimates"))
+    monkeypatch.setattr(recipe, "update_bounced", stand_in("bounce", "rounds"))
+    for _ in range(3):
+        recipe.find_light()
+    assert work == done
 
 
 @pytest.mark.slow
