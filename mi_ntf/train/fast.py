@@ -197,9 +197,8 @@ class Fast:
         due &= not (finished and self.clock.step > course.last_bake + 8 * REFRESH)
         if due or (progress >= self.config.ntf_from and not self.marched.known):
             self.bake()
-        if finished:
-            return
-        self.find_light()
+        if not finished or (self.estimating and not course.estimates):
+            self.find_light()
 
     def find_light(self) -> None:
         """Estimate the position of the flash and compute bounced light, where one is due and there is time.

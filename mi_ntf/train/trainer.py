@@ -180,7 +180,7 @@ class Trainer:
             self.log.start(clock.step)
             self.keep()
             self.saved, traced, average = time.monotonic(), clock.progress, math.nan
-            while clock.progress < 1:
+            while clock.progress < 1 or clock.step == clock.first:  # a slow machine makes one step, too
                 try:
                     value = self.turn()
                 except Fault as fault:
