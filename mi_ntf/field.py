@@ -26,13 +26,13 @@ class Reflectance(NamedTuple):
     Attributes
     ----------
     normal
-        Unit vectors in the coordinates of the capture, (n, 3).
+        Unit vectors in the coordinates of the capture, (n, 3); 0 for smoke.
     albedo
-        Diffuse albedo in linear RGB, 0 to 1, (n, 3).
+        Diffuse albedo in linear RGB, 0 to 1, (n, 3). For smoke, the fraction of light that is scattered.
     roughness
-        Roughness of the specular lobe, 0 to 1, (n,).
+        Roughness of the specular lobe, 0 to 1, (n,); 1 for smoke.
     specular
-        Weight of the specular lobe, 0 to 1, (n,).
+        Weight of the specular lobe, 0 to 1, (n,); 0 for smoke.
     """
 
     normal: Array
@@ -53,6 +53,8 @@ class Field:
         The field file.
     center, radius
         Sphere around the object. The density outside of it is 0.
+    phase
+        Asymmetry g of smoke, whose phase function is that of Henyey and Greenstein; None for surfaces.
     """
 
     def __init__(self, path: Path, field: loaded.LoadedField):
@@ -60,6 +62,7 @@ class Field:
         self.path = path
         self.center: np.ndarray = np.array(similarity.center, np.float64)
         self.radius = float(similarity.radius)
+        self.phase: float | None = field.header.architecture.phase
         self._frame, self._grid = Frame(similarity, np.eye(4), 1.0), field.grid
 
     @classmethod

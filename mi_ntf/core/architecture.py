@@ -91,6 +91,9 @@ class Architecture:
     visibility: Network | None = None
     fresnel: bool = False
     """True if the specular weight is the reflectance at normal incidence of :mod:`mi_ntf.core.fresnel`."""
+    phase: float | None = None
+    """Asymmetry g of smoke, which scatters by :mod:`mi_ntf.core.henyey_greenstein`; None: a surface's reflectance.
+    Smoke has no normal and no specular lobe: the reflectance network's albedo alone counts."""
 
     @property
     def least_specular(self) -> float:
@@ -149,6 +152,9 @@ def header_from_json(data: object, source: str) -> Header:
         if described.get("visibility") is not None:  # absent from files of earlier builds
             nets["visibility"] = _network(_member(described, "visibility", dict), "visibility")
         fresnel = _member({"fresnel": False} | described, "fresnel", bool)  # likewise
+        phase = described.get("phase")  # likewise
+        if phase is not None and not abs(_number(phase, "the asymmetry of the phase function")) < 1:
+            raise ValueError(f"the asymmetry of the phase function is {shown(phase)}, expected -1 to 1, exclusive")
         similarity = _member(data, "similarity", dict)
         center = _member(similarity, "center", list)
         if len(center) != 3:
@@ -156,7 +162,7 @@ def header_from_json(data: object, source: str) -> Header:
         x, y, z = (_number(c, "the similarity's center") for c in center)
         radius = _number(_member(similarity, "radius", object), "the similarity's radius", above=0)
         provenance = _member({"provenance": {}} | data, "provenance", dict)
-        return Header(Architecture(**nets, fresnel=fresnel), Similarity((x, y, z), radius), provenance)
+        return Header(Architecture(**nets, fresnel=fresnel, phase=phase), Similarity((x, y, z), radius), provenance)
     except ValueError as error:
         raise MiNtfError(f"{source}: the header's description is incomplete or wrong: {error}; "
                          "was it written by `mi-ntf train`?") from None

@@ -61,7 +61,7 @@ class NetworkField:
         baseline = arch.visibility
         self._visibility = None if baseline is None else _Network(baseline.encoding, "visibility", tensors, dj)
         self.has_visibility = baseline is not None
-        self._least_specular = arch.least_specular
+        self._least_specular, self._smoke = arch.least_specular, arch.phase is not None
         self.quick = arch.reflectance.encoding.kind == "planes"
         """True if a reflectance costs no more than a few fetches."""
 
@@ -75,8 +75,11 @@ class NetworkField:
         return density_of(inside(cut(self.log_density(p)), p))
 
     def reflectance(self, p: Vector) -> Reflected:
-        """Return normal, albedo, roughness and specular weight at `p`."""
+        """Return normal, albedo, roughness and specular weight at `p`; of smoke 0, its albedo, 1 and 0."""
         raw = self._reflectance.layers(self._reflectance.encode(p))
+        if self._smoke:
+            zero, one = dr.zeros(type(raw[3]), dr.width(raw[3])), dr.ones(type(raw[3]), dr.width(raw[3]))
+            return (zero, zero, zero), tuple(logistic.sigmoid(ops, v) for v in raw[3:6]), one, zero
         normal = normalize(ops, tuple(raw[:3]))
         r, g, b, rough, spec = (logistic.sigmoid(ops, v) for v in raw[3:])
         least = self._least_specular

@@ -50,7 +50,7 @@ def sample(wo: Vector, reflectance: Reflectance, u1: Float, u2: tuple[Float, Flo
     cos_specular = dr.sqrt((1 - u2[0]) / (1 + (alpha * alpha - 1) * u2[0]))
     cos = dr.select(glossy, cos_specular, dr.select(uniform, u2[0], dr.sqrt(1 - u2[0])))
     sin = dr.safe_sqrt(1 - cos * cos)
-    s, t = _tangents(normal)
+    s, t = tangents(normal)
     m = tuple(sin * dr.cos(phi) * a + sin * dr.sin(phi) * b + cos * c for a, b, c in zip(s, t, normal, strict=True))
     twice = 2 * dot(wo, m)
     wi = tuple(dr.select(glossy, twice * a - b, a) for a, b in zip(m, wo, strict=True))
@@ -69,7 +69,7 @@ def _specular_chance(wo: Vector, reflectance: Reflectance) -> tuple[Float, Float
     return dr.select(above > 0, chance, 0), above
 
 
-def _tangents(n: Vector) -> tuple[Vector, Vector]:
+def tangents(n: Vector) -> tuple[Vector, Vector]:
     """Return two unit vectors perpendicular to `n` and each other (Duff et al. 2017)."""
     sign = dr.select(n[2] < 0, -1, 1)
     a = -dr.rcp(sign + n[2])

@@ -34,6 +34,16 @@ class Softness:
         return self._bricks.at(self._bricks.place(p))[0]
 
 
+class Smoke:
+    """Softness of matter without skins."""
+
+    opaque, solid = False, 0.0
+
+    def __call__(self, p: Vector) -> Float:
+        """Return 0 at the points `p`."""
+        return dr.zeros(type(p[0]), dr.width(p[0]))
+
+
 def measured(grid: GridField, dj: ModuleType) -> Softness:
     """Return the softness of `grid`."""
     return Softness(measure(grid, dj), dj)

@@ -40,13 +40,13 @@ def _logit(p):
 
 def blobs(
     centers, radii, *, log_density=5.0, edge=8.0, albedo=(0.6, 0.5, 0.4), roughness=0.5, specular=0.2, similarity=None,
-    components=2, visibility=False, fresnel=False
+    components=2, visibility=False, fresnel=False, phase=None
 ) -> tuple[Header, dict]:
     """Opaque balls: ln σ rises from −12 to `log_density` over about radius/`edge`.. around each radius. Normals point
     away from the origin. At most 8 balls; a ball is the level set of a Gaussian, which the three planes' product holds
     exactly. `visibility`: with the baseline's network, too, whose τ is anything between 0 and 1 and smooth. `fresnel`:
-    `specular` is the normal reflectance."""
-    arch = replace(architecture(components, visibility), fresnel=fresnel)
+    `specular` is the normal reflectance. `phase`: asymmetry of smoke."""
+    arch = replace(architecture(components, visibility), fresnel=fresnel, phase=phase)
     t = {k: np.zeros(s) for k, s in arch.skeleton().items()}
     u, v = _axes()
     for i, (c, r) in enumerate(zip(centers, radii, strict=True)):

@@ -14,7 +14,7 @@ from ...core.architecture import Header
 from ..grid import Density, GridField
 from ..lights import LightTable
 from ..network import NetworkField
-from ..skin import Softness
+from ..skin import Smoke, Softness
 from ..tuning import FINE_MAPS, MIN_MAP_RESOLUTION
 from ..types import Visibility
 
@@ -64,7 +64,7 @@ class Field(Protocol):
     @property
     def grid(self) -> GridField: ...  # noqa: D102
     @property
-    def softness(self) -> Softness: ...  # noqa: D102
+    def softness(self) -> Softness | Smoke: ...  # noqa: D102
     @property
     def trained(self) -> bool: ...  # noqa: D102
 

@@ -16,9 +16,9 @@ No parameter is exposed to ``mi.traverse``.
 
 The medium fills the sphere around the captured object, whose centre and radius in capture units are in the file. It
 belongs inside one bounding shape with a ``null`` BSDF that encloses the object. Extinction is in inverse scene units.
-Every collision scatters (the single-scattering albedo is 1), with the field's reflectance as phase function. Media may
-overlap: the ``nrf`` integrator adds their densities. Stock volumetric integrators know one medium at a time and are no
-reference there.
+Every collision scatters (the single-scattering albedo is 1), with the field's reflectance as phase function. Smoke has
+the phase function of Henyey and Greenstein in place of a surface's reflectance. Media may overlap: the ``nrf``
+integrator adds their densities. Stock volumetric integrators know one medium at a time and are no reference there.
 
 Does not support: several bounding shapes for one medium; shearing or non-uniform transforms; spectral extinction.
 Source: neural reflectance fields, Bi et al. 2020.
@@ -52,11 +52,13 @@ from collections.abc import Callable
 import drjit as dr
 import mitsuba as mi
 
-from ...core.architecture import MAX_LOG_DENSITY
+from ...core.architecture import MAX_LOG_DENSITY, Architecture
 from ...core.errors import MiNtfError
+from ...infer.backend import module_of
 from ...infer.grid import Density, NetworkVolume
+from ...infer.phase_function import HenyeyGreenstein, smoke
 from ...infer.shade import Reflectance
-from ...infer.skin import Softness
+from ...infer.skin import Smoke, Softness
 from ...infer.types import Color3, Float, Mask, Ray, Vector, Vector3
 from .. import log
 from ..scene import loaded
@@ -66,13 +68,18 @@ from . import properties
 REPRESENTATIONS = ("grid", "network")
 
 
-def _reflectance(source: Density, softness: Softness, fresnel: bool) -> Callable[[Vector], Reflectance]:
+def _reflectance(source: Density, softness: Softness | Smoke, architecture: Architecture
+                 ) -> Callable[[Vector], Reflectance]:
     """Return the reflectance of field points as a function.
 
     The phase function holds it rather than the medium, which holds the phase function. The two would never be freed.
     """
+    fresnel, phase = architecture.fresnel, architecture.phase
+    lobe = None if phase is None else HenyeyGreenstein(phase, module_of(mi.Float))
 
     def reflectance(x: Vector) -> Reflectance:
+        if lobe:
+            return smoke(source.reflectance(x)[1], lobe)
         return Reflectance(*source.reflectance(x), softness(x), fresnel)
 
     return reflectance
@@ -103,8 +110,7 @@ def medium_class(phase_class: type) -> type:
             grid, bound = self.field.grid, math.exp(MAX_LOG_DENSITY)  # clipping alone bounds the networks
             self.source: Density = (
                 grid if self.representation == "grid" else NetworkVolume(self.field.network, grid, bound))
-            architecture = self.field.header.architecture
-            self.reflectance = _reflectance(self.source, self.field.softness, architecture.fresnel)
+            self.reflectance = _reflectance(self.source, self.field.softness, self.field.header.architecture)
             self.frame = Frame(self.field.header.similarity, to_world, scale)
             self.path = path
             phase = phase_class(mi.Properties("nrf"))

@@ -9,6 +9,7 @@ parameter type default range meaning
 Its value is f = ρ(R(x), ω_o, ω_i, n(x)) (⟨n,ω_i⟩ + ⟨n,ω_o⟩) in 1/sr and linear RGB, between directions on the side of
 the normal, and less at grazing angles of curved skins. An opaque skin thus reflects like a surface of the microfacet
 model ρ (:func:`mi_ntf.core.microfacet.scattering`). It is not normalised: its integral over directions is the albedo.
+Smoke has the albedo times the phase function of Henyey and Greenstein (:mod:`mi_ntf.core.henyey_greenstein`) instead.
 Stock ``volpath`` and ``volpathmis`` at `max_depth` 2 solve the same equation as the ``nrf`` integrator (Bi et al. 2020,
 eq. 2).
 

@@ -17,7 +17,7 @@ from ...infer.backend import module
 from ...infer.bake import VERSION, bake
 from ...infer.grid import GridField
 from ...infer.network import NetworkField
-from ...infer.skin import Softness, measure
+from ...infer.skin import Smoke, Softness, measure
 from .. import log, user_cache
 
 QUEUED = 1 << 16
@@ -37,7 +37,7 @@ class LoadedField:
     header: Header
     network: NetworkField
     grid: GridField
-    softness: Softness
+    softness: Softness | Smoke
     digest: str
     trained = True
 
@@ -95,11 +95,17 @@ def _load(path: str, _identity: tuple[int, int, int] | None, resolution: int | N
         stored = field_file.load_baked(path, _stamp(digest, n))
         if stored is not None:
             try:
-                return LoadedField(header, network, GridField(stored, network, dj), Softness(stored, dj), digest)
+                return LoadedField(header, network, GridField(stored, network, dj), _softness(header, stored, dj),
+                                   digest)
             except (KeyError, ValueError):
                 log.info(f"nrf medium: the voxels in {path} are damaged")
-        arrays = user_cache.cached("fields", user_cache.key(digest, n), lambda: _baked(path, network, n, dj))
-        return LoadedField(header, network, GridField(arrays, network, dj), Softness(arrays, dj), digest)
+        arrays = user_cache.cached("fields", user_cache.key(digest, n), lambda: _baked(path, header, network, n, dj))
+        return LoadedField(header, network, GridField(arrays, network, dj), _softness(header, arrays, dj), digest)
+
+
+def _softness(header: Header, arrays: dict[str, np.ndarray], dj: ModuleType) -> Softness | Smoke:
+    """Return the softness of a field's skins, which smoke does not have."""
+    return Softness(arrays, dj) if header.architecture.phase is None else Smoke()
 
 
 def add_baked(path: Path, resolution: int | None = None) -> dict[str, str | int]:
@@ -110,14 +116,16 @@ def add_baked(path: Path, resolution: int | None = None) -> dict[str, str | int]
     header, tensors = field_file.load(path)
     dj = module(str(mi.variant()))
     n = resolution or voxels(header)
-    arrays = _baked(str(path), NetworkField(header, tensors, dj), n, dj)
+    arrays = _baked(str(path), header, NetworkField(header, tensors, dj), n, dj)
     field_file.add_baked(path, arrays, _stamp(_digest(header, tensors), n))
     return {"file": str(path), "voxels": n, "bytes": Path(path).stat().st_size}
 
 
-def _baked(path: str, network: NetworkField, n: int, dj: ModuleType) -> dict[str, np.ndarray]:
+def _baked(path: str, header: Header, network: NetworkField, n: int, dj: ModuleType) -> dict[str, np.ndarray]:
     with log.Work("nrf medium", f"baking {Path(path).name}, {n}³ voxels") as work:
         arrays = bake(network, n, dj, lambda done: work.update(0.75 * done))
+        if header.architecture.phase is not None:
+            return arrays
         return arrays | measure(GridField(arrays, network, dj), dj, lambda done: work.update(0.75 + 0.25 * done))
 
 

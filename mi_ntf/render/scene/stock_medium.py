@@ -14,7 +14,9 @@ from ...core.errors import MiNtfError
 from ...core.spheres import MIN_HALF_CHORD, fibonacci
 from ...infer.backend import module_of
 from ...infer.convex import Convex, box, planes_of
+from ...infer.phase_function import smoke
 from ...infer.shade import Reflectance
+from ...infer.skin import Smoke
 from ...infer.types import Array, Float, Vector, Vector3
 from ...infer.volume import VoxelVolume
 from .. import log
@@ -25,16 +27,6 @@ from .recent import Recent, Version
 MARGIN = 1.00001 / (1 - MIN_HALF_CHORD**2) ** 0.5
 """Radius of the unit sphere over that of the matter: a ray that grazes the matter has a chord that counts."""
 _volumes: Recent[tuple[VoxelVolume, Frame]] = Recent()
-
-
-class Smoke:
-    """Softness of matter without skins."""
-
-    opaque, solid = False, 0.0
-
-    def __call__(self, p: Vector) -> Float:
-        """Return 0 at the points `p`."""
-        return dr.zeros(type(p[0]), dr.width(p[0]))
 
 
 @dataclass(frozen=True)
@@ -106,14 +98,11 @@ class StockMedium:
 
     def reflectance(self, x: Vector) -> Reflectance:
         """Return albedo and phase function at field points."""
-        n = dr.width(x[0])
         p = self.frame.point_to_world(x)
         scattering, extinction = _coefficients(self._medium, p)
         albedo = tuple(dr.select(extinction > 0, s / dr.maximum(extinction, 1e-30), 0) for s in scattering)
-        zero, one = dr.zeros(mi.Float, n), dr.ones(mi.Float, n)
         dr.eval(p)
-        return Reflectance((zero, zero, zero), albedo, one, zero, zero, False,
-                           PhaseLobe(self._medium.phase_function(), self.frame, p))
+        return smoke(albedo, PhaseLobe(self._medium.phase_function(), self.frame, p))
 
 
 def _coefficients(medium: mi.Medium, p: Vector3) -> tuple[Array, Float]:
