@@ -12,19 +12,17 @@ paper, as its end points p1 and p2 (encoding `frequency` of the six coordinates)
 (Srinivasan et al. 2021): one query for each point and direction, with τ not monotone along a ray.
 """
 
-import math
 from dataclasses import asdict, dataclass, field
 from itertools import pairwise
-from typing import Any, TypeAlias, TypeVar
 
 from .depth_profile import FEATURES
 from .errors import MiNtfError, shown
 from .fresnel import DIELECTRIC
-
-T = TypeVar("T")
-Json: TypeAlias = dict[str, Any]
+from .json_values import Json, member, number, whole
 
 FORMAT = 2
+KEY = "mi_ntf"
+"""Name of the header in the metadata of a field file."""
 MAX_LOG_DENSITY = 6.5
 """Upper bound of ln σ: σ ≤ 665 per unit-sphere radius, a skin of 0.0015 radii."""
 MIN_LOG_DENSITY = -12.0
@@ -147,21 +145,21 @@ def header_from_json(data: object, source: str) -> Header:
         raise MiNtfError(f"{source}: field format {shown(version)}, this build reads {FORMAT}; "
                          "train or export the field anew")
     try:
-        described = _member(data, "architecture", dict)
-        nets = {name: _network(_member(described, name, dict), name) for name in NAMES}
+        described = member(data, "architecture", dict)
+        nets = {name: _network(member(described, name, dict), name) for name in NAMES}
         if described.get("visibility") is not None:  # absent from files of earlier builds
-            nets["visibility"] = _network(_member(described, "visibility", dict), "visibility")
-        fresnel = _member({"fresnel": False} | described, "fresnel", bool)  # likewise
+            nets["visibility"] = _network(member(described, "visibility", dict), "visibility")
+        fresnel = member({"fresnel": False} | described, "fresnel", bool)  # likewise
         phase = described.get("phase")  # likewise
-        if phase is not None and not abs(_number(phase, "the asymmetry of the phase function")) < 1:
+        if phase is not None and not abs(number(phase, "the asymmetry of the phase function")) < 1:
             raise ValueError(f"the asymmetry of the phase function is {shown(phase)}, expected -1 to 1, exclusive")
-        similarity = _member(data, "similarity", dict)
-        center = _member(similarity, "center", list)
+        similarity = member(data, "similarity", dict)
+        center = member(similarity, "center", list)
         if len(center) != 3:
             raise ValueError(f"the similarity's center {shown(center)}, expected 3 numbers")
-        x, y, z = (_number(c, "the similarity's center") for c in center)
-        radius = _number(_member(similarity, "radius", object), "the similarity's radius", above=0)
-        provenance = _member({"provenance": {}} | data, "provenance", dict)
+        x, y, z = (number(c, "the similarity's center") for c in center)
+        radius = number(member(similarity, "radius", object), "the similarity's radius", above=0)
+        provenance = member({"provenance": {}} | data, "provenance", dict)
         return Header(Architecture(**nets, fresnel=fresnel, phase=phase), Similarity((x, y, z), radius), provenance)
     except ValueError as error:
         raise MiNtfError(f"{source}: the header's description is incomplete or wrong: {error}; "
@@ -170,43 +168,19 @@ def header_from_json(data: object, source: str) -> Header:
 
 def _network(data: Json, name: str) -> Network:
     legal = {"transmittance": ("frequency", "depth"), "visibility": ("frequency",)}.get(name, ("planes", "frequency"))
-    e = _member(data, "encoding", dict)
-    kind = _member(e, "kind", str)
+    e = member(data, "encoding", dict)
+    kind = member(e, "kind", str)
     if kind not in legal:
         raise ValueError(f"encoding kind {shown(kind)} of {name}, expected one of {', '.join(legal)}")
     planes = kind == "planes"
-    resolutions = tuple(_whole(r, f"a resolution of {name}", 2) for r in _member(e, "resolutions", list))
+    resolutions = tuple(whole(r, f"a resolution of {name}", 2) for r in member(e, "resolutions", list))
     if planes != bool(resolutions):
         raise ValueError(f"{len(resolutions)} resolutions of {name}, whose encoding is {kind}; planes alone have any")
-    channels = _whole(_member(e, "channels", object), f"channels of {name}", int(planes))
-    octaves = _whole(_member(e, "octaves", object), f"octaves of {name}", 0, MAX_OCTAVES)
-    hidden = tuple(_whole(n, f"a layer's width in {name}", 1) for n in _member(data, "hidden", list))
-    components = _whole(_member(data, "components", object), f"components of {name}", 1)
+    channels = whole(member(e, "channels", object), f"channels of {name}", int(planes))
+    octaves = whole(member(e, "octaves", object), f"octaves of {name}", 0, MAX_OCTAVES)
+    hidden = tuple(whole(n, f"a layer's width in {name}", 1) for n in member(data, "hidden", list))
+    components = whole(member(data, "components", object), f"components of {name}", 1)
     return Network(Encoding(kind, resolutions, channels, octaves), hidden, components)
-
-
-def _member(data: Json, key: str, kind: type[T]) -> T:
-    if key not in data:
-        raise ValueError(f"{key} is missing")
-    value = data[key]
-    if not isinstance(value, kind):
-        raise ValueError(f"{key} is {shown(value)}, expected {_JSON[kind]}")
-    return value
-
-
-def _whole(value: object, name: str, low: int, high: int = 1 << 31) -> int:
-    if type(value) is not int or not low <= value <= high:  # a bool is an int too
-        raise ValueError(f"{name} is {shown(value)}, expected an integer, {low} to {high}")
-    return value
-
-
-def _number(value: object, name: str, above: float = -math.inf) -> float:
-    if not isinstance(value, int | float) or isinstance(value, bool) or not above < value or not abs(value) < 1e30:
-        raise ValueError(f"{name} is {shown(value)}, expected a finite number" + (" above 0" if above == 0 else ""))
-    return float(value)
-
-
-_JSON = {dict: "an object", list: "a list", str: "text", bool: "true or false"}
 
 
 FAST = Architecture(

@@ -7,12 +7,12 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from . import files, quantities
-from .architecture import Header, Json, Network, header_from_json
+from . import files, quantities, voxels
+from .architecture import FORMAT, KEY, Header, Network, header_from_json
 from .errors import MiNtfError
+from .json_values import Json
 from .ops import Tensors
 
-_KEY = "mi_ntf"
 _BAKED = "baked."
 """Prefix of the names of arrays that were baked from the tensors (:func:`add_baked`), and their key in the metadata."""
 _LARGEST = 1e36
@@ -26,7 +26,7 @@ def save(path: str | Path, header: Header, tensors: Tensors, dtype: type = np.fl
     the file; interpolation and the perceptron smooth its rounding.
     """
     _check(str(path), header, tensors)
-    files.write(path, safetensors.numpy.save(rounded(tensors, dtype), metadata={_KEY: json.dumps(header.to_json())}))
+    files.write(path, safetensors.numpy.save(rounded(tensors, dtype), metadata={KEY: json.dumps(header.to_json())}))
 
 
 def rounded(tensors: Tensors, dtype: type = np.float16) -> Tensors:
@@ -38,6 +38,8 @@ def rounded(tensors: Tensors, dtype: type = np.float16) -> Tensors:
 def load(path: str | Path) -> tuple[Header, Tensors]:
     """Read header and float32 tensors; raise one MiNtfError that names every mismatch with the header's skeleton."""
     header = load_header(path)
+    if isinstance(header, voxels.Voxels):
+        raise MiNtfError(f"{path} is a field of voxels, which has no networks; give a file of `mi-ntf train`")
     try:
         with safetensors.safe_open(path, "np") as file:
             tensors = {k: file.get_tensor(k) for k in file.keys() if not k.startswith(_BAKED)}
@@ -68,8 +70,8 @@ def load_baked(path: str | Path, stamp: str) -> Tensors | None:
         return {k.removeprefix(_BAKED): file.get_tensor(k) for k in file.keys() if k.startswith(_BAKED)}
 
 
-def load_header(path: str | Path) -> Header:
-    """Read the header without the tensors."""
+def load_header(path: str | Path) -> Header | voxels.Voxels:
+    """Read the header without the tensors; that of a field of voxels is another class."""
     if not Path(path).is_file():
         raise MiNtfError(f"field file {path} does not exist; make one with `mi-ntf train DATASET -o {Path(path).name}`")
     try:
@@ -78,18 +80,23 @@ def load_header(path: str | Path) -> Header:
     except safetensors.SafetensorError as error:
         raise MiNtfError(f"{path} is no field file or is truncated ({str(error)[:200]}); "
                          "make it anew with `mi-ntf train`") from None
-    if _KEY not in metadata:
-        raise MiNtfError(f"{path} is a safetensors file of another program (no '{_KEY}' header); "
+    if KEY not in metadata:
+        raise MiNtfError(f"{path} is a safetensors file of another program (no '{KEY}' header); "
                          "pass a file of `mi-ntf train`")
     try:
-        data = json.loads(metadata[_KEY])
+        data = json.loads(metadata[KEY])
     except (ValueError, RecursionError) as error:
         raise MiNtfError(f"{path}: header is not JSON ({error}); make the file anew with `mi-ntf train`") from None
+    if isinstance(data, dict) and data.get("format") == FORMAT and "voxels" in data:
+        return voxels.voxels_from_json(data, str(path))
     return header_from_json(data, str(path))
 
 
 def describe(path: str | Path) -> Json:
     """Return the table of `mi-ntf info`: header, parameter counts, file size in bytes."""
+    first = load_header(path)
+    if isinstance(first, voxels.Voxels):
+        return {"file": str(path), "bytes": Path(path).stat().st_size} | voxels.describe(path, first)
     header, tensors = load(path)
     counts = {name: sum(v.size for k, v in tensors.items() if k.startswith(name + ".")) for name in
               header.architecture.networks()}
@@ -100,10 +107,13 @@ def print_summary(description: Json) -> None:
     """Print the result of :func:`describe` in six lines; the sphere is XML to paste into a scene."""
     sphere, record = description["similarity"], description["provenance"]
     x, y, z = (f"{value:.7g}" for value in sphere["center"])
-    print(f"field     {description['file']}, {quantities.size(description['bytes'])}, "
-          f"{quantities.count(sum(description['parameters'].values()))} parameters")
+    content = ("voxels" if "voxels" in description else
+               f"{quantities.count(sum(description['parameters'].values()))} parameters")
+    print(f"field     {description['file']}, {quantities.size(description['bytes'])}, {content}")
     print(f'sphere    <point name="center" x="{x}" y="{y}" z="{z}"/>')
     print(f'          <float name="radius" value="{sphere["radius"]:.7g}"/>')
+    if "voxels" in description:
+        return voxels.print_rest(description)
     print(f"networks  {', '.join(description['parameters'])}")
     scores = {name: _number(record, split, "srgb") for split, name in (("val", "validation"), ("test", "test"))}
     words = [f"{score:.1f} dB on {name} photographs" for name, score in scores.items() if score is not None]
