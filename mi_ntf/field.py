@@ -57,12 +57,13 @@ class Field:
         Asymmetry g of smoke, whose phase function is that of Henyey and Greenstein; None for surfaces.
     """
 
-    def __init__(self, path: Path, field: loaded.LoadedField):
-        similarity = field.header.similarity
+    def __init__(self, path: Path, field: loaded.LoadedField | loaded.VolumeField,
+                 memory: loaded.InMemory | None = None):
+        similarity, self._memory = field.similarity, memory
         self.path = path
         self.center: np.ndarray = np.array(similarity.center, np.float64)
         self.radius = float(similarity.radius)
-        self.phase: float | None = field.header.architecture.phase
+        self.phase: float | None = field.phase
         self._frame, self._grid = Frame(similarity, np.eye(4), 1.0), field.grid
 
     @classmethod

@@ -11,7 +11,6 @@ values of the nearest centre, as in Mitsuba's ``gridvolume``.
 """
 
 import json
-import math
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path

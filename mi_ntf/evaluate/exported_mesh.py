@@ -53,7 +53,7 @@ class ExportedMesh:
             for i, medium in enumerate(media):
                 name = f"{Path(medium.path).stem}{i or ''}.ply"
                 exported = export(Path(medium.path), folder / name)
-                place = medium.frame.of_capture(medium.field.header.similarity)
+                place = medium.frame.of_capture(medium.field.similarity)
                 text = mitsuba_shape((folder / name).absolute(), exported, place)
                 parts.append(mi.load_string(text.replace("<shape ", '<shape version="3.9.0" ', 1)))
                 self.shapes += mitsuba_shape(Path(name), exported, place)

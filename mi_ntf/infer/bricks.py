@@ -190,6 +190,15 @@ def of_dense(values: np.ndarray, mask: np.ndarray) -> dict[str, np.ndarray]:
     return pack(np.moveaxis(values[z, y, x], -1, 1), places, octants_of(mask[z, y, x]), n, 0.0)
 
 
+def octants_with_matter(index: np.ndarray) -> np.ndarray:
+    """Return a mask (z, y, x) of the octants of all bricks that hold matter, by the `index` of a :func:`pack`."""
+    side = index.shape[0]
+    bits = index[:, None, :, None, :, None] >> (_OCTANTS + np.arange(8, dtype=np.uint32)).reshape(1, 2, 1, 2, 1, 2)
+    number = index & np.uint32((1 << _OCTANTS) - 1)
+    result: np.ndarray = ((bits & 1) == 1) & (number > 0)[:, None, :, None, :, None]
+    return result.reshape(2 * side, 2 * side, 2 * side)
+
+
 def octants_of(dense: np.ndarray) -> np.ndarray:
     """Return a mask of the octants (bricks, 2, 2, 2) that interpolate a voxel that is `dense` (bricks, 9, 9, 9)."""
     half = SIDE // 2

@@ -12,7 +12,7 @@ from .backend import floats
 from .bake import REFLECTANCE_RESOLUTION, Progress, at_voxels, flat
 from .bricks import of_dense
 from .bundle import density_where, onward, safe_inverse
-from .grid import GridField, bricks_of
+from .grid import Density, GridField, bricks_of
 from .types import Array, Float, Mask, Vector
 
 OPAQUE = 0.5
@@ -49,14 +49,14 @@ def measured(grid: GridField, dj: ModuleType) -> Softness:
     return Softness(measure(grid, dj), dj)
 
 
-def measure(grid: GridField, dj: ModuleType, progress: Progress = lambda done: None) -> dict[str, np.ndarray]:
+def measure(grid: Density, dj: ModuleType, progress: Progress = lambda done: None) -> dict[str, np.ndarray]:
     """Return the arrays of a :class:`Softness` of `grid`; `progress` receives the fraction of the work that is done."""
     values, solid = _measure(grid, min(grid.resolution, REFLECTANCE_RESOLUTION), dj, progress)
     arrays = of_dense(values[..., None], values > 0)
     return {f"softness.{name}": array for name, array in arrays.items()} | {"solid": np.array([solid])}
 
 
-def _measure(grid: GridField, n: int, dj: ModuleType, progress: Progress) -> tuple[np.ndarray, float]:
+def _measure(grid: Density, n: int, dj: ModuleType, progress: Progress) -> tuple[np.ndarray, float]:
     """Return the softness (z, y, x), float32, and the fraction of skins that are opaque."""
     solid = 0.0
     result, known = np.zeros((n, n, n), np.float32), np.zeros((n, n, n), bool)
@@ -98,13 +98,13 @@ def _centres(index: np.ndarray, n: int, dj: ModuleType) -> tuple[Float, ...]:
     return tuple(floats((index // n**axis % n + 0.5) * (2 / n) - 1, dj) for axis in range(3))
 
 
-def _occupied(grid: GridField, n: int, dj: ModuleType) -> np.ndarray:
+def _occupied(grid: Density, n: int, dj: ModuleType) -> np.ndarray:
     """Return a mask of the voxels of n³, x fastest, that hold density."""
     mask: np.ndarray = at_voxels(lambda p: [grid.density(p)], 1, None, n, dj)[:, 0] > 0
     return mask
 
 
-def _depth(grid: GridField, x: Vector, d: Vector, limit: Float) -> Float:
+def _depth(grid: Density, x: Vector, d: Vector, limit: Float) -> Float:
     """Return ∫ σ from `x` along `d` as far as ``skin.LENGTH``, or until it exceeds `limit`."""
     floats = type(x[0])
     step, length = dr.opaque(floats, 1 / grid.resolution), skin.LENGTH

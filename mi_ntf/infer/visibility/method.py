@@ -17,6 +17,7 @@ from ..network import NetworkField
 from ..skin import Smoke, Softness
 from ..tuning import FINE_MAPS, MIN_MAP_RESOLUTION
 from ..types import Visibility
+from ..volume import VoxelVolume
 
 if TYPE_CHECKING:
     from .transmittance_map import TransmittanceMap
@@ -62,7 +63,7 @@ class Field(Protocol):
     @property
     def network(self) -> NetworkField: ...  # noqa: D102
     @property
-    def grid(self) -> GridField: ...  # noqa: D102
+    def grid(self) -> GridField | VoxelVolume: ...  # noqa: D102
     @property
     def softness(self) -> Softness | Smoke: ...  # noqa: D102
     @property

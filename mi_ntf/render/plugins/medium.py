@@ -3,7 +3,7 @@
 =============== ========= ======== ============= =======================================================================
 parameter       type      default  range         meaning
 =============== ========= ======== ============= =======================================================================
-filename        string    required a path        field file (``.safetensors``, written by ``mi-ntf train``)
+filename        string    required a path        field file (``.safetensors``, of ``mi-ntf train`` or ``import``)
 to_world        transform identity similarity    placement after `scale`: rotation, translation, uniform scale
 scale           float     1        10⁻¹² to 10¹² scene units per capture unit
 representation  string    grid     grid, network ``grid``: baked voxels; ``network``: the networks, exact and slower
@@ -52,7 +52,7 @@ from collections.abc import Callable
 import drjit as dr
 import mitsuba as mi
 
-from ...core.architecture import MAX_LOG_DENSITY, Architecture
+from ...core.architecture import MAX_LOG_DENSITY
 from ...core.errors import MiNtfError
 from ...infer.backend import module_of
 from ...infer.grid import Density, NetworkVolume
@@ -60,6 +60,7 @@ from ...infer.phase_function import HenyeyGreenstein, smoke
 from ...infer.shade import Reflectance
 from ...infer.skin import Smoke, Softness
 from ...infer.types import Color3, Float, Mask, Ray, Vector, Vector3
+from ...infer.volume import VoxelVolume
 from .. import log
 from ..scene import loaded
 from ..scene.frame import SCALES, Frame
@@ -68,13 +69,12 @@ from . import properties
 REPRESENTATIONS = ("grid", "network")
 
 
-def _reflectance(source: Density, softness: Softness | Smoke, architecture: Architecture
+def _reflectance(source: Density, softness: Softness | Smoke, fresnel: bool, phase: float | None
                  ) -> Callable[[Vector], Reflectance]:
     """Return the reflectance of field points as a function.
 
     The phase function holds it rather than the medium, which holds the phase function. The two would never be freed.
     """
-    fresnel, phase = architecture.fresnel, architecture.phase
     lobe = None if phase is None else HenyeyGreenstein(phase, module_of(mi.Float))
 
     def reflectance(x: Vector) -> Reflectance:
@@ -100,7 +100,7 @@ def medium_class(phase_class: type) -> type:
                 raise MiNtfError(
                     'nrf medium: "filename" is missing; add <string name="filename" value="field.safetensors"/>'
                 )
-            path = log.resolve(name)
+            path = name if loaded.is_in_memory(name) else log.resolve(name)
             to_world = read.placement("to_world")
             scale = read.number("scale", 1.0, *SCALES)
             self.representation = read.choice("representation", "grid", REPRESENTATIONS)
@@ -108,10 +108,16 @@ def medium_class(phase_class: type) -> type:
             read.flag("sample_emitters", True)
             self.field = loaded.load(path, resolution)
             grid, bound = self.field.grid, math.exp(MAX_LOG_DENSITY)  # clipping alone bounds the networks
-            self.source: Density = (
-                grid if self.representation == "grid" else NetworkVolume(self.field.network, grid, bound))
-            self.reflectance = _reflectance(self.source, self.field.softness, self.field.header.architecture)
-            self.frame = Frame(self.field.header.similarity, to_world, scale)
+            if isinstance(grid, VoxelVolume):
+                if self.representation != "grid":
+                    raise MiNtfError(f'nrf medium: representation is "network", but {path} is a field of voxels, which '
+                                     "has no networks; choose grid")
+                self.source: Density = grid
+            else:
+                self.source = (
+                    grid if self.representation == "grid" else NetworkVolume(self.field.network, grid, bound))
+            self.reflectance = _reflectance(self.source, self.field.softness, self.field.fresnel, self.field.phase)
+            self.frame = Frame(self.field.similarity, to_world, scale)
             self.path = path
             phase = phase_class(mi.Properties("nrf"))
             phase.attach(self.frame, self.reflectance)

@@ -1,23 +1,29 @@
 """Cache of the fields in memory, each read and baked once."""
 
 import hashlib
+import itertools
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from types import ModuleType
+from typing import NoReturn
+from weakref import WeakValueDictionary
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ...core import field_file
-from ...core.architecture import Header
+from ...core import voxels as voxel_file
+from ...core.architecture import Header, Similarity
+from ...core.errors import MiNtfError
 from ...infer.backend import module
 from ...infer.bake import VERSION, bake
 from ...infer.grid import GridField
 from ...infer.network import NetworkField
 from ...infer.skin import Smoke, Softness, measure
+from ...infer.volume import VoxelVolume, of_file
 from .. import log, user_cache
 
 QUEUED = 1 << 16
@@ -42,9 +48,64 @@ class LoadedField:
     trained = True
 
     @property
+    def similarity(self) -> Similarity:
+        """Transform from the capture to the field."""
+        return self.header.similarity
+
+    @property
+    def phase(self) -> float | None:
+        """Asymmetry of the phase function, None for surfaces."""
+        return self.header.architecture.phase
+
+    @property
     def fresnel(self) -> bool:
         """True if the specular weight grows towards grazing angles."""
         return self.header.architecture.fresnel
+
+
+@dataclass(frozen=True)
+class VolumeField:
+    """A field without networks: that of a file of voxels, or of a medium of Mitsuba called `name`."""
+
+    grid: VoxelVolume
+    name: str
+    similarity: Similarity = field(default_factory=Similarity)
+    phase: float | None = None
+    softness: Softness | Smoke = field(default_factory=Smoke)
+    fresnel = trained = False
+
+    @property
+    def digest(self) -> str:
+        """Hash of the voxels and of the body that they fill."""
+        return self.grid.digest
+
+    @property
+    def header(self) -> NoReturn:
+        """Raise MiNtfError, since there is no trained field."""
+        raise MiNtfError(f"nrf integrator: {self.name} is no trained field, so it has no networks; choose "
+                         "visibility=raymarch, transmittance_map, transmittance_volume or transmittance_atlas, and "
+                         "map_source=field")
+
+    network = header
+
+
+class InMemory:
+    """Header and arrays of a field of voxels without a file; media find it by its `name` as long as it exists."""
+
+    def __init__(self, header: voxel_file.Voxels, arrays: dict[str, np.ndarray]) -> None:
+        self.name = f"memory:{next(_numbers)}"
+        voxel_file.check("the field in memory", header, arrays)
+        self.header, self.arrays = header, arrays
+        _in_memory[self.name] = self
+
+
+_numbers = itertools.count(1)
+_in_memory: WeakValueDictionary[str, InMemory] = WeakValueDictionary()
+
+
+def is_in_memory(name: str) -> bool:
+    """Return True if `name`, in place of a file, is that of an :class:`InMemory`, perhaps a freed one."""
+    return name.startswith("memory:")
 
 
 def voxels(header: Header) -> int:
@@ -56,8 +117,10 @@ def voxels(header: Header) -> int:
     return min(max(192, 2 * finest), 512)
 
 
-def load(path: str, resolution: int | None) -> LoadedField:
+def load(path: str, resolution: int | None) -> LoadedField | VolumeField:
     """Read the field file `path` and bake it at `resolution`³ voxels, None for :func:`voxels`.
+
+    A file of voxels, or the name of an :class:`InMemory`, is read as it is.
 
     The result is cached by path, the file's identity and time, resolution and variant.
     """
@@ -86,8 +149,15 @@ def _begin_other_media(variant: str) -> None:
 
 
 @lru_cache(maxsize=4)
-def _load(path: str, _identity: tuple[int, int, int] | None, resolution: int | None, variant: str) -> LoadedField:
+def _load(path: str, _identity: tuple[int, int, int] | None, resolution: int | None, variant: str
+          ) -> LoadedField | VolumeField:
     dj = module(variant)
+    volume = _stored_voxels(path)
+    if volume is not None:
+        if resolution is not None:
+            raise MiNtfError(f"nrf medium: resolution is {resolution}, but {path} is a field of voxels, which has its "
+                             "own; leave resolution out")
+        return _volume_field(path, *volume, dj)
     header, tensors = field_file.load(path)
     with log.Work("nrf medium", f"reading {path}"):
         network, digest = NetworkField(header, tensors, dj), _digest(header, tensors)
@@ -101,6 +171,33 @@ def _load(path: str, _identity: tuple[int, int, int] | None, resolution: int | N
                 log.info(f"nrf medium: the voxels in {path} are damaged")
         arrays = user_cache.cached("fields", user_cache.key(digest, n), lambda: _baked(path, header, network, n, dj))
         return LoadedField(header, network, GridField(arrays, network, dj), _softness(header, arrays, dj), digest)
+
+
+def _stored_voxels(path: str) -> tuple[voxel_file.Voxels, dict[str, np.ndarray]] | None:
+    """Return header and arrays of a field of voxels, None if `path` is a trained field."""
+    if is_in_memory(path):
+        volume = _in_memory.get(path)
+        if volume is None:
+            raise MiNtfError(f"the field {path} was freed; keep the mi_ntf.Field as long as scenes are loaded with it")
+        return volume.header, volume.arrays
+    header = field_file.load_header(path)
+    return (header, voxel_file.load(path, header)) if isinstance(header, voxel_file.Voxels) else None
+
+
+def _volume_field(path: str, header: voxel_file.Voxels, arrays: dict[str, np.ndarray], dj: ModuleType) -> VolumeField:
+    """Return a field of voxels. Raises MiNtfError if the arrays are damaged, or emit light."""
+    if header.emissive:
+        raise MiNtfError(f"nrf medium: {path} holds emitted light, which is not rendered; import it with an albedo")
+    with log.Work("nrf medium", f"reading {path}") as work:
+        try:
+            volume = of_file(header, arrays, dj)
+        except ValueError as error:
+            raise MiNtfError(f"{path} is damaged ({error}); make it anew with `mi-ntf import`") from None
+        softness: Softness | Smoke = Smoke()
+        if header.phase is None and volume.majorant > 0:
+            softness = Softness(user_cache.cached("fields", user_cache.key(volume.digest, volume.resolution),
+                                                  lambda: measure(volume, dj, work.update)), dj)
+        return VolumeField(volume, path, header.similarity, header.phase, softness)
 
 
 def _softness(header: Header, arrays: dict[str, np.ndarray], dj: ModuleType) -> Softness | Smoke:

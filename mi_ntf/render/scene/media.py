@@ -13,7 +13,7 @@ from ...infer.grid import Density
 from ...infer.shade import Reflectance
 from ...infer.types import Vector
 from .frame import Frame
-from .loaded import LoadedField
+from .loaded import LoadedField, VolumeField
 from .stock_medium import StockMedium
 
 
@@ -23,7 +23,7 @@ class NRFMedium(Protocol):
     `source`: density, of the baked voxels or of the networks, as `representation` says; `path`: the field file.
     """
 
-    field: LoadedField
+    field: LoadedField | VolumeField
     frame: Frame
     source: Density
     representation: str

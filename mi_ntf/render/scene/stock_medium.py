@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NoReturn, cast
+from typing import cast
 
 import drjit as dr
 import mitsuba as mi
@@ -11,46 +10,21 @@ import numpy as np
 
 from ...core.architecture import Similarity
 from ...core.errors import MiNtfError
-from ...core.spheres import MIN_HALF_CHORD, fibonacci
+from ...core.spheres import fibonacci
+from ...core.voxels import MARGIN, Voxels
 from ...infer.backend import module_of
 from ...infer.convex import Convex, box, planes_of
 from ...infer.phase_function import smoke
 from ...infer.shade import Reflectance
-from ...infer.skin import Smoke
 from ...infer.types import Array, Float, Vector, Vector3
-from ...infer.volume import VoxelVolume
+from ...infer.volume import VoxelVolume, dense
 from .. import log
 from . import medium_voxels
 from .frame import Frame
+from .loaded import VolumeField
 from .recent import Recent, Version
 
-MARGIN = 1.00001 / (1 - MIN_HALF_CHORD**2) ** 0.5
-"""Radius of the unit sphere over that of the matter: a ray that grazes the matter has a chord that counts."""
 _volumes: Recent[tuple[VoxelVolume, Frame]] = Recent()
-
-
-@dataclass(frozen=True)
-class VolumeField:
-    """The part of a :class:`mi_ntf.render.scene.loaded.LoadedField` that a medium without networks has."""
-
-    grid: VoxelVolume
-    name: str
-    softness = Smoke()
-    fresnel = trained = False
-
-    @property
-    def digest(self) -> str:
-        """Hash of the voxels and of the body that they fill."""
-        return self.grid.digest
-
-    @property
-    def header(self) -> NoReturn:
-        """Raise MiNtfError, since no file belongs to the medium."""
-        raise MiNtfError(f"nrf integrator: {self.name} is no trained field, so it has no networks; choose "
-                         "visibility=raymarch, transmittance_map, transmittance_volume or transmittance_atlas, and "
-                         "map_source=field")
-
-    network = header
 
 
 class PhaseLobe:
@@ -147,7 +121,9 @@ def _sampled(shape: mi.Shape, medium: mi.Medium, volume_box: np.ndarray, name: s
     field_low, field_high = ((c - centre) / frame.length for c in (low_box, high_box))
     hull = fibonacci(400) / MARGIN * 1.01 if ball else _corners((low - centre) / frame.length,
                                                                 (high - centre) / frame.length)
-    return VoxelVolume(values * np.float32(frame.length), field_low, field_high, body, hull, module_of(mi.Float)), frame
+    header = Voxels(tuple(low_box), tuple(high_box), tuple(counts.tolist()))
+    return VoxelVolume(dense(values * np.float32(frame.length)), header, field_low, field_high, body, hull,
+                       module_of(mi.Float)), frame
 
 
 def _corners(low: np.ndarray, high: np.ndarray) -> np.ndarray:
