@@ -34,7 +34,7 @@ class Command(Protocol):
 GROUPS: dict[str, dict[str, type[Command]]] = {
     "From an object to a field": {
         "capture": fields.Capture, "inspect": fields.Inspect, "train": fields.Train, "info": fields.Info,
-        "swap": scenes.Swap, "export": fields.Export},
+        "import": fields.Import, "swap": scenes.Swap, "export": fields.Export},
     "Pictures": {
         "render": scenes.Render, "view": scenes.View, "sequence": scenes.RenderSequence, "bake": scenes.Bake},
     "Accuracy and time": {

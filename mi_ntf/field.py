@@ -1,5 +1,6 @@
 """Fields and renderings from Python, as NumPy arrays or Dr.Jit arrays."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -8,8 +9,12 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
+from . import importing
 from .core.errors import MiNtfError
+from .core.ops import Tensors
 from .core.variants import VARIANTS
+from .core.voxels import Voxels, named
+from .data import grids
 from .infer.visibility.raymarch import RayMarch
 from .render import register
 from .render.maps import map_cache
@@ -42,7 +47,7 @@ class Reflectance(NamedTuple):
 
 
 class Field:
-    """A neural reflectance field. Use :meth:`load` to make one.
+    """A reflectance field. Use :meth:`load`, :meth:`from_grid` or :meth:`from_function` to make one.
 
     All coordinates are those of the capture, the world of the photographs. Points and directions are arrays of shape
     (n, 3), which give NumPy arrays, or Dr.Jit's ``Point3f`` and ``Vector3f``, which give Dr.Jit arrays.
@@ -50,7 +55,7 @@ class Field:
     Attributes
     ----------
     path
-        The field file.
+        The field file; the name of a field in memory.
     center, radius
         Sphere around the object. The density outside of it is 0.
     phase
@@ -82,12 +87,81 @@ class Field:
         MiNtfError
             If the file is missing or no field.
         """
-        if mi.variant() is None:
-            mi.set_variant(*VARIANTS)
-        register()
+        _ready()
         if resolution is not None and not 16 <= resolution <= 1024:
             raise MiNtfError(f"resolution is {resolution}, expected 16 to 1024 voxels per side")
         return cls(Path(path), loaded.load(str(path), resolution))
+
+    @classmethod
+    def from_grid(cls, density: ArrayLike, albedo: ArrayLike = 1.0,
+                  bounds: ArrayLike = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), phase: float = 0.0) -> "Field":
+        """Make a field of voxels in memory, without a file.
+
+        Parameters
+        ----------
+        density
+            Extinction at the centres of the voxels, 1/scene unit, (z, y, x), x fastest.
+        albedo
+            Single-scattering albedo, 0 to 1: a number, three numbers, or (z, y, x, 3) in linear RGB.
+        bounds
+            Lower and upper corner of the box that the voxels fill, x first.
+        phase
+            Asymmetry g of the phase function of Henyey and Greenstein.
+
+        Raises
+        ------
+        MiNtfError
+            If a value is out of range.
+
+        Notes
+        -----
+        Scenes find the field as long as the object exists.
+        """
+        colours = np.asarray(albedo)
+        constant = colours.ndim < 2
+        grid = grids.checked(grids.Grid(np.asarray(density), np.asarray(bounds, np.float64),
+                                        None if constant else colours), "from_grid")
+        return cls.of_voxels(*importing.of_grid(grid, colours if constant else 1.0, phase))
+
+    @classmethod
+    def from_function(cls, sigma: Callable[[np.ndarray], ArrayLike],
+                      albedo: ArrayLike | Callable[[np.ndarray], ArrayLike] = 1.0,
+                      bounds: ArrayLike = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), phase: float = 0.0,
+                      resolution: int = 128) -> "Field":
+        """Make a field of voxels in memory, whose density is a function of points.
+
+        Parameters
+        ----------
+        sigma
+            Function of scene points, a NumPy array (n, 3), that returns their extinction (n,), 1/scene unit.
+        albedo
+            Likewise, a function that returns (n, 3), or one or three numbers.
+        bounds
+            Lower and upper corner of the box outside of which there is no matter.
+        phase
+            Asymmetry g of the phase function of Henyey and Greenstein.
+        resolution
+            Voxels along the longest side of the box, 2 to 1024. Voxels are about cubes.
+
+        Raises
+        ------
+        MiNtfError
+            If a value is out of range, or a function returns another shape.
+        """
+        if not 2 <= resolution <= 1024:
+            raise MiNtfError(f"resolution is {resolution}, expected 2 to 1024 voxels along the longest side")
+        low, high = grids.corners(bounds, "from_function")
+        counts = np.maximum(np.ceil((high - low) / (high - low).max() * resolution - 1e-6), 1).astype(int)
+        values = _at_centres(sigma, low, high, counts, 1, "sigma")[..., 0]
+        colours = _at_centres(albedo, low, high, counts, 3, "albedo") if callable(albedo) else albedo
+        return cls.from_grid(values, colours, (low, high), phase)
+
+    @classmethod
+    def of_voxels(cls, header: Voxels, density: Tensors, reflectance: Tensors | None = None) -> "Field":
+        """Make a field in memory of the contents of a file of voxels (:func:`mi_ntf.core.voxels.save`)."""
+        _ready()
+        memory = loaded.InMemory(header, named(density, reflectance))
+        return cls(Path(memory.name), loaded.load(memory.name, None), memory)
 
     def density(self, points: ArrayLike) -> Array:
         """Return the extinction coefficient at `points`, in 1/capture unit, (n,)."""
@@ -171,6 +245,28 @@ def clear_caches() -> None:
     """Free the fields and maps that this process keeps in memory. ``mi-ntf cache --clear`` empties the disk's cache."""
     loaded.forget()
     map_cache.forget()
+
+
+def _ready() -> None:
+    """Set a variant if there is none, and register the plugins."""
+    if mi.variant() is None:
+        mi.set_variant(*VARIANTS)
+    register()
+
+
+def _at_centres(function: Callable[[np.ndarray], ArrayLike], low: np.ndarray, high: np.ndarray, counts: np.ndarray,
+                channels: int, name: str) -> np.ndarray:
+    """Return the values (z, y, x, channels) of a function of points at the centres of voxels, layer by layer."""
+    x, y, z = ((np.arange(n) + 0.5) / n * (b - a) + a for n, a, b in zip(counts, low, high, strict=True))
+    result = np.empty((*counts[::-1], channels), np.float32)
+    for layer, height in enumerate(z):
+        points = np.stack(np.broadcast_arrays(x[None, :], y[:, None], height), -1).reshape(-1, 3)
+        values = np.asarray(function(points))
+        if values.shape not in [(len(points), channels)] + [(len(points),)] * (channels == 1):
+            raise MiNtfError(f"{name} returned an array of shape {values.shape} for {len(points)} points, expected "
+                             f"({len(points)}{', 3' if channels == 3 else ''},)")
+        result[layer] = values.reshape(*result.shape[1:])
+    return result
 
 
 def _vectors(values: ArrayLike) -> "mi.Vector3f":

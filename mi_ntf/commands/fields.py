@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
+from tyro.conf import Positional
+
 from mi_ntf.commands import options
 from mi_ntf.core import extras, files, progress
 from mi_ntf.core.errors import MiNtfError
@@ -191,25 +193,58 @@ class Train:
 
 
 @dataclass
+class Import:
+    """Make a field of a grid of density: Mitsuba's .vol, NumPy's .npz and .npy, OpenVDB's .vdb."""
+
+    source: Annotated[Positional[Path], options.named("FILE", "Grid of density, .vol, .npz, .npy, .vdb.")]
+    output: options.Output
+    """Field file to write."""
+    scale: Annotated[float, options.named("X")] = 1.0
+    """Factor of the extinction, which is in 1/scene unit."""
+    albedo: Annotated[str | None, options.named("A")] = None
+    """Number, r,g,b, or .vol or .npy file. The default is the file's own colours, or 1."""
+    phase: Annotated[float, options.named("G")] = 0.0
+    """Asymmetry of the phase function, of Henyey and Greenstein: -1 backward, 0 isotropic, 1 forward."""
+    bounds: Annotated[str | None, options.named("BOX")] = None
+    """Corners x0,y0,z0,x1,y1,z1 in place of the file's."""
+    order: Annotated[Literal["zyx", "xyz"], options.named()] = "zyx"
+    """Axes of arrays of NumPy; many NeRF programs have x first."""
+    overwrite: options.Overwrite = False
+    json: options.Json = False
+
+    def run(self) -> None:
+        """Write the field and print its figures."""
+        from mi_ntf.importing import import_grid, print_summary
+
+        files.check(self.output, (".safetensors",), self.overwrite)
+        report = import_grid(self.source, self.output, self.scale, self.albedo, self.phase, self.bounds, self.order)
+        options.print_report(report, self.json, print_summary)
+
+
+@dataclass
 class Export:
-    """Write a field's surface as a mesh with albedo and roughness, as for Blender."""
+    """Write a field's surface as a mesh, as for Blender, or its density as a grid."""
 
     field_file: options.FieldFile
     output: options.Output
-    """Mesh to write: .ply (all attributes), .obj, .glb (colours), .stl."""
+    """Mesh to write: .ply (all attributes), .obj, .glb (colours), .stl; or grid of density: .vol, .vdb."""
     resolution: options.Count = 256
-    """Voxels per side of the grid that the surface is extracted from, 32 to 512."""
+    """Voxels per side of the grid, 32 to 512. A field of voxels keeps its own in .vol and .vdb."""
     level: options.OptionalNumber = None
     """Density of the surface, 1/(radius of the field's sphere). The default is 10, or less in thin matter."""
     overwrite: options.Overwrite = False
     json: options.Json = False
 
     def run(self) -> None:
-        """Write the mesh and print its figures."""
-        extras.need("mesh", "a mesh")
+        """Write the mesh or grid and print its figures."""
+        from mi_ntf import exported_grid
         from mi_ntf.export import SUFFIXES, export, print_summary
 
-        files.check(self.output, SUFFIXES, self.overwrite)
+        files.check(self.output, SUFFIXES + exported_grid.SUFFIXES, self.overwrite)
+        if self.output.suffix.lower() in exported_grid.SUFFIXES:
+            grid = exported_grid.export(self.field_file, self.output, self.resolution)
+            return options.print_report(grid, self.json, exported_grid.print_summary)
+        extras.need("mesh", "a mesh")
         mesh = export(self.field_file, self.output, self.resolution, self.level)
         options.print_report(mesh, self.json, print_summary)
 

@@ -1,6 +1,7 @@
 """Sparse volumes: bricks of 8³ trilinear cells that hold matter, and an index that also skips empty space."""
 
 import itertools
+from collections.abc import Sequence
 from types import ModuleType
 
 import drjit as dr
@@ -188,6 +189,19 @@ def of_dense(values: np.ndarray, mask: np.ndarray) -> dict[str, np.ndarray]:
     voxels = np.minimum(SIDE * places[..., None] + np.arange(SIDE + 1), last)  # (bricks, axis, 9)
     z, y, x = voxels[:, 0, :, None, None], voxels[:, 1, None, :, None], voxels[:, 2, None, None, :]
     return pack(np.moveaxis(values[z, y, x], -1, 1), places, octants_of(mask[z, y, x]), n, 0.0)
+
+
+def to_dense(arrays: dict[str, np.ndarray], counts: Sequence[int]) -> np.ndarray:
+    """Return the first channel (z, y, x) of the arrays of a :class:`Bricks`; `counts`: voxels along x, y and z."""
+    number = arrays["index"] & np.uint32((1 << _OCTANTS) - 1)
+    low, step = arrays["range"][:, 0]
+    result = np.zeros((SIDE * number.shape[0] + 1,) * 3, np.float32)
+    for z, y, x in np.argwhere(number > 0):
+        stored = arrays["words"][number[z, y, x], 0]
+        levels = np.concatenate([stored & 0xFFFF, stored[..., -1:] >> 16], 2)
+        first = SIDE * np.array([z, y, x])
+        result[tuple(slice(a, a + SIDE + 1) for a in first)] = low + step * levels.astype(np.float32)
+    return result[: counts[2], : counts[1], : counts[0]]
 
 
 def octants_with_matter(index: np.ndarray) -> np.ndarray:
