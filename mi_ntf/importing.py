@@ -70,8 +70,9 @@ def import_grid(source: Path, output: Path, scale: float = 1.0, albedo: str | No
             if box is None or len(box) != 6:
                 raise MiNtfError(f"--bounds is {bounds}, expected six numbers, x0,y0,z0,x1,y1,z1")
             grid = Grid(grid.density, np.array(box).reshape(2, 3), grid.albedo)
-        header, *parts = of_grid(grids.checked(grid, str(source)), constant, phase, source.name)
-        voxels.save(output, header, *parts)
+        contents = of_grid(grids.checked(grid, str(source)), constant, phase, source.name)
+        voxels.save(output, *contents)
+        header = contents[0]
     return Imported(str(output), list(header.counts), list(header.low), list(header.high),
                     float(grid.density.max()), phase, output.stat().st_size)
 

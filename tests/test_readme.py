@@ -7,6 +7,7 @@ import sys
 import urllib.request
 from pathlib import Path
 
+import numpy as np
 import OpenEXR
 import pytest
 from data import forms
@@ -14,6 +15,7 @@ from helpers.command_process import CommandProcess
 from helpers.programs import run_program
 
 from mi_ntf import cli
+from mi_ntf.data import grids
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -30,7 +32,7 @@ CAPTURE = {"--views": "12", "--size": "24", "--test-views": "1", "--spp": "2"}
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """Make a folder with the files that the pages' commands expect: the shipped scenes, a scene of meshes, photographs
-    with a COLMAP model, two images."""
+    with a COLMAP model, a grid, two images."""
     folder = tmp_path_factory.mktemp("readme")
     shutil.copytree(ROOT / "scenes", folder / "scenes")
     shutil.copytree(ROOT / "docs/gallery", folder / "docs/gallery")
@@ -44,6 +46,7 @@ def folder(tmp_path_factory):
     (folder / "scene.xml").write_text(BOXES.replace('value="96"', 'value="24"'))
     for name in ("skull_flash", "mine"):
         forms.colmap(folder / name)
+    grids.write_vol(folder / "smoke.vol", np.random.default_rng(0).uniform(0, 1, (6, 7, 8)), grids.UNIT)
     timeline = folder / "scenes/statue/circle.toml"
     timeline.write_text(timeline.read_text().replace("frames = 120", "frames = 4"))
     shutil.copy(ROOT / "scenes/statue/reference_point.exr", folder / "reference.exr")

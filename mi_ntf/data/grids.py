@@ -69,7 +69,7 @@ def checked(grid: Grid, source: str) -> Grid:
     albedo = grid.albedo
     if albedo is not None:
         albedo = _real(albedo, f"{source}: the albedo")
-        if albedo.ndim == 3 or albedo.shape[-1:] == (1,):
+        if albedo.ndim == 3 or (albedo.ndim == 4 and albedo.shape[3] == 1):
             albedo = np.repeat(albedo.reshape(*albedo.shape[:3], 1), 3, axis=3)
         if albedo.ndim != 4 or albedo.shape[3] != 3 or 0 in albedo.shape:
             raise MiNtfError(f"{source}: the albedo has the shape {albedo.shape}, expected z, y, x and 3 channels")

@@ -5,6 +5,7 @@ Its grids have x first, and a voxel's centre has whole coordinates in the index 
 
 import importlib
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -20,15 +21,15 @@ MOST_VOXELS = 1 << 30
 """Largest number of voxels in the box of a grid."""
 
 
-def module() -> Any:
+def module() -> ModuleType:
     """Return OpenVDB's module. Raises MiNtfError if there is none."""
     for name in (*MODULES, "bpy"):
         try:
-            found = importlib.import_module(name)
+            vdb = importlib.import_module(name)
         except ImportError:
             continue
         if name != "bpy":
-            return found
+            return vdb
         try:  # Blender puts it on the path when it starts
             return importlib.import_module(MODULES[0])
         except ImportError:
@@ -56,8 +57,9 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def _values(grid: Any, path: Path) -> tuple[np.ndarray, np.ndarray]:
     first, last = (np.array(corner) for corner in grid.evalActiveVoxelBoundingBox())
+    first, last = first - 1, last + 1  # between active voxels and the background, values are interpolated
     counts = last - first + 1
-    if (counts < 1).any() or np.prod(counts.astype(float)) > MOST_VOXELS:
+    if (counts < 3).any() or np.prod(counts.astype(float)) > MOST_VOXELS:
         raise MiNtfError(f"{path} has no active voxels, or more than {MOST_VOXELS} in their box; crop the grid")
     values = np.zeros(counts, np.float32)
     grid.copyToArray(values, ijk=tuple(int(c) for c in first))

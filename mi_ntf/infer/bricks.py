@@ -48,7 +48,7 @@ class Bricks:
     """
 
     def __init__(self, arrays: dict[str, np.ndarray], dj: ModuleType):
-        _check(arrays)
+        check(arrays)
         self._dj, self.resolution = dj, int(arrays["resolution"][0])
         self.channels, self.side = arrays["range"].shape[1], bricks_per_side(self.resolution)
         self._index, self._words = (words(arrays[name], dj) for name in ("index", "words"))
@@ -166,7 +166,7 @@ def pack(values: np.ndarray, places: np.ndarray, octants: np.ndarray, resolution
     return {"index": index, "words": result, "range": np.stack([low, step]), "resolution": np.array([resolution])}
 
 
-def _check(arrays: dict[str, np.ndarray]) -> None:
+def check(arrays: dict[str, np.ndarray]) -> None:
     """Raise ValueError if a lookup in `arrays`, which may come from a file, would read outside of their memory."""
     index, stored, ranges, resolution = (
         arrays.get(name, np.zeros(0)) for name in ("index", "words", "range", "resolution"))

@@ -9,7 +9,7 @@ import numpy as np
 from ..core.microfacet import MIN_ROUGHNESS
 from ..core.ops import normalize
 from ..core.spheres import fibonacci
-from ..core.voxels import Voxels
+from ..core.voxels import ARRAYS, Voxels
 from . import bricks, ops
 from .convex import Convex, box
 from .grid import bricks_of
@@ -129,6 +129,8 @@ class VoxelVolume:
 
 def of_file(header: Voxels, arrays: dict[str, np.ndarray], dj: ModuleType) -> VoxelVolume:
     """Return the volume of a file of voxels; raise ValueError if its arrays are no bricks."""
+    for part in ("density",) if header.reflectance_counts is None else ("density", "reflectance"):
+        bricks.check({name: arrays[f"{part}.{name}"] for name in ARRAYS})
     sphere = header.similarity
     low, high = ((np.array(corner) - sphere.center) / sphere.radius for corner in (header.low, header.high))
     scaled = arrays | {"density.range": (arrays["density.range"] * sphere.radius).astype(np.float32)}

@@ -119,6 +119,116 @@ def check_finite(architecture: Architecture, tensors: dict) -> None:
         assert np.isfinite(np.float32(value)).all(), "a field that loads is not finite"
 
 
+# --- fields of voxels, and grids that are imported -------------------------------------------------------------------
+
+
+def voxels(folder: Path):
+    """Bytes of a field file of voxels, and the variant that loads it."""
+    import mitsuba as mi
+
+    from mi_ntf.importing import import_grid
+
+    mi.set_variant(VARIANT)
+    mi.set_log_level(mi.LogLevel.Error)
+    np.savez(folder / "base.npz", density=DENSITY, albedo=np.full((5, 4, 3, 3), 0.5))
+    import_grid(folder / "base.npz", folder / "base.safetensors", phase=0.4, bounds="0,0,0,1,2,3")
+    return (folder / "base.safetensors").read_bytes()
+
+
+def voxels_case(rng, folder: Path, data):
+    from mi_ntf.render.scene import loaded
+
+    size = struct.unpack("<Q", data[:8])[0]
+    entries, body = json.loads(data[8 : 8 + size]), data[8 + size :]
+    kind = rng.choice(["bytes", "header", "entries", "values"], p=[0.3, 0.4, 0.15, 0.15])
+    if kind == "bytes":
+        data = mutate.blob(rng, data, head=size)
+    elif kind == "header":
+        entries["__metadata__"]["mi_ntf"] = json.dumps(mutate.tree(rng, json.loads(entries["__metadata__"]["mi_ntf"])))
+        data = safetensors_bytes(entries, body)
+    elif kind == "entries":
+        data = safetensors_bytes(mutate.tree(rng, entries), body)
+    else:
+        data = safetensors_bytes(entries, mutate.blob(rng, body, head=200))
+    path = folder / "case.safetensors"
+    path.write_bytes(data)
+
+    def attempt():
+        field_file.describe(path)
+        loaded.forget()
+        grid = loaded.load(str(path), None).grid
+        import mitsuba as mi
+
+        x = tuple(mi.Float(c) for c in np.random.default_rng(0).uniform(-1, 1, (3, 64)).astype(np.float32))
+        assert np.isfinite(np.array(grid.density(x))).all(), "a field that loads is not finite"
+
+    return str(kind), attempt
+
+
+DENSITY = np.random.default_rng(1).uniform(0, 3, (5, 4, 3)).astype(np.float32)
+
+
+def grid(folder: Path):
+    """Bytes of a grid of each form by the ending, and arrays of an archive that another program could write."""
+    import mi_ntf.importing  # noqa: F401, for the limit of memory to count it
+    from mi_ntf.data import grids
+
+    grids.write_vol(folder / "base.vol", DENSITY, np.array([[0, 0, 0], [1, 2, 3.0]]))
+    np.save(folder / "base.npy", DENSITY)
+    archives = {
+        "dense": {"density": DENSITY, "albedo": np.full((5, 4, 3, 3), 0.5), "bounds": np.array([[0, 0, 0], [1, 2, 3]])},
+        "rgba": {"rgba": np.full((5, 4, 3, 4), 0.5)},
+        "nerfacc": {"occs": DENSITY.ravel(), "aabbs": np.array([[0, 0, 0, 1, 1, 1]]),
+                    "resolution": np.array([5, 4, 3])},
+        "plenoxels": {"links": np.arange(60).reshape(5, 4, 3) - 9, "density_data": DENSITY.reshape(-1, 1),
+                      "sh_data": np.zeros((60, 27), np.float16), "center": np.zeros(3), "radius": np.ones(3)},
+    }
+    return {suffix: (folder / f"base{suffix}").read_bytes() for suffix in (".vol", ".npy")}, archives
+
+
+def grid_case(rng, folder: Path, base):
+    from mi_ntf.importing import import_grid
+
+    files, archives = base
+    suffix = str(rng.choice([".vol", ".npy", ".npz", ".vdb"], p=[0.3, 0.2, 0.45, 0.05]))
+    path, name = folder / f"case{suffix}", suffix
+    if suffix == ".npz":
+        name = str(rng.choice(sorted(archives)))
+        arrays = dict(archives[name])
+        if rng.random() < 0.7:
+            victim = str(rng.choice(sorted(arrays)))
+            arrays[victim] = other_array(rng, arrays[victim])
+        np.savez(path, **arrays)
+        if rng.random() < 0.5:
+            path.write_bytes(mutate.blob(rng, path.read_bytes(), head=200))
+    elif rng.random() < 0.1:
+        path.write_bytes(pickled(folder) if rng.random() < 0.5 else rng.bytes(200))
+    elif suffix == ".npy" and rng.random() < 0.5:
+        np.save(path, other_array(rng, DENSITY))
+    else:
+        path.write_bytes(mutate.blob(rng, files.get(suffix, b"VDB file"), head=80))
+    order = str(rng.choice(["zyx", "xyz"]))
+    return name, lambda: import_grid(path, folder / "out.safetensors", order=order)
+
+
+def other_array(rng, values: np.ndarray) -> np.ndarray:
+    """Return `values` of another shape, type or range."""
+    kind = rng.integers(0, 7)
+    if kind == 0:
+        return values.ravel()[: rng.integers(0, values.size + 1)]
+    if kind == 1:
+        return values[None] if rng.random() < 0.5 else values[..., None]
+    if kind == 2:
+        return values.astype(rng.choice(["U4", "S4", "c8", "f2", "i8", "u1", "?"]))
+    if kind == 3:
+        result = np.array(values, np.float64)
+        result[rng.random(values.shape) < 0.3] = rng.choice([np.nan, np.inf, -1, 1e39, 2, 1e9])
+        return result
+    if kind == 4:
+        return np.array(mutate.VALUES[rng.integers(0, 16)], np.float64)
+    return -values.astype(np.float64) if kind == 5 else np.zeros_like(values)
+
+
 # --- data sets --------------------------------------------------------------------------------------------------------
 
 
@@ -337,7 +447,8 @@ def rewrite(source: Path, path: Path, change) -> None:
 
 # --- the batch --------------------------------------------------------------------------------------------------------
 
-KINDS = {"field": (field, field_case), "dataset": (dataset, dataset_case), "colmap": (colmap, colmap_case),
+KINDS = {"field": (field, field_case), "voxels": (voxels, voxels_case), "grid": (grid, grid_case),
+         "dataset": (dataset, dataset_case), "colmap": (colmap, colmap_case),
          "properties": (properties, properties_case), "maps": (maps, maps_case)}
 
 

@@ -13,7 +13,7 @@ TESTS = Path(__file__).parents[1]
 SEED = 20210922
 SECONDS = 20
 """No file takes longer: what does is a hang."""
-QUICK = {"field": 400, "dataset": 200, "colmap": 200, "properties": 200, "maps": 100}
+QUICK = {"field": 400, "voxels": 100, "grid": 200, "dataset": 200, "colmap": 200, "properties": 200, "maps": 100}
 """Files of each kind in the quick suite; the slow test reads ten times as many others."""
 
 
