@@ -173,7 +173,7 @@ def test_openvdb_there_and_back(tmp_path, openvdb):
     vdb.write(tmp_path / "a.vdb", Z_FIRST, box)
     grid = grids.read(tmp_path / "a.vdb")
     assert (grid.density[1:-1, 1:-1, 1:-1] == Z_FIRST).all() and grid.density.sum() == Z_FIRST.sum()
-    assert np.allclose(grid.bounds, box + [[-0.5], [0.5]])
+    assert np.allclose(grid.bounds, box + np.array([[-0.5], [0.5]]))
     density = openvdb.pop("density")
     openvdb |= {name: copy.copy(density) for name in ("heat", "smoke")}
     openvdb["heat"].name, openvdb["smoke"].name = "heat", "smoke"

@@ -16,8 +16,8 @@ No parameter is exposed to ``mi.traverse``.
 
 The medium fills the sphere around the captured object, whose centre and radius in capture units are in the file. It
 belongs inside one bounding shape with a ``null`` BSDF that encloses the object. Extinction is in inverse scene units.
-A field of voxels, of ``mi-ntf import``, fills a box. It has no networks, so `representation` is ``grid``, `resolution` is
-its own, and the visibility methods that are trained refuse it.
+A field of voxels, of ``mi-ntf import``, fills a box. It has no networks, so `representation` is ``grid``, `resolution`
+is its own, and the visibility methods that are trained refuse it.
 Every collision scatters (the single-scattering albedo is 1), with the field's reflectance as phase function. Smoke has
 the phase function of Henyey and Greenstein in place of a surface's reflectance. Media may overlap: the ``nrf``
 integrator adds their densities. Stock volumetric integrators know one medium at a time and are no reference there.
