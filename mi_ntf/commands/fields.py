@@ -194,7 +194,7 @@ class Train:
 
 @dataclass
 class Import:
-    """Make a field of a grid of density: Mitsuba's .vol, NumPy's .npz and .npy, OpenVDB's .vdb."""
+    """Make a field of a grid of density, as of Mitsuba, NumPy or OpenVDB."""
 
     source: Annotated[Positional[Path], options.named("FILE", "Grid of density, .vol, .npz, .npy, .vdb.")]
     output: options.Output
@@ -207,7 +207,7 @@ class Import:
     """Asymmetry of the phase function, of Henyey and Greenstein: -1 backward, 0 isotropic, 1 forward."""
     bounds: Annotated[str | None, options.named("BOX")] = None
     """Corners x0,y0,z0,x1,y1,z1 in place of the file's."""
-    order: Annotated[Literal["zyx", "xyz"], options.named()] = "zyx"
+    order: Annotated[Literal["zyx", "xyz"], options.named("{zyx,xyz}")] = "zyx"
     """Axes of arrays of NumPy; many NeRF programs have x first."""
     overwrite: options.Overwrite = False
     json: options.Json = False
