@@ -7,7 +7,7 @@ import numpy as np
 
 from ..core.ops import dot
 from . import ops
-from .types import Float, Mask, Vector
+from .types import Float, Mask, Place, Vector
 
 PARALLEL = 1e-9
 """Cosine to a plane's normal below which a ray counts as parallel to the plane."""
@@ -29,6 +29,8 @@ class Convex:
     -----
     All numbers are opaque to kernels: bodies of the same number of planes share their kernels.
     """
+
+    nbytes = resolution = 0
 
     def __init__(self, planes: np.ndarray, radius: float | None, dj: ModuleType):
         self.planes, self.radius = np.asarray(planes, np.float64).reshape(-1, 4), radius
@@ -52,6 +54,18 @@ class Convex:
             begin = dr.select(enters, dr.maximum(begin, t), begin)
             end = dr.select(~leaves & ~enters & (room < 0), -2, end)
         return begin, end
+
+    def arrays(self) -> list[np.ndarray]:
+        """Return the numbers that define the body."""
+        return [self.planes, np.array([self.radius or 0.0])]
+
+    def place(self, p: Vector) -> Place:
+        """Return a mask of the points `p` that lie inside, first, and what else :meth:`clear_distance` needs."""
+        return (self.inside(p),)
+
+    def clear_distance(self, place: Place, inverse_d: Vector) -> Float:
+        """Return the distance from a :meth:`place` along which a ray stays outside, or 0; inside the extent, 0."""
+        return 0
 
     def inside(self, p: Vector) -> Mask:
         """Return True where the points `p` lie inside."""

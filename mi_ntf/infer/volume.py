@@ -1,4 +1,4 @@
-"""Density of a participating medium: trilinear voxels of extinction, as in ``gridvolume``, in a convex body."""
+"""Density of a participating medium: trilinear voxels of extinction, as in ``gridvolume``, in a body."""
 
 import hashlib
 from types import ModuleType
@@ -33,6 +33,7 @@ class Placed:
     def __init__(self, content: bricks.Bricks, counts: np.ndarray, low: np.ndarray, high: np.ndarray, dj: ModuleType):
         self.bricks, self.counts = content, np.asarray(counts, np.float64)
         size = np.asarray(high, np.float64) - low
+        self.resolution = int(np.ceil((2 * self.counts / size).max()))
         scale = 2 * self.counts / (content.resolution * size)
         offset, last = -1 - scale * low, (self.counts - 0.5) * 2 / content.resolution - 1
         self._scale, self._offset, self._last, self._inverse = (
@@ -47,6 +48,36 @@ class Placed:
         """Return the distance that a ray runs through empty bricks."""
         return self.bricks.clear_distance(place, tuple(
             i * s for i, s in zip(inverse_d, self._inverse, strict=True)))
+
+
+class Solid(Convex):
+    """A body of voxels in a box: it is inside where the interpolated fraction of a voxel that lies inside exceeds ½.
+
+    That follows a smooth surface to a small part of a voxel, where a density that fades out over a voxel would grow
+    dense bodies by one.
+
+    `fractions`: (z, y, x), in [0, 1]; `low`, `high`: corners of the box, field coordinates.
+    """
+
+    def __init__(self, fractions: np.ndarray, low: np.ndarray, high: np.ndarray, dj: ModuleType):
+        super().__init__(box(low, high), None, dj)
+        content = bricks.Bricks(bricks.of_dense(fractions[..., None], fractions > 0), dj)
+        self._voxels = Placed(content, np.array(fractions.shape[::-1]), low, high, dj)
+        self.nbytes, self.resolution = content.nbytes, self._voxels.resolution
+        self._fractions = fractions
+
+    def arrays(self) -> list[np.ndarray]:
+        """Return the numbers that define the body."""
+        return [*super().arrays(), self._fractions]
+
+    def place(self, p: Vector) -> Place:
+        """Return a mask of the points `p` that lie inside, first, and their places in the bricks."""
+        place = self._voxels.place(p)
+        return self.inside(p) & (self._voxels.bricks.at(place)[0] > 0.5), *place
+
+    def clear_distance(self, place: Place, inverse_d: Vector) -> Float:
+        """Return the distance that a ray runs through empty bricks."""
+        return self._voxels.clear_distance(place[1:], inverse_d)
 
 
 class VoxelVolume:
@@ -79,19 +110,20 @@ class VoxelVolume:
             bricks_of(arrays, "reflectance", dj), np.array(header.reflectance_counts), low, high, dj)
         self.bounds = hull.min(0), hull.max(0)
         self.majorant, self.gloss = _highest(arrays["density.range"]), _gloss(arrays)
-        self.resolution = int(np.ceil((2 * self._density.counts / (np.asarray(high, np.float64) - low)).max()))
+        self.resolution = max(self._density.resolution, body.resolution)
         digest = hashlib.sha256(repr((header.counts, header.reflectance_counts, header.albedo, header.phase)).encode())
         for name in sorted(arrays):
             digest.update(name.encode())
             digest.update(np.ascontiguousarray(arrays[name]).data)
-        for array in (low, high, body.planes, np.array([body.radius or 0.0]), hull):
+        for array in (low, high, *body.arrays(), hull):
             digest.update(np.ascontiguousarray(array, np.float64).data)
         self.digest = digest.hexdigest()
 
     @property
     def nbytes(self) -> int:
         """Size in bytes."""
-        return self._density.bricks.nbytes + (self._reflectance.bricks.nbytes if self._reflectance else 0)
+        reflectance = self._reflectance.bricks.nbytes if self._reflectance else 0
+        return self._density.bricks.nbytes + reflectance + self.body.nbytes
 
     def density(self, p: Vector) -> Float:
         """Return σ at `p`, 1/(unit-sphere radius)."""
@@ -110,17 +142,18 @@ class VoxelVolume:
         return normal, tuple(values[3:6]), dr.maximum(values[ROUGHNESS], MIN_ROUGHNESS), values[SPECULAR]
 
     def place(self, p: Vector) -> Place:
-        """Return the places of `p` in the bricks, and a mask of the points inside the body."""
-        return *self._density.place(p), self.body.inside(p)
+        """Return the places of `p` in the bricks and in the body."""
+        return self._density.place(p), self.body.place(p)
 
     def log_density(self, place: Place) -> Float:
         """Return ln σ at a place, ``NOTHING`` outside the body."""
-        sigma = self._density.bricks.at(place[:-1])[0]
-        return dr.select(place[-1] & (sigma > FAINTEST), dr.log(sigma), NOTHING)
+        sigma = self._density.bricks.at(place[0])[0]
+        return dr.select(place[1][0] & (sigma > FAINTEST), dr.log(sigma), NOTHING)
 
     def clear_distance(self, place: Place, inverse_d: Vector) -> Float:
         """Return the distance that a ray runs through empty bricks."""
-        return self._density.clear_distance(place[:-1], inverse_d)
+        return dr.maximum(self._density.clear_distance(place[0], inverse_d),
+                          self.body.clear_distance(place[1], inverse_d))
 
     def extent(self, m: Vector, d: Vector, h: Float) -> tuple[Float, Float]:
         """Return begin and end, t', of the part of a chord inside the body (:meth:`Convex.extent`)."""

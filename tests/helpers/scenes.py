@@ -96,6 +96,29 @@ def scene(
     return mi.load_dict(result)
 
 
+def floor(integrator: dict, lights: dict, bsdf: dict, size=16, **shapes):
+    """A floor below the object, seen from lower than the object: no camera ray meets the field."""
+    to_world = mi.ScalarTransform4f
+    return mi.load_dict({
+        "type": "scene",
+        "integrator": integrator,
+        "sensor": {
+            "type": "perspective",
+            "fov": 50,
+            "to_world": to_world().look_at([0.4, -1.9, 2.4], [0.4, -3.5, 1.2], [0, 1, 0]),
+            "film": film(size),
+            "sampler": {"type": "independent", "sample_count": 16},
+        },
+        "floor": {
+            "type": "rectangle",
+            "to_world": to_world().translate([0.4, -3.5, 0.3]).rotate([1, 0, 0], -90).scale(12),
+            "bsdf": bsdf,
+        },
+        **lights,
+        **shapes,
+    })  # fmt: skip
+
+
 def render(loaded, seed=0, spp=0) -> np.ndarray:
     """(h, w, 4) linear RGBA."""
     return np.array(mi.render(loaded, seed=seed, spp=spp))

@@ -32,29 +32,6 @@ def ball(path) -> dict:
     }
 
 
-def floor_scene(integrator, lights: dict, bsdf: dict, size=16, **shapes):
-    """A floor below the object, seen from lower than the object: no camera ray meets the field."""
-    to_world = mi.ScalarTransform4f
-    return mi.load_dict({
-        "type": "scene",
-        "integrator": integrator,
-        "sensor": {
-            "type": "perspective",
-            "fov": 50,
-            "to_world": to_world().look_at([0.4, -1.9, 2.4], [0.4, -3.5, 1.2], [0, 1, 0]),
-            "film": scenes.film(size),
-            "sampler": {"type": "independent", "sample_count": 16},
-        },
-        "floor": {
-            "type": "rectangle",
-            "to_world": to_world().translate([0.4, -3.5, 0.3]).rotate([1, 0, 0], -90).scale(12),
-            "bsdf": bsdf,
-        },
-        **lights,
-        **shapes,
-    })  # fmt: skip
-
-
 ROUGH = {"type": "roughconductor", "alpha": 0.3, "specular_reflectance": {"type": "rgb", "value": [0.9, 0.8, 0.6]}}
 ABOVE = {
     "point": {"type": "point", "position": [0.4, 3.0, -1.0], "intensity": 60.0},
@@ -97,9 +74,9 @@ def light(kind: str, path=None, visibility="raymarch") -> dict:
 def test_a_floor_in_the_shadow_equals_a_path_traced_field(blobs, kind, bsdf):
     """Rough metal reflects the light that BSDF samples reach, too: stock `path` with the ``ntf`` light against stock
     `volpath` with the field as a medium, whose own scattering lies a bounce beyond `max_depth`."""
-    ours = floor_scene({"type": "path", "max_depth": 2}, light(kind, blobs), bsdf)
-    theirs = floor_scene({"type": "volpath", "max_depth": 2}, light(kind), bsdf, **ball(blobs))
-    open_ = floor_scene({"type": "path", "max_depth": 2}, light(kind), bsdf)
+    ours = scenes.floor({"type": "path", "max_depth": 2}, light(kind, blobs), bsdf)
+    theirs = scenes.floor({"type": "volpath", "max_depth": 2}, light(kind), bsdf, **ball(blobs))
+    open_ = scenes.floor({"type": "path", "max_depth": 2}, light(kind), bsdf)
     images = [
         [scenes.render(s, seed, spp)[..., :3] for seed in range(SEEDS)]
         for s, spp in ((ours, 256), (theirs, 512), (open_, 128))
@@ -124,7 +101,7 @@ def test_a_floor_in_the_shadow_equals_a_path_traced_field(blobs, kind, bsdf):
 def test_maps_of_one_light(blobs, kind, visibility, tolerance):
     """The table of one row that a map or volume is made for: the shadow that the march casts."""
     march, mapped, bare = (
-        scenes.render(floor_scene({"type": "direct"}, light(kind, blobs, v), {"type": "diffuse"}, 24), 0, 16)[..., 0]
+        scenes.render(scenes.floor({"type": "direct"}, light(kind, blobs, v), {"type": "diffuse"}, 24), 0, 16)[..., 0]
         for v in ("raymarch", visibility, "none")
     )
     size = np.sqrt((bare**2).mean())
@@ -139,7 +116,7 @@ def test_the_shadow_of_a_sun_is_sharp_where_skies_are_looked_up(blobs, monkeypat
     monkeypatch.setattr(tuning, "ATLAS_RESOLUTION", 32)
 
     def picture(visibility):
-        loaded = floor_scene({"type": "direct"}, light("sunsky", blobs, visibility), {"type": "diffuse"}, 24)
+        loaded = scenes.floor({"type": "direct"}, light("sunsky", blobs, visibility), {"type": "diffuse"}, 24)
         return scenes.render(loaded, 0, 64)[..., :3]
 
     march = picture("raymarch")
@@ -158,7 +135,7 @@ def test_shapes_far_off_hide_lights_from_afar(blobs, kind):
     ceiling = {"ceiling": {"type": "rectangle", "to_world": up}}
 
     def mean(path, **shapes):
-        loaded = floor_scene({"type": "direct"}, light(kind, path), {"type": "diffuse"}, 8, **shapes)
+        loaded = scenes.floor({"type": "direct"}, light(kind, path), {"type": "diffuse"}, 8, **shapes)
         return scenes.render(loaded)[..., :3].mean()
 
     assert mean(blobs, **ceiling) < 0.002 * mean(blobs)
@@ -204,7 +181,7 @@ def test_the_camera_sees_what_is_wrapped(blobs):
     """Environment and lamp in the picture are the bare ones, but for light that they throw on the floor."""
     for kind in ("constant", "area"):
         bare, wrapped = (
-            floor_scene({"type": "path", "max_depth": 1}, light(kind, path), {"type": "diffuse"}, 8)
+            scenes.floor({"type": "path", "max_depth": 1}, light(kind, path), {"type": "diffuse"}, 8)
             for path in (None, blobs)
         )
         for scene in (bare, wrapped):
@@ -218,13 +195,13 @@ def test_the_camera_sees_what_is_wrapped(blobs):
 
 def test_parameters_reach_the_nested_light(blobs):
     """What is changed in the wrapped light changes the picture, its maps included."""
-    loaded = floor_scene({"type": "direct"}, light("point", blobs, "transmittance_map"), {"type": "diffuse"}, 8)
+    loaded = scenes.floor({"type": "direct"}, light("point", blobs, "transmittance_map"), {"type": "diffuse"}, 8)
     parameters = mi.traverse(loaded)
     parameters["light.emitter.position"] = mi.Point3f(2.4, 3.0, -1.0)
     parameters.update()
     moved = light("point", blobs, "transmittance_map")
     moved["light"]["emitter"]["position"] = [2.4, 3.0, -1.0]
-    fresh = floor_scene({"type": "direct"}, moved, {"type": "diffuse"}, 8)
+    fresh = scenes.floor({"type": "direct"}, moved, {"type": "diffuse"}, 8)
     np.testing.assert_allclose(scenes.render(loaded, 1), scenes.render(fresh, 1), rtol=1e-4, atol=1e-5)
 
 
@@ -249,7 +226,7 @@ def test_a_floor_beside_its_field_is_not_shadowed_twice(blobs):
     """`nrf` on an ordinary surface: the ``ntf`` light through the scene's own field, and the bare one."""
     integrator = {"type": "nrf", "visibility": "raymarch", "hide_emitters": True}
     bare, wrapped = (
-        scenes.render(floor_scene(integrator, light("point", path), {"type": "diffuse"}, 8, **ball(blobs)), 3)
+        scenes.render(scenes.floor(integrator, light("point", path), {"type": "diffuse"}, 8, **ball(blobs)), 3)
         for path in (None, blobs)
     )
     np.testing.assert_allclose(wrapped, bare, rtol=1e-3, atol=1e-4)  # equal seeds draw equal lights
@@ -258,7 +235,7 @@ def test_a_floor_beside_its_field_is_not_shadowed_twice(blobs):
 def under(integrator: str, path, visibility: str):
     """The floor in the shadow of a point light, and its parameters."""
     options = {} if integrator == "direct" else {"max_depth": 2}
-    loaded = floor_scene({"type": integrator, **options}, light("point", path, visibility), {"type": "diffuse"}, 12)
+    loaded = scenes.floor({"type": integrator, **options}, light("point", path, visibility), {"type": "diffuse"}, 12)
     return loaded, mi.traverse(loaded)
 
 

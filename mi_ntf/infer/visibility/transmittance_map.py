@@ -20,7 +20,7 @@ from ..lights import LightTable
 from ..profile import DepthProfile
 from ..texels import Texels, blank
 from ..types import Array, Float, Mask, UInt32, Vector
-from . import map_source
+from . import map_source, two_logistics
 from .light_rays import LightRays
 from .map_source import Source
 from .method import Keep, Medium, Method, Options
@@ -156,7 +156,8 @@ def build(medium: Medium, table: LightTable, options: Options, dj: ModuleType, k
     if network:
         source = map_source.network_source(medium.field.network, profile, _inside(table))
     else:
-        source = map_source.field_source(medium.source, profile, options.map_components)
+        effort = two_logistics.FINE if medium.field.softness.opaque else two_logistics.SMOKE
+        source = map_source.field_source(medium.source, profile, options.map_components, effort)
 
     def make(values: np.ndarray | None = None) -> TransmittanceMap:
         return TransmittanceMap(table, options.map_resolution, medium.field.grid.hull, source, dj, values)

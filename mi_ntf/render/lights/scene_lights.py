@@ -189,7 +189,7 @@ def _same(medium: NRFMedium | None, other: NRFMedium) -> bool:
     """Return True if both are one medium, or two media of one field in one place."""
     if medium is other:
         return True
-    if medium is None or medium.path != other.path:
+    if medium is None or medium.field.digest != other.field.digest:
         return False
     a, b = medium.frame, other.frame
     near = np.allclose(a.origin, b.origin, atol=1e-4 * a.length) and np.isclose(a.length, b.length, rtol=1e-4)

@@ -1,4 +1,4 @@
-"""Light with the shadow of a field (``ntf``, an emitter).
+"""Light with the shadow of a field or of smoke (``ntf``, an emitter).
 
 =============== ======= ======== =========== ======================== ==================================================
 parameter       type    default  range       flags                    meaning
@@ -6,8 +6,9 @@ parameter       type    default  range       flags                    meaning
 (nested)        emitter required             exposed, differentiable  the light: any emitter, or another ``ntf`` for a
                                                                       second field; ``area`` if this emitter stands
                                                                       inside the shape that shines
-(nested)        medium  required                                      the ``nrf`` medium that casts the shadow, nested
-                                                                      or by ``<ref>``
+(nested)        medium  required             exposed                  the ``nrf`` medium that casts the shadow, or a
+                or                                                    sphere or closed mesh with any medium inside;
+                shape                                                 nested or by ``<ref>``
 visibility      string  auto     see meaning                          ``raymarch``, ``transmittance_atlas``,
                                                                       ``neural_transmittance``, ``ray_network``,
                                                                       ``visibility_mlp``, ``none``; for lights of one
@@ -30,7 +31,10 @@ Pictures are differentiable with respect to what stock integrators support: the 
 surfaces. The shadows of moving lights and surfaces are marched then, unless `visibility` is ``none``. ``prb`` has no
 derivative with respect to the place of a light of one point or direction, and is refused there.
 
-The ``nrf`` integrator takes the bare light if the medium is in the scene, since it casts the shadows of fields itself.
+Smoke and fog of Mitsuba (``homogeneous``, ``heterogeneous``) have no bounds of their own. They are nested with the
+shape that they fill. A nested shape is not in the scene, where stock ``path`` would take it for an opaque surface.
+
+The ``nrf`` integrator takes the bare light if the medium is in the scene, since it casts the shadows of media itself.
 Stock ``volpath`` casts them, too, if the medium fills a shape in the scene: give it the bare light.
 
 Does not support: the field's shadow on reflections in mirrors (delta BSDFs); importance sampling by position (particle
@@ -50,6 +54,15 @@ tracers).
         "light": {"type": "point", "position": [1.5, 2.6, 2.7]},
         "field": {"type": "nrf", "filename": "scenes/statue/field.safetensors"},
     }
+
+.. code-block:: xml
+
+    <emitter type="ntf">
+        <emitter type="directional"> <vector name="direction" x="0" y="-1" z="0"/> </emitter>
+        <shape type="sphere">
+            <medium type="homogeneous" name="interior"> <float name="sigma_t" value="2"/> </medium>
+        </shape>
+    </emitter>
 """
 
 from __future__ import annotations
@@ -67,7 +80,7 @@ from ...infer.visibility.method import Options, resolution_for
 from ..lights import environment, light_checks, light_rows, scene_lights
 from ..lights.emitter_samples import SHARP, fully_sampled
 from ..maps import building
-from ..scene.media import NRFMedium
+from ..scene.media import NRFMedium, medium_inside
 from . import properties
 
 T = TypeVar("T")
@@ -90,13 +103,13 @@ def emitter_class() -> type:
             read.number("sampling_weight", 1.0, 0.0, 1e30)
             nested = [value for _, value in props.objects()]
             lights = [o for o in nested if isinstance(o, mi.Emitter)]
-            media = [o for o in nested if getattr(o, "is_nrf", False)]
-            other = [o for o in nested if o not in lights + media]
+            casters = [o for o in nested if getattr(o, "is_nrf", False) or isinstance(o, mi.Shape)]
+            other = [o for o in nested if o not in lights + casters]
             if other:
                 raise MiNtfError(f"ntf emitter: it has no place for a nested {other[0].class_name()}; it takes a light "
-                                 "and an nrf medium")
+                                 "and an nrf medium, or a light and a shape with a medium inside")
             self.inner: mi.Emitter = _single(lights, "emitter", "a light to wrap")
-            self.medium = cast(NRFMedium, _single(media, "medium", "an nrf medium"))
+            self._caster = _single(casters, "medium or shape", "an nrf medium, or a shape with a medium inside")
             mi.Emitter.__init__(self, props)
             # An environment's flags let the camera see it; the shape that shines asks for those of its emitter.
             self.m_flags = int(self.inner.flags())
@@ -107,6 +120,8 @@ def emitter_class() -> type:
         def _prepare(self) -> None:
             light_checks.check(self.inner, scene_lights.kind(self.inner), sampled=True)
             environment.check_unscaled(self.inner)
+            self.medium = (medium_inside(self._caster) if isinstance(self._caster, mi.Shape)
+                           else cast(NRFMedium, self._caster))
             if not self.sampling_weight() and not mi.has_flag(self.inner.flags(), mi.EmitterFlags.Delta):
                 raise MiNtfError("ntf emitter: sampling_weight is 0, so that BSDF samples alone would find the light, "
                                  "which know nothing of the field's shadow; give it a weight above 0")
@@ -174,6 +189,8 @@ def emitter_class() -> type:
         def traverse(self, callback: mi.TraversalCallback) -> None:
             mi.Emitter.traverse(self, callback)
             callback.put("emitter", self.inner, mi.ParamFlags.Differentiable)
+            if isinstance(self._caster, mi.Shape):
+                callback.put("shape", self._caster, mi.ParamFlags.NonDifferentiable)
 
         def parameters_changed(self, keys: Sequence[str] = ()) -> None:
             mi.Emitter.parameters_changed(self, keys)

@@ -82,7 +82,7 @@ class VolumeField:
     @property
     def header(self) -> NoReturn:
         """Raise MiNtfError, since there is no trained field."""
-        raise MiNtfError(f"nrf integrator: {self.name} is no trained field, so it has no networks; choose "
+        raise MiNtfError(f"{self.name} is no trained field, so it has no networks; choose "
                          "visibility=raymarch, transmittance_map, transmittance_volume or transmittance_atlas, and "
                          "map_source=field")
 

@@ -46,7 +46,7 @@ def find_media(scene: mi.Scene) -> list[NRFMedium]:
         medium = _nrf_medium(shape)
         if medium is None:
             if shape.is_medium_transition():
-                stock.append(_stock_medium(shape))
+                stock.append(medium_inside(shape))
             continue
         if not any(medium is m for m in media):
             media.append(medium)
@@ -66,6 +66,19 @@ def find_media(scene: mi.Scene) -> list[NRFMedium]:
             "or let `mi-ntf swap` write the scene"
         )
     return media + stock
+
+
+def medium_inside(shape: mi.Shape) -> NRFMedium:
+    """Return the medium inside `shape`, which is closed. Raises MiNtfError if there is none, or one that is refused."""
+    field = _nrf_medium(shape)
+    if field is not None:
+        return field
+    if not shape.is_medium_transition():
+        raise MiNtfError(f'{_label(shape)} has no medium inside; nest one with the name "interior"')
+    if shape.exterior_medium() is not None or shape.interior_medium() is None:
+        raise MiNtfError(f"{_label(shape)} has an exterior medium, which fills space without an end; put the medium "
+                         "inside a closed shape of its own, or render the scene with volpath")
+    return cast(NRFMedium, StockMedium(shape, shape.interior_medium(), _label(shape)))
 
 
 def ordinary_shapes(scene: mi.Scene) -> list[mi.Shape]:
@@ -117,14 +130,6 @@ def _hold_fields_alone(scene: mi.Scene) -> bool:
 def _nrf_medium(shape: mi.Shape) -> NRFMedium | None:
     medium = shape.interior_medium() if shape.is_medium_transition() else None
     return cast(NRFMedium, medium) if getattr(medium, "is_nrf", False) else None
-
-
-def _stock_medium(shape: mi.Shape) -> NRFMedium:
-    """Return Mitsuba's medium inside `shape`. Raises MiNtfError if the shape bounds a medium that is not supported."""
-    if shape.exterior_medium() is not None or shape.interior_medium() is None:
-        raise MiNtfError(f"nrf integrator: {_label(shape)} has an exterior medium, which fills space without an end; "
-                         "put the medium inside a closed shape of its own, or render the scene with volpath")
-    return cast(NRFMedium, StockMedium(shape, shape.interior_medium(), _label(shape)))
 
 
 def _check_bounds(medium: NRFMedium, shapes: Sequence[mi.Shape]) -> None:

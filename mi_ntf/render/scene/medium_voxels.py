@@ -9,8 +9,6 @@ import numpy as np
 from ...core.errors import MiNtfError
 from ...infer.bake import PART
 
-MASKED = 192
-"""Voxels along the longest side of a medium whose shape is not convex, which its voxels have to resolve."""
 TOLERANCE = 1e-3
 """Root mean square error of interpolated extinction, relative to the largest extinction, that needs no more voxels."""
 PROBES = 1 << 14
@@ -19,8 +17,6 @@ MOST_VOXELS = 1 << 27
 """Largest number of voxels that are sampled, half a gigabyte."""
 COLOURED = 1e-4
 """Difference between the extinctions of two channels, relative to the largest, from which a medium is coloured."""
-MOST_CROSSINGS = 64
-"""Largest number of times that a straight line may cross the shape of a medium."""
 
 
 def extinction_volume(medium: mi.Medium) -> mi.Volume | None:
@@ -35,23 +31,14 @@ def extinction_volume(medium: mi.Medium) -> mi.Volume | None:
     return None
 
 
-def counts_of(medium: mi.Medium, size: np.ndarray, convex: bool) -> np.ndarray:
-    """Return the number of voxels along each axis: those of the medium's own grid, more in a shape that needs them."""
-    volume = extinction_volume(medium)
-    own = np.array(volume.resolution(), int).ravel() if volume is not None else np.full(3, MASKED)
-    if medium.is_homogeneous():
-        own = np.full(3, 1)
-    least = 2 if convex else np.ceil(MASKED * size / size.max()).astype(int)
-    counts: np.ndarray = np.maximum(own, least)
-    return counts
+def sampled(medium: mi.Medium, low: np.ndarray, high: np.ndarray, name: str) -> np.ndarray:
+    """Return the extinction (z, y, x), 1/scene unit, at the voxels of a box.
 
-
-def sampled(medium: mi.Medium, low: np.ndarray, high: np.ndarray, counts: np.ndarray, name: str
-            ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the extinction (z, y, x), 1/scene unit, at the voxels of a box, and their number along each axis.
-
-    There are more than `counts` where interpolation would be wrong between them, as in a grid that is turned.
+    Their number along each axis is that of the medium's own grid, or more where interpolation would be wrong between
+    them, as in a grid that is turned.
     """
+    volume = None if medium.is_homogeneous() else extinction_volume(medium)
+    counts = np.full(3, 2) if volume is None else np.maximum(np.array(volume.resolution(), int).ravel(), 2)
     rng = np.random.default_rng(5)
     probe = rng.uniform(0.5 / counts, 1 - 0.5 / counts, (PROBES, 3))
     truth = _extinction(medium, low + probe * (high - low), name)
@@ -61,7 +48,7 @@ def sampled(medium: mi.Medium, low: np.ndarray, high: np.ndarray, counts: np.nda
         values = values.reshape(counts[::-1])
         error = np.sqrt(np.mean((_interpolated(values, probe * counts - 0.5) - truth) ** 2))
         if error <= TOLERANCE * max(values.max(), 1e-30) or np.prod(2.0 * counts) > MOST_VOXELS:
-            return values, counts
+            return values
         counts = 2 * counts
 
 
@@ -74,8 +61,8 @@ def _extinction(medium: mi.Medium, points: np.ndarray, name: str) -> np.ndarray:
         mei.p = mi.Point3f(*(mi.Float(c) for c in part))
         sigma = np.array(mi.Color3f(medium.get_scattering_coefficients(mei)[2])).reshape(3, -1)
         if np.ptp(sigma, axis=0).max() > COLOURED * max(sigma.max(), 1e-30):
-            raise MiNtfError(f"nrf integrator: the medium of {name} has another sigma_t in each colour channel, which "
-                             "one transmittance cannot hold; give sigma_t one number, and colour the albedo")
+            raise MiNtfError(f"the medium of {name} has another sigma_t in each colour channel, which one "
+                             "transmittance cannot hold; give sigma_t one number, and colour the albedo")
         result[first : first + PART] = sigma[0]
     return result
 
@@ -91,28 +78,3 @@ def _interpolated(values: np.ndarray, place: np.ndarray) -> np.ndarray:
         weight = np.prod(np.where(corner, fraction, 1 - fraction), axis=1)
         result += weight * values[z, y, x]
     return result
-
-
-def inside(shape: mi.Shape, low: np.ndarray, high: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Return 1 at the voxels (z, y, x) inside a closed shape, 0 outside.
-
-    A ray from a point inside crosses the shape an odd number of times.
-    """
-    scene = mi.load_dict({"type": "scene", "shape": shape})
-    index = np.stack(np.meshgrid(*(np.arange(n) for n in counts[::-1]), indexing="ij"), -1)[..., ::-1].reshape(-1, 3)
-    result = np.zeros(len(index), bool)
-    size = float(np.linalg.norm(high - low))
-    for first in range(0, len(index), PART):
-        points = (low + (index[first : first + PART] + 0.5) / counts * (high - low)).T.astype(np.float32)
-        ray = mi.Ray3f(mi.Point3f(*(mi.Float(c) for c in points)), dr.normalize(mi.Vector3f(0.48, 0.36, 0.8)))
-        odd, active = dr.zeros(mi.Bool, points.shape[1]), mi.Bool(True)
-        for _ in range(MOST_CROSSINGS):
-            hit = scene.ray_intersect_preliminary(ray, active=active)
-            active = active & hit.is_valid()
-            if not dr.any(active):
-                break
-            odd ^= active
-            ray.o = dr.select(active, ray(hit.t + 1e-5 * size), ray.o)
-            dr.eval(odd, active, ray)
-        result[first : first + PART] = np.array(odd)
-    return result.reshape(counts[::-1]).astype(np.float32)

@@ -10,6 +10,7 @@ import numpy as np
 
 from ...core.architecture import Similarity
 from ...core.errors import MiNtfError
+from ...core.mesh_voxels import fraction_inside
 from ...core.spheres import fibonacci
 from ...core.voxels import MARGIN, Voxels
 from ...infer.backend import module_of
@@ -17,13 +18,15 @@ from ...infer.convex import Convex, box, planes_of
 from ...infer.phase_function import smoke
 from ...infer.shade import Reflectance
 from ...infer.types import Array, Float, Vector, Vector3
-from ...infer.volume import VoxelVolume, dense
+from ...infer.volume import Solid, VoxelVolume, dense
 from .. import log
 from . import medium_voxels
 from .frame import Frame
 from .loaded import VolumeField
 from .recent import Recent, Version
 
+BODY_VOXELS = 192
+"""Voxels along the longest side of a mesh that is not convex or has many planes."""
 _volumes: Recent[tuple[VoxelVolume, Frame]] = Recent()
 
 
@@ -100,30 +103,20 @@ def _sampled(shape: mi.Shape, medium: mi.Medium, volume_box: np.ndarray, name: s
     corners = np.array([shape.bbox().min, shape.bbox().max], np.float64).reshape(2, 3)
     low, high = np.maximum(corners[0], volume_box[0]), np.minimum(corners[1], volume_box[1])
     if not (high > low).all():
-        raise MiNtfError(f"nrf integrator: {name} and its medium do not overlap; give both the same to_world")
+        raise MiNtfError(f"{name} and its medium do not overlap; give both the same to_world")
     ball = shape.class_name() == "Sphere"
     centre = corners.mean(0) if ball else (low + high) / 2
     radius = (corners[1, 0] - corners[0, 0]) / 2 if ball else np.linalg.norm(high - low) / 2
     frame = Frame(Similarity(tuple(centre), float(radius * MARGIN)), np.eye(4), 1.0)
-    planes = None if ball else _planes(shape)
-    convex = ball or planes is not None
-    low_box, high_box = (low, high) if np.isfinite(volume_box).all() else corners
-    counts = medium_voxels.counts_of(medium, high_box - low_box, convex)
-    with log.Work("nrf integrator", f"sampling the medium of {name}"):
-        values, counts = medium_voxels.sampled(medium, low_box, high_box, counts, name)
-        if not convex:
-            values *= medium_voxels.inside(shape, low_box, high_box, counts)
-    bounded = not ball or np.isfinite(volume_box).all()
-    rows = [box(*((c - centre) / frame.length for c in (low, high)))] if bounded else []
-    if planes is not None:
-        rows.append(np.column_stack([planes[:, :3], (planes[:, 3] - planes[:, :3] @ centre) / frame.length]))
-    body = Convex(np.concatenate(rows) if rows else np.zeros((0, 4)), 1 / MARGIN if ball else None, module_of(mi.Float))
-    field_low, field_high = ((c - centre) / frame.length for c in (low_box, high_box))
-    hull = fibonacci(400) / MARGIN * 1.01 if ball else _corners((low - centre) / frame.length,
-                                                                (high - centre) / frame.length)
-    header = Voxels(tuple(low_box), tuple(high_box), tuple(counts.tolist()))
-    return VoxelVolume(dense(values * np.float32(frame.length)), header, field_low, field_high, body, hull,
-                       module_of(mi.Float)), frame
+    ends = (low - centre) / frame.length, (high - centre) / frame.length
+    with log.Work("medium", f"sampling the medium of {name}"):
+        values = medium_voxels.sampled(medium, low, high, name)
+        bounded = np.isfinite(volume_box).all()
+        body = (Convex(box(*ends) if bounded else np.zeros((0, 4)), 1 / MARGIN, module_of(mi.Float)) if ball
+                else _mesh_body(shape, frame, ends, name))
+    hull = fibonacci(400) / MARGIN * 1.01 if ball else _corners(*ends)
+    header = Voxels(tuple(low), tuple(high), values.shape[::-1])
+    return VoxelVolume(dense(values * np.float32(frame.length)), header, *ends, body, hull, module_of(mi.Float)), frame
 
 
 def _corners(low: np.ndarray, high: np.ndarray) -> np.ndarray:
@@ -132,10 +125,18 @@ def _corners(low: np.ndarray, high: np.ndarray) -> np.ndarray:
     return corners
 
 
-def _planes(shape: mi.Shape) -> np.ndarray | None:
-    """Return the planes of a convex mesh in scene coordinates, None for any other shape."""
+def _mesh_body(shape: mi.Shape, frame: Frame, ends: tuple[np.ndarray, np.ndarray], name: str) -> Convex:
+    """Return the part of a closed mesh in the box between two corners, `ends`; refuse any other shape."""
     if not shape.is_mesh():
-        return None
+        raise MiNtfError(f"{name} holds a medium, but media fill spheres, cubes and closed meshes alone; give the "
+                         "medium one of these shapes")
     mesh = cast(mi.Mesh, shape)
     vertices = np.array(mesh.vertex_positions_buffer(), np.float64).reshape(-1, 3)
-    return planes_of(vertices, np.array(mesh.faces_buffer()).reshape(-1, 3).astype(int))
+    vertices = (vertices - frame.origin) / frame.length
+    faces = np.array(mesh.faces_buffer()).reshape(-1, 3).astype(int)
+    planes = planes_of(vertices, faces)
+    if planes is not None:
+        return Convex(np.concatenate([box(*ends), planes]), None, module_of(mi.Float))
+    size = ends[1] - ends[0]
+    counts = np.maximum(np.ceil(BODY_VOXELS * size / size.max()), 2).astype(int)
+    return Solid(fraction_inside(vertices, faces, *ends, counts), *ends, module_of(mi.Float))
