@@ -16,15 +16,22 @@ from ...core.errors import MiNtfError
 from ...infer.backend import module_of
 from ...infer.lights import LightTable
 from ...infer.texels import DTYPES
+from ...infer.tuning import ATLAS_RESOLUTION
 from ...infer.types import Visibility
 from ...infer.visibility import REGISTRY
+from ...infer.visibility.marched_begin import MarchedBegin
 from ...infer.visibility.marched_suns import MarchedSuns
 from ...infer.visibility.method import Options
+from ...infer.visibility.raymarch import RayMarch
 from ...infer.visibility.transmittance_map import TransmittanceMap
 from .. import log, timing
 from ..scene.media import NRFMedium
 from ..scene.settings import Settings
 from . import map_cache
+
+DENSE_TEXELS = 2
+"""Length of the marched part of a ray through smoke in texels; smoke is dense where it is longer than a mean free path.
+"""
 
 
 def resolved(settings: Settings, lights: int, media: Sequence[NRFMedium]) -> Settings:
@@ -112,7 +119,11 @@ def build(name: str, medium: NRFMedium, table: LightTable | None, options: Optio
         return method.build(medium, table, options, module_of(mi.Float), keep)
     size = "" if method.per_field or table is None else f", {table.count} × {options.map_resolution}² texels"
     with timing.building(), log.Work("nrf integrator", f"making the {name}{size}"):
-        return method.build(medium, table, options, module_of(mi.Float), keep)
+        lookup = method.build(medium, table, options, module_of(mi.Float), keep)
+    length = DENSE_TEXELS * 2 / (ATLAS_RESOLUTION if method.per_field else options.map_resolution)
+    if lookup is None or medium.field.trained or medium.source.majorant * length < 1:
+        return lookup
+    return MarchedBegin(lookup, cast(RayMarch, march(medium, table, options)), length, module_of(mi.Float))
 
 
 def march(medium: NRFMedium, table: LightTable | None, options: Options) -> Visibility:

@@ -80,14 +80,15 @@ that let light through.
 
 Mitsuba's ``homogeneous`` and ``heterogeneous`` media are lit in the same way, inside spheres, meshes and other closed
 shapes, with any phase function: under single scattering and more, the picture is that of ``volpath``. A shape whose
-BSDF is not ``null`` is a surface, too. Their extinction is sampled at the voxels of their grid, or at 192 voxels across
-a shape that is not convex or has more than 16 planes. Maps follow them where a cell of the march (2/`samples` of the
-bounding sphere's radius) is thinner than a mean free path; denser media need ``raymarch``.
+BSDF is not ``null`` is a surface, too. Their extinction is sampled at the voxels of their grid. Spheres and convex
+meshes of up to 16 planes bound it exactly, other closed meshes to a part of a voxel, with 192 of them across. Maps,
+volumes and atlases follow smoke. Where two of their texels are thicker than a mean free path, this part of a ray is
+marched.
 
-Does not support: media with another extinction in each colour, exterior media, media in a ``shapegroup``; instances
-that move a field of their ``shapegroup``; a place inside another integrator, such as ``aov`` or ``moment`` (use
-`aovs`); spectral and polarised variants; derivatives with respect to fields and turning environments;
-``timed_sunsky``; environments whose `to_world` shears or, among surfaces, scales.
+Does not support: media with another extinction in each colour or, as by ``sggx``, in each direction; exterior media,
+media in a ``shapegroup``; instances that move a field of their ``shapegroup``; a place inside another integrator, such
+as ``aov`` or ``moment`` (use `aovs`); spectral and polarised variants; derivatives with respect to fields and turning
+environments; ``timed_sunsky``; environments whose `to_world` shears or, among surfaces, scales.
 
 .. code-block:: xml
 

@@ -62,7 +62,8 @@ def _extinction(medium: mi.Medium, points: np.ndarray, name: str) -> np.ndarray:
         sigma = np.array(mi.Color3f(medium.get_scattering_coefficients(mei)[2])).reshape(3, -1)
         if np.ptp(sigma, axis=0).max() > COLOURED * max(sigma.max(), 1e-30):
             raise MiNtfError(f"the medium of {name} has another sigma_t in each colour channel, which one "
-                             "transmittance cannot hold; give sigma_t one number, and colour the albedo")
+                             "transmittance cannot hold; give sigma_t one number and colour the albedo, or render with "
+                             "volpath")
         result[first : first + PART] = sigma[0]
     return result
 

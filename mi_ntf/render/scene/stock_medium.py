@@ -67,6 +67,10 @@ class StockMedium:
 
     def __init__(self, shape: mi.Shape, medium: mi.Medium, name: str) -> None:
         self.path, self._medium = name, medium
+        if mi.has_flag(medium.phase_function().flags(), mi.PhaseFunctionFlags.Microflake):
+            raise MiNtfError(f"the medium of {name} has an sggx phase function, whose flakes give each direction "
+                             "another extinction, which one density cannot hold; choose another phase function, or "
+                             "render with volpath")
         volume_box = _volume_box(medium)
         self.source, self.frame = Version(shape).once(
             _volumes, lambda: _sampled(shape, medium, volume_box, name), str(mi.variant()), medium.class_name(),
