@@ -31,8 +31,8 @@ Pictures are differentiable with respect to what stock integrators support: the 
 surfaces. The shadows of moving lights and surfaces are marched then, unless `visibility` is ``none``. ``prb`` has no
 derivative with respect to the place of a light of one point or direction, and is refused there.
 
-Smoke and fog of Mitsuba (``homogeneous``, ``heterogeneous``) have no bounds of their own. They are nested with the
-shape that they fill. A nested shape is not in the scene, where stock ``path`` would take it for an opaque surface.
+Smoke and fog of Mitsuba (``homogeneous``, ``heterogeneous``) have no bounds of their own. In place of an ``nrf`` medium
+the emitter then holds the shape that they fill, with the medium called ``interior``. A nested shape is not in the scene, where stock ``path`` would take it for an opaque surface.
 
 The ``nrf`` integrator takes the bare light if the medium is in the scene, since it casts the shadows of media itself.
 Stock ``volpath`` casts them, too, if the medium fills a shape in the scene: give it the bare light.
@@ -54,15 +54,6 @@ tracers).
         "light": {"type": "point", "position": [1.5, 2.6, 2.7]},
         "field": {"type": "nrf", "filename": "scenes/statue/field.safetensors"},
     }
-
-.. code-block:: xml
-
-    <emitter type="ntf">
-        <emitter type="directional"> <vector name="direction" x="0" y="-1" z="0"/> </emitter>
-        <shape type="sphere">
-            <medium type="homogeneous" name="interior"> <float name="sigma_t" value="2"/> </medium>
-        </shape>
-    </emitter>
 """
 
 from __future__ import annotations
