@@ -32,7 +32,8 @@ surfaces. The shadows of moving lights and surfaces are marched then, unless `vi
 derivative with respect to the place of a light of one point or direction, and is refused there.
 
 Smoke and fog of Mitsuba (``homogeneous``, ``heterogeneous``) have no bounds of their own. In place of an ``nrf`` medium
-the emitter then holds the shape that they fill, with the medium called ``interior``. A nested shape is not in the scene, where stock ``path`` would take it for an opaque surface.
+the emitter then holds the shape that they fill, with the medium called ``interior``. A nested shape is not in the
+scene, where stock ``path`` would take it for an opaque surface.
 
 The ``nrf`` integrator takes the bare light if the medium is in the scene, since it casts the shadows of media itself.
 Stock ``volpath`` casts them, too, if the medium fills a shape in the scene: give it the bare light.
