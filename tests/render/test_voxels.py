@@ -25,8 +25,8 @@ UNTRAINED = ("raymarch", "transmittance_map", "transmittance_volume", "transmitt
 
 
 def puff() -> np.ndarray:
-    """Return a density (z, y, x) of 14 × 18 × 22 voxels that reaches two faces of its box."""
-    z, y, x = np.meshgrid(*(np.linspace(-1, 1, n) for n in (14, 18, 22)), indexing="ij")
+    """Return a density (z, y, x) of 14 × 16 × 17 voxels that reaches two faces of its box."""
+    z, y, x = np.meshgrid(*(np.linspace(-1, 1, n) for n in (14, 16, 17)), indexing="ij")
     waves = 1 + 0.8 * np.sin(7 * x + 3 * y) * np.cos(5 * z)
     return (3 * np.clip(1 - np.sqrt((x - 0.3) ** 2 + (y + 0.2) ** 2 + z * z), 0, None) * waves).astype(np.float32)
 
