@@ -16,6 +16,8 @@ SIDE = 8
 """Cells along an edge of a brick. A brick holds the 9³ voxels around its cells, so neighbours share a face."""
 LINE, LAYER, WORDS = SIDE, SIDE * (SIDE + 1), SIDE * (SIDE + 1) ** 2
 """Words of a line of voxels, of a layer of lines, and of a brick, for each channel."""
+PART = 4096
+"""Number of bricks that are packed together."""
 FARTHEST = 15
 """Largest distance to the next brick that the index holds, in bricks."""
 _OCTANTS, _DISTANCE = 20, 28
@@ -161,8 +163,10 @@ def pack(values: np.ndarray, places: np.ndarray, octants: np.ndarray, resolution
     step = np.maximum(high - low, np.float32(1e-6)) / 0xFFFF
     result = np.zeros((count + 1, channels, SIDE + 1, SIDE + 1, SIDE), np.uint32)
     for channel in range(channels):
-        levels = np.round((values[:, channel] - low[channel]) / step[channel]).astype(np.uint32)
-        result[1:, channel] = levels[..., :-1] | levels[..., 1:] << 16
+        for first in range(0, count, PART):  # bounds the memory
+            part = slice(first, first + PART)
+            levels = np.round((values[part, channel] - low[channel]) / step[channel]).astype(np.uint32)
+            result[1:][part, channel] = levels[..., :-1] | levels[..., 1:] << 16
     return {"index": index, "words": result, "range": np.stack([low, step]), "resolution": np.array([resolution])}
 
 

@@ -1,0 +1,113 @@
+"""Gaussian splats as a field of kind *voxels*: extinction, normals and colours."""
+
+from types import ModuleType
+
+import numpy as np
+
+from ..core import splat_normals
+from ..core.errors import MiNtfError
+from ..core.ops import Tensors
+from ..core.splats import Splats
+from ..core.voxels import Voxels
+from .bake import Progress
+from .splat_voxels import Lattice, SplatSums
+
+VISIBLE = 1 / 255
+"""Smallest opacity of a splat that is imported, as in the rasteriser of Kerbl et al. (2023)."""
+THIN = 0.1
+"""Fraction of the splats' cross-section that may be thinner than a voxel."""
+FINER = 0.8
+"""Length of a voxel over the splats' shortest axis."""
+MOST_VOXELS = 2048
+"""Largest default number of voxels along the longest side."""
+COARSER = 2
+"""Least length of the reflectance's voxels over that of the density's."""
+MOST_COLOURS = 384
+"""Largest number of the reflectance's voxels along the longest side."""
+COLOUR_BLUR = 0.75
+"""Smallest standard deviation of a splat in the reflectance, voxels: wide enough that no density lies outside of it."""
+OPAQUE = 16.0
+"""Upper bound of a voxel's optical depth. More would cost digits elsewhere, since voxels have 16 bits."""
+MOST_BLOCKS = 64_000
+"""Number of blocks of density above which the voxels become longer, which bounds the memory."""
+
+
+def voxelised(splats: Splats, dj: ModuleType, resolution: int | None = None, emissive: bool = False,
+              provenance: dict[str, object] | None = None, progress: Progress = lambda done: None
+              ) -> tuple[Voxels, Tensors, Tensors]:
+    """Return header, density and reflectance of a field of kind *voxels* (:func:`mi_ntf.core.voxels.save`).
+
+    Parameters
+    ----------
+    splats
+        The splats.
+    dj
+        Dr.Jit module of the back end.
+    resolution
+        Voxels along the longest side. By default a voxel has ``FINER`` of the splats' shortest axis, of which ``THIN``
+        of the splats fall short, weighted by cross-section. There are at most ``MOST_VOXELS``, and fewer if more than
+        ``MOST_BLOCKS`` blocks hold matter.
+    emissive
+        Keep the colours as emitted radiance; otherwise they are the albedo of a diffuse surface.
+    provenance
+        Free-form JSON about the origin.
+    progress
+        Receives the fraction of the work that is done.
+    """
+    splats = splats.take(np.flatnonzero(splats.opacities >= VISIBLE))
+    if not len(splats):
+        raise MiNtfError(f"no splat has an opacity of {VISIBLE:.4f} or more, so there is nothing to import")
+    lattice = lattice_of(splats, resolution)
+    sums = SplatSums(splats, lattice, dj)
+    while sums.count > MOST_BLOCKS:  # the blocks of a surface grow with the square of the resolution
+        fewer = 0.98 * (MOST_BLOCKS / sums.count) ** 0.5
+        lattice = lattice_of(splats, int(fewer * lattice.counts.max()))
+        sums = SplatSums(splats, lattice, dj)
+    progress(0.2)
+    density = sums.bricks(np.minimum(sums.total(), np.float32(OPAQUE / lattice.size)))
+    del sums
+    progress(0.6)
+    coarse, reflectance = _reflectance(splats, lattice, dj, emissive)
+    x, y, z = lattice.low.tolist()
+    header = Voxels((x, y, z), tuple(lattice.high.tolist()), tuple(lattice.counts.tolist()),
+                    tuple(coarse.counts.tolist()), 0.0 if emissive else None, emissive=emissive,
+                    provenance={"splats": len(splats)} | (provenance or {}))
+    return header, density, reflectance
+
+
+def lattice_of(splats: Splats, resolution: int | None) -> Lattice:
+    """Return voxels that hold all `splats`, with an empty one at each side."""
+    shortest = splats.scales.min(1).astype(np.float64)
+    reach = splats.reach(3.0)
+    low, high = (splats.centres - reach).min(0), (splats.centres + reach).max(0)
+    scales = np.sort(splats.scales.astype(np.float64), axis=1)
+    area = splats.opacities * scales[:, 1] * scales[:, 2]
+    order = np.argsort(shortest)
+    thin = shortest[order][np.searchsorted(np.cumsum(area[order]), THIN * area.sum())]
+    longest = float((high - low).max())
+    size = longest / resolution if resolution else max(FINER * thin, longest / MOST_VOXELS)
+    counts = np.ceil((high - low) / size).astype(int) + 6  # the splats' tails, and an empty voxel
+    ratio = _ratio(counts)
+    counts = -(-counts // ratio) * ratio
+    return Lattice((low + high) / 2 - counts * size / 2, size, counts)
+
+
+def _ratio(counts: np.ndarray) -> int:
+    """Return the length of the reflectance's voxels over that of the density's."""
+    return max(COARSER, -(-int(counts.max()) // MOST_COLOURS))
+
+
+def _reflectance(splats: Splats, lattice: Lattice, dj: ModuleType, emissive: bool) -> tuple[Lattice, Tensors]:
+    """Return coarser voxels of the reflectance and their bricks: means of the splats, weighted by extinction."""
+    ratio = _ratio(lattice.counts)
+    coarse = Lattice(lattice.low, lattice.size * ratio, lattice.counts // ratio)
+    sums = SplatSums(splats, coarse, dj, COLOUR_BLUR, faintest=1e-30)
+    values = splats.colours
+    if not emissive:
+        values = np.concatenate([splat_normals.outward(splats, lattice.low, lattice.high), values], 1)
+    weight, *channels = sums.total(values)
+    for channel in channels:
+        np.divide(channel, weight, out=channel, where=weight > 0)
+    if not emissive:
+        channels += [np.ones_like(weight), np.zeros_like(weight)]
+    return coarse, sums.bricks(channels)
