@@ -1,0 +1,79 @@
+"""`mi-ntf import` of Gaussian splats: a field of voxels of a ``.ply`` or ``.spz`` file."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from mi_ntf.core import files, progress, voxels
+from mi_ntf.core.errors import MiNtfError
+from mi_ntf.core.ops import Tensors
+from mi_ntf.core.splats import Splats
+from mi_ntf.core.variants import VARIANTS
+from mi_ntf.core.voxels import Voxels
+from mi_ntf.data import splat_files
+from mi_ntf.infer import splat_field
+from mi_ntf.infer.backend import module
+
+LEAST, MOST = 16, 2048
+"""Range of the number of voxels along the longest side."""
+
+
+@dataclass(frozen=True)
+class ImportedSplats:
+    """Figures of an import: number of splats, voxels along x, y and z, and the box, scene units."""
+
+    file: str
+    splats: int
+    voxels: list[int]
+    low: list[float]
+    high: list[float]
+    voxel: float
+    emissive: bool
+    bytes: int
+
+
+def import_splats(source: Path, output: Path, resolution: int | None = None, emissive: bool = False
+                  ) -> ImportedSplats:
+    """Write the splats of `source` as a field of voxels.
+
+    Parameters
+    ----------
+    source
+        A ``.ply`` or ``.spz`` file (:mod:`mi_ntf.data.splat_files`).
+    output
+        The field file.
+    resolution
+        Voxels along the longest side; by default it follows from the splats (:mod:`mi_ntf.infer.splat_field`).
+    emissive
+        Keep the colours as emitted radiance; otherwise they are the albedo.
+
+    Raises
+    ------
+    MiNtfError
+        If the file is damaged, or an option is out of range.
+    """
+    files.check(output, (".safetensors",))
+    with progress.Stage(f"importing {source}"):
+        header, arrays = of_splats(splat_files.read(source), resolution, emissive, source.name)
+        voxels.save(output, header, arrays)
+    size = (header.high[0] - header.low[0]) / header.counts[0]
+    return ImportedSplats(str(output), header.provenance["splats"], list(header.counts), list(header.low),
+                          list(header.high), size, emissive, output.stat().st_size)
+
+
+def of_splats(splats: Splats, resolution: int | None = None, emissive: bool = False, source: str = "splats"
+              ) -> tuple[Voxels, Tensors]:
+    """Return header and arrays of a field of voxels of `splats`; options as in :func:`import_splats`."""
+    if resolution is not None and not LEAST <= resolution <= MOST:
+        raise MiNtfError(f"resolution is {resolution}, expected {LEAST} to {MOST} voxels along the longest side")
+    header, density, reflectance = splat_field.voxelised(splats, module(VARIANTS[-1]), resolution, emissive,
+                                                         {"source": source})
+    return header, voxels.named(density, reflectance)
+
+
+def print_summary(report: ImportedSplats) -> None:
+    """Print the file, the figures of the voxels, and the use of it."""
+    low, high = ("(" + ", ".join(f"{value:.6g}" for value in corner) + ")" for corner in (report.low, report.high))
+    colours = "kept as emission" if report.emissive else "taken as albedo; light that is baked into them stays"
+    print(f"field: {report.file} ({' × '.join(map(str, report.voxels))} voxels from {low} to {high})",
+          f"splats: {report.splats} with an opacity that counts; their colours are {colours}",
+          f"next: mi-ntf info {report.file} prints the sphere of the nrf medium", sep="\n")
