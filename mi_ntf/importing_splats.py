@@ -7,7 +7,6 @@ from mi_ntf.core import files, progress, voxels
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.core.ops import Tensors
 from mi_ntf.core.splats import Splats
-from mi_ntf.core.variants import VARIANTS
 from mi_ntf.core.voxels import Voxels
 from mi_ntf.data import splat_files
 from mi_ntf.infer import splat_field
@@ -53,8 +52,8 @@ def import_splats(source: Path, output: Path, resolution: int | None = None, emi
     """
     files.check(output, (".safetensors",))
     with progress.Stage(f"importing {source}"):
-        header, arrays = of_splats(splat_files.read(source), resolution, emissive, source.name)
-        voxels.save(output, header, arrays)
+        header, density, reflectance = _voxelised(splat_files.read(source), resolution, emissive, source.name)
+        voxels.save(output, header, density, reflectance)
     size = (header.high[0] - header.low[0]) / header.counts[0]
     return ImportedSplats(str(output), header.provenance["splats"], list(header.counts), list(header.low),
                           list(header.high), size, emissive, output.stat().st_size)
@@ -63,11 +62,14 @@ def import_splats(source: Path, output: Path, resolution: int | None = None, emi
 def of_splats(splats: Splats, resolution: int | None = None, emissive: bool = False, source: str = "splats"
               ) -> tuple[Voxels, Tensors]:
     """Return header and arrays of a field of voxels of `splats`; options as in :func:`import_splats`."""
+    header, density, reflectance = _voxelised(splats, resolution, emissive, source)
+    return header, voxels.named(density, reflectance)
+
+
+def _voxelised(splats: Splats, resolution: int | None, emissive: bool, source: str) -> tuple[Voxels, Tensors, Tensors]:
     if resolution is not None and not LEAST <= resolution <= MOST:
         raise MiNtfError(f"resolution is {resolution}, expected {LEAST} to {MOST} voxels along the longest side")
-    header, density, reflectance = splat_field.voxelised(splats, module(VARIANTS[-1]), resolution, emissive,
-                                                         {"source": source})
-    return header, voxels.named(density, reflectance)
+    return splat_field.voxelised(splats, module("llvm_ad_rgb"), resolution, emissive, {"source": source})
 
 
 def print_summary(report: ImportedSplats) -> None:

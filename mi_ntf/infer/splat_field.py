@@ -87,19 +87,21 @@ def lattice_of(splats: Splats, resolution: int | None) -> Lattice:
     longest = float((high - low).max())
     size = longest / resolution if resolution else max(FINER * thin, longest / MOST_VOXELS)
     counts = np.ceil((high - low) / size).astype(int) + 6  # the splats' tails, and an empty voxel
-    ratio = _ratio(counts)
+    ratio = _ratio(splats, counts, size)
     counts = -(-counts // ratio) * ratio
     return Lattice((low + high) / 2 - counts * size / 2, size, counts)
 
 
-def _ratio(counts: np.ndarray) -> int:
-    """Return the length of the reflectance's voxels over that of the density's."""
-    return max(COARSER, -(-int(counts.max()) // MOST_COLOURS))
+def _ratio(splats: Splats, counts: np.ndarray, size: float) -> int:
+    """Return the length of the reflectance's voxels over that of the density's: ``FINER`` of the middle axis."""
+    middle = float(np.median(np.sort(splats.scales, axis=1)[:, 1]))
+    fewest = min(8, int(counts.max()) // 16)  # of a few large splats
+    return max(COARSER, -(-int(counts.max()) // MOST_COLOURS), min(int(np.ceil(FINER * middle / size)), fewest))
 
 
 def _reflectance(splats: Splats, lattice: Lattice, dj: ModuleType, emissive: bool) -> tuple[Lattice, Tensors]:
     """Return coarser voxels of the reflectance and their bricks: means of the splats, weighted by extinction."""
-    ratio = _ratio(lattice.counts)
+    ratio = _ratio(splats, lattice.counts, lattice.size)
     coarse = Lattice(lattice.low, lattice.size * ratio, lattice.counts // ratio)
     sums = SplatSums(splats, coarse, dj, COLOUR_BLUR, faintest=1e-30)
     values = splats.colours
