@@ -28,7 +28,8 @@ class Reflectance(NamedTuple):
     """Reflectance of field points: ranges as in :mod:`mi_ntf.core.microfacet`, softness as in :mod:`mi_ntf.core.skin`.
 
     `fresnel`: the specular weight is that at normal incidence (:mod:`mi_ntf.core.fresnel`). `lobe`: a phase function
-    that is weighted by the albedo, in place of normal, roughness and specular weight.
+    that is weighted by the albedo, in place of normal, roughness and specular weight. `emission`: emitted radiance of
+    matter that reflects nothing.
     """
 
     normal: Vector
@@ -38,6 +39,7 @@ class Reflectance(NamedTuple):
     softness: Float
     fresnel: bool = False
     lobe: Lobe | None = None
+    emission: Vector | None = None
 
     def diffuse_albedo(self) -> list[Float]:
         """Return the linear RGB albedo of a diffuse surface that reflects as much of uniform light."""
@@ -60,7 +62,7 @@ class Points:
         uint = dr.uint32_array_t(type(x[0]))
         self.ray: UInt32 = dr.arange(uint, dr.width(x[0])) if ray is None else ray
         self.ordinal: UInt32 = uint(0) if ordinal is None else ordinal
-        self.normal, self.albedo, self.roughness, self.specular, self.softness, _, self.lobe = reflectance
+        self.normal, self.albedo, self.roughness, self.specular, self.softness, _, self.lobe, _ = reflectance
 
     def evaluate(self) -> None:
         """Evaluate the arrays now, before a loop over lights."""

@@ -129,14 +129,16 @@ class SplatSums:
         near = [held[tuple(slice(c, c + n) for c, n in zip(corner, sides, strict=True))] for corner in corners]
         parts = [(slice(None), *(slice(1) if c else slice(None) for c in corner)) for corner in corners]
         filled = [np.any([channel[part].any((1, 2, 3)) for channel in channels], 0) for part in parts]
+        resolution = int(self.lattice.counts.max())
         places = np.argwhere(np.any([f[slot] for f, slot in zip(filled, near, strict=True)], axis=0))
+        places = places[(places < bricks.bricks_per_side(resolution)).all(1)]
         values = np.zeros((len(places), len(channels)) + (BLOCK + 1,) * 3, np.float32)
         for corner, part, slot in zip(corners, parts, near, strict=True):
             to = tuple(slice(BLOCK, None) if c else slice(BLOCK) for c in corner)
             for k, channel in enumerate(channels):
                 values[(slice(None), k, *to)] = channel[part][slot[tuple(places.T)]]
         octants = np.any([bricks.octants_of(values[:, k] != 0) for k in range(len(channels))], 0)
-        return bricks.pack(values, places, octants, int(self.lattice.counts.max()), 0.0)
+        return bricks.pack(values, places, octants, resolution, 0.0)
 
     def _slots(self) -> np.ndarray:
         """Return the number of each block that holds matter, from 1 on, 0 for the others; (z, y, x) uint32."""

@@ -71,7 +71,7 @@ from . import properties
 REPRESENTATIONS = ("grid", "network")
 
 
-def _reflectance(source: Density, softness: Softness | Smoke, fresnel: bool, phase: float | None
+def _reflectance(source: Density, softness: Softness | Smoke, fresnel: bool, phase: float | None, emissive: bool
                  ) -> Callable[[Vector], Reflectance]:
     """Return the reflectance of field points as a function.
 
@@ -80,6 +80,10 @@ def _reflectance(source: Density, softness: Softness | Smoke, fresnel: bool, pha
     lobe = None if phase is None else HenyeyGreenstein(phase, module_of(mi.Float))
 
     def reflectance(x: Vector) -> Reflectance:
+        if lobe and emissive:
+            colour = source.reflectance(x)[1]
+            black = tuple(dr.zeros(type(c), dr.width(c)) for c in colour)
+            return smoke(black, lobe)._replace(emission=colour)
         if lobe:
             return smoke(source.reflectance(x)[1], lobe)
         return Reflectance(*source.reflectance(x), softness(x), fresnel)
@@ -118,7 +122,8 @@ def medium_class(phase_class: type) -> type:
             else:
                 self.source = (
                     grid if self.representation == "grid" else NetworkVolume(self.field.network, grid, bound))
-            self.reflectance = _reflectance(self.source, self.field.softness, self.field.fresnel, self.field.phase)
+            self.reflectance = _reflectance(self.source, self.field.softness, self.field.fresnel, self.field.phase,
+                                            self.field.emissive)
             self.frame = Frame(self.field.similarity, to_world, scale)
             self.path = path
             phase = phase_class(mi.Properties("nrf"))

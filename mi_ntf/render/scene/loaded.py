@@ -46,6 +46,7 @@ class LoadedField:
     softness: Softness | Smoke
     digest: str
     trained = True
+    emissive = False
 
     @property
     def similarity(self) -> Similarity:
@@ -72,6 +73,7 @@ class VolumeField:
     similarity: Similarity = field(default_factory=Similarity)
     phase: float | None = None
     softness: Softness | Smoke = field(default_factory=Smoke)
+    emissive: bool = False
     fresnel = trained = False
 
     @property
@@ -185,9 +187,7 @@ def _stored_voxels(path: str) -> tuple[voxel_file.Voxels, dict[str, np.ndarray]]
 
 
 def _volume_field(path: str, header: voxel_file.Voxels, arrays: dict[str, np.ndarray], dj: ModuleType) -> VolumeField:
-    """Return a field of voxels. Raises MiNtfError if the arrays are damaged, or emit light."""
-    if header.emissive:
-        raise MiNtfError(f"nrf medium: {path} holds emitted light, which is not rendered; import it with an albedo")
+    """Return a field of voxels. Raises MiNtfError if the arrays are damaged."""
     with log.Work("nrf medium", f"reading {path}") as work:
         try:
             volume = of_file(header, arrays, dj)
@@ -197,7 +197,7 @@ def _volume_field(path: str, header: voxel_file.Voxels, arrays: dict[str, np.nda
         if header.phase is None and volume.majorant > 0:
             softness = Softness(user_cache.cached("fields", user_cache.key(volume.digest, volume.resolution),
                                                   lambda: measure(volume, dj, work.update)), dj)
-        return VolumeField(volume, path, header.similarity, header.phase, softness)
+        return VolumeField(volume, path, header.similarity, header.phase, softness, header.emissive)
 
 
 def _softness(header: Header, arrays: dict[str, np.ndarray], dj: ModuleType) -> Softness | Smoke:

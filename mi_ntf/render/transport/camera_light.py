@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -150,11 +150,12 @@ class _CameraLight:
         return radiance, opacity
 
     def _fields(self) -> Float:
-        """Add the light that fields scatter once; return the transmittance of the rays."""
+        """Add the light that fields emit, and scatter once; return the transmittance of the rays."""
         effects, parts = self.effects, self.scene.in_view
         strands, unit = self.scene.strands(self.ray, parts)
         maxt = (dr.minimum(self.ray.maxt, self.hit.t) if self.hit is not None else self.ray.maxt) / unit
-        options = effects.lit or bool(self.sums and self.sums.needs_points), effects.collocated
+        shining = effects.lit or effects.emission
+        options = shining or bool(self.sums and self.sums.needs_points), effects.collocated
         samples = self.cache.samples.get(options) if self.cache else None
         if samples is None:
             samples = march.camera_samples(
@@ -166,13 +167,13 @@ class _CameraLight:
         light = [dr.zeros(mi.Float, dr.width(samples.t)) for _ in range(3)]
         for i, part in enumerate(parts):
             self._field(i, part, options, light)
-        if effects.lit and dr.width(samples.t):
+        if shining and dr.width(samples.t):
             self.total[:] = samples.totals(light, effects.gradients)
         transmittance: Float = samples.transmittance
         return transmittance
 
     def _field(self, i: int, part: Part, options: tuple[bool, bool], light: list[Float]) -> None:
-        """Add the light reflected by samples in the field `part`, strand `i`, to `light`, three arrays by sample."""
+        """Add the light of samples in the field `part`, strand `i`, to `light`, three arrays by sample."""
         assert self.field_samples
         samples, unit = self.field_samples
         weight = samples.weights[i]
@@ -203,13 +204,22 @@ class _CameraLight:
             distance += self.distance if dr.width(self.distance) == 1 else dr.gather(mi.Float, self.distance, ray)
             self.sums.add_field(i, part, points, samples, index if several else None, distance,
                                 self.scene.shadow(part, sampled=False))
-        if self.effects.lit:
+        emission = points.reflectance.emission
+        if emission is not None:
+            if self.first_run:
+                self._add(light, emission, weight, index)
+        elif self.effects.lit:
             reflected = self.scene.reflect(part, points, self.stream, view)
             if self.scene.bounced and self.first_run:
                 bounced = self.scene.bounced.reflect(part, points)
                 reflected = [a + b for a, b in zip(reflected, bounced, strict=True)]
-            for channel, value in zip(light, reflected, strict=True):
-                dr.scatter_reduce(dr.ReduceOp.Add, channel, value * weight, index, mode=dr.ReduceMode.NoConflicts)
+            self._add(light, reflected, weight, index)
+
+    @staticmethod
+    def _add(light: list[Float], radiance: Iterable[Float], weight: Float, index: UInt32) -> None:
+        """Add the radiance of the samples `index` to `light`."""
+        for channel, value in zip(light, radiance, strict=True):
+            dr.scatter_reduce(dr.ReduceOp.Add, channel, value * weight, index, mode=dr.ReduceMode.NoConflicts)
 
     def _walk(self) -> Walk:
         return Walk(self.scene, self.scene.settings.max_depth, self.total, self.stream, self.number)

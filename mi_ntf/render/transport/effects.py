@@ -46,6 +46,7 @@ class Effects:
 
     emitters    plugin names of the emitters
     lit         a light has power, and `max_depth` lets it scatter
+    emission    the camera may see a field that emits light
     background  the environment is directly visible
     exhaustive  every light is summed at every shading point, rather than random ones
     visibility  visibility method, never ``auto``
@@ -61,6 +62,7 @@ class Effects:
 
     emitters: tuple[str, ...]
     lit: bool
+    emission: bool
     background: bool
     exhaustive: bool
     visibility: str
@@ -96,16 +98,18 @@ def describe(scene: mi.Scene, settings: Settings, sensor: mi.Sensor, spp: int, m
     method, reason = _method(settings, width * height * spp, lights)
     if collocated:
         reason += "; not needed where the camera's own transmittance is the light's"
+    in_view = _in_view(sensor, media)
     rims = [m.field.fresnel for m in media]
     return Effects(
         emitters=tuple(lights.kinds),
         lit=lit,
+        emission=depth != 0 and any(m.field.emissive for m, seen in zip(media, in_view, strict=True) if seen),
         background=lights.background and not settings.hide_emitters and depth != 0,
         exhaustive=exhaustive,
         visibility=method,
         reason=reason,
         collocated=collocated,
-        in_view=_in_view(sensor, media),
+        in_view=in_view,
         surfaces=surfaces,
         specular=settings.specular and (any(rims) or any(m.field.grid.gloss > MIN_GLOSS for m in media)),
         fresnel=settings.specular and any(rims),

@@ -1,0 +1,80 @@
+"""Fields that emit light, against the closed form: radiance = Σ over splats of ∫ T σ c dt."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_ntf.core import voxels
+from mi_ntf.core.splats import Splats, density, optical_depth
+from mi_ntf.importing_splats import of_splats
+
+COLOUR = (0.7, 0.3, 0.1)
+
+
+@pytest.fixture(scope="module")
+def splats() -> Splats:
+    rng = np.random.default_rng(4)
+    n = 20
+    turns = rng.normal(size=(n, 4))
+    return Splats(rng.uniform(-0.5, 0.5, (n, 3)), rng.uniform(0.1, 0.3, (n, 3)),
+                  turns / np.linalg.norm(turns, axis=1, keepdims=True), rng.uniform(0.2, 0.9, n),
+                  np.where(rng.random((n, 1)) < 0.5, COLOUR, (0.1, 0.2, 0.8)))
+
+
+@pytest.fixture(scope="module")
+def field(splats, tmp_path_factory):
+    path = tmp_path_factory.mktemp("emission") / "field.safetensors"
+    header, arrays = of_splats(splats, 96, emissive=True)
+    parts = [{name.removeprefix(f"{part}."): a for name, a in arrays.items() if name.startswith(part)}
+             for part in ("density", "reflectance")]
+    voxels.save(path, header, *parts)
+    sphere = header.similarity
+    return {"type": "sphere", "center": list(sphere.center), "radius": sphere.radius, "bsdf": {"type": "null"},
+            "interior": {"type": "nrf", "filename": str(path)}}
+
+
+def rendered(spp=64, **things):
+    camera = {"type": "orthographic",
+              "to_world": mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]),
+              "film": {"type": "hdrfilm", "width": 16, "height": 16, "pixel_format": "rgb",
+                       "rfilter": {"type": "box"}}}
+    scene = mi.load_dict({"type": "scene", "integrator": {"type": "nrf"}, "sensor": camera, **things})
+    return np.array(mi.render(scene, spp=spp))
+
+
+def closed_form(splats: Splats) -> np.ndarray:
+    """Radiance at 4 × 4 points of each pixel, by the closed form of T and a fine sum along the ray."""
+    axis = (np.arange(64) + 0.5) / 32 - 1
+    x, y = np.meshgrid(-axis, -axis)
+    result = np.zeros((64 * 64, 3))
+    origins = np.stack([x.ravel(), y.ravel(), np.full(x.size, 4.0)], 1)
+    depth, step = np.zeros(len(origins)), 0.02
+    for z in np.arange(1.8, -1.8, -step):
+        points = origins * [1, 1, 0] + [0, 0, z - step / 2]
+        sigma = density(splats, points)
+        of_first = density(splats.take(splats.colours[:, 0] > 0.5), points)
+        colour = of_first[:, None] * COLOUR + (sigma - of_first)[:, None] * [0.1, 0.2, 0.8]
+        result += (np.exp(-depth) * -np.expm1(-sigma * step) / np.maximum(sigma, 1e-12))[:, None] * colour
+        depth += sigma * step
+    straight = np.tile([0.0, 0.0, -1.0], (8, 1))
+    assert np.allclose(depth[2000:2008], optical_depth(splats, origins[2000:2008], straight), rtol=1e-3)
+    return result.reshape(16, 4, 16, 4, 3).mean((1, 3))
+
+
+def test_radiance_without_lights_is_that_of_the_splats(field, splats):
+    """The picture needs no light, and its mean error is 1 % of its brightest value."""
+    picture, truth = rendered(field=field), closed_form(splats)
+    assert np.abs(picture - truth).mean() < 0.01 * truth.max()
+    assert picture.mean() == pytest.approx(truth.mean(), rel=0.01)
+
+
+def test_a_lamp_does_not_change_emission_but_the_field_shadows_a_floor(field):
+    """Emitted light does not depend on a lamp; the floor behind the field gets less of its light."""
+    lamp = {"type": "directional", "direction": [0, 0, -1], "irradiance": 2.0}
+    dark = rendered(field=field)
+    assert np.abs(rendered(field=field, lamp=lamp) - dark).max() < 0.05
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -2]).scale(3)}
+    lit = rendered(floor=floor, lamp=lamp)
+    behind = rendered(field=field, floor=floor, lamp=lamp) - dark
+    assert behind[8, 8].max() < 0.5 * lit[8, 8].min()
+    assert (behind < lit + 0.02).all()
