@@ -9,12 +9,12 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from . import importing
+from . import importing, importing_splats
 from .core.errors import MiNtfError
 from .core.ops import Tensors
 from .core.variants import VARIANTS
 from .core.voxels import Voxels, named
-from .data import grids
+from .data import grids, splat_files
 from .infer.visibility.raymarch import RayMarch
 from .render import register
 from .render.maps import map_cache
@@ -155,6 +155,28 @@ class Field:
         values = _at_centres(sigma, low, high, counts, 1, "sigma")[..., 0]
         colours = _at_centres(albedo, low, high, counts, 3, "albedo") if callable(albedo) else albedo
         return cls.from_grid(values, colours, (low, high), phase)
+
+    @classmethod
+    def from_splats(cls, path: str | Path, emissive: bool = False, resolution: int | None = None) -> "Field":
+        """Make a field of voxels in memory of Gaussian splats.
+
+        Parameters
+        ----------
+        path
+            A ``.ply`` of Gaussian splatting, or an ``.spz``.
+        emissive
+            Keep the colours as emitted radiance. By default they are the albedo of a diffuse surface, with whatever
+            light is baked into them.
+        resolution
+            Voxels along the longest side, 16 to 2048. By default it follows from the splats' sizes.
+
+        Raises
+        ------
+        MiNtfError
+            If the file is missing or damaged, or a value is out of range.
+        """
+        _ready()
+        return cls.of_voxels(*importing_splats.of_splats(splat_files.read(path), resolution, emissive, str(path)))
 
     @classmethod
     def of_voxels(cls, header: Voxels, density: Tensors, reflectance: Tensors | None = None) -> "Field":

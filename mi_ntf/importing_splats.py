@@ -52,7 +52,7 @@ def import_splats(source: Path, output: Path, resolution: int | None = None, emi
     """
     files.check(output, (".safetensors",))
     with progress.Stage(f"importing {source}"):
-        header, density, reflectance = _voxelised(splat_files.read(source), resolution, emissive, source.name)
+        header, density, reflectance = of_splats(splat_files.read(source), resolution, emissive, source.name)
         voxels.save(output, header, density, reflectance)
     size = (header.high[0] - header.low[0]) / header.counts[0]
     return ImportedSplats(str(output), header.provenance["splats"], list(header.counts), list(header.low),
@@ -60,13 +60,11 @@ def import_splats(source: Path, output: Path, resolution: int | None = None, emi
 
 
 def of_splats(splats: Splats, resolution: int | None = None, emissive: bool = False, source: str = "splats"
-              ) -> tuple[Voxels, Tensors]:
-    """Return header and arrays of a field of voxels of `splats`; options as in :func:`import_splats`."""
-    header, density, reflectance = _voxelised(splats, resolution, emissive, source)
-    return header, voxels.named(density, reflectance)
+              ) -> tuple[Voxels, Tensors, Tensors]:
+    """Return header, density and reflectance of a field of voxels, the arguments of :func:`mi_ntf.core.voxels.save`.
 
-
-def _voxelised(splats: Splats, resolution: int | None, emissive: bool, source: str) -> tuple[Voxels, Tensors, Tensors]:
+    The options are those of :func:`import_splats`. Raises MiNtfError if one is out of range.
+    """
     if resolution is not None and not LEAST <= resolution <= MOST:
         raise MiNtfError(f"resolution is {resolution}, expected {LEAST} to {MOST} voxels along the longest side")
     return splat_field.voxelised(splats, module("llvm_ad_rgb"), resolution, emissive, {"source": source})

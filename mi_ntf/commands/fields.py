@@ -192,11 +192,16 @@ class Train:
         return shlex.join(words)
 
 
+SPLATS_LACK = {"scale": 1.0, "albedo": None, "phase": 0.0, "bounds": None, "order": "zyx"}
+SPLATS_HAVE = {"emissive": False, "resolution": None}
+"""Defaults of the options of `mi-ntf import` for either form of files."""
+
+
 @dataclass
 class Import:
-    """Make a field of a grid of density, as of Mitsuba, NumPy or OpenVDB."""
+    """Make a field of a grid of density (.vol, .npz, .npy, .vdb) or of Gaussian splats (.ply, .spz)."""
 
-    source: Annotated[Positional[Path], options.named("FILE", "Grid of density, .vol, .npz, .npy, .vdb.")]
+    source: Annotated[Positional[Path], options.named("FILE", "Grid, .vol, .npz, .npy, .vdb; or splats, .ply, .spz.")]
     output: options.Output
     """Field file to write."""
     scale: Annotated[float, options.named("X")] = 1.0
@@ -209,14 +214,28 @@ class Import:
     """Corners x0,y0,z0,x1,y1,z1 in place of the file's."""
     order: Annotated[Literal["zyx", "xyz"], options.named("{zyx,xyz}")] = "zyx"
     """Axes of arrays of NumPy; many NeRF programs have x first."""
+    emissive: bool = False
+    """Splats keep their colours as emitted light. The default takes them as the albedo of a surface."""
+    resolution: options.OptionalCount = None
+    """Voxels of splats along the longest side, 16 to 2048. The default follows from the splats' sizes."""
     overwrite: options.Overwrite = False
     json: options.Json = False
 
     def run(self) -> None:
         """Write the field and print its figures."""
+        from mi_ntf import importing_splats
+        from mi_ntf.data import splat_files
         from mi_ntf.importing import import_grid, print_summary
 
         files.check(self.output, (".safetensors",), self.overwrite)
+        splats = self.source.suffix.lower() in splat_files.SUFFIXES
+        for name, default in (SPLATS_LACK if splats else SPLATS_HAVE).items():
+            if getattr(self, name) != default:
+                raise MiNtfError(f"--{name} is for {'grids' if splats else 'Gaussian splats'}, and {self.source} "
+                                 f"holds {'splats' if splats else 'a grid'}; leave it out")
+        if splats:
+            field = importing_splats.import_splats(self.source, self.output, self.resolution, self.emissive)
+            return options.print_report(field, self.json, importing_splats.print_summary)
         report = import_grid(self.source, self.output, self.scale, self.albedo, self.phase, self.bounds, self.order)
         options.print_report(report, self.json, print_summary)
 
