@@ -11,6 +11,8 @@ Array = NDArray[np.float64]
 
 CELLS = 128
 """Cells along the longest side of the grid in which openness is computed."""
+POINTS, MOST_POINTS = 1 << 21, 256
+"""Number of points that carry the splats' mass into cells, all together and at most for each splat."""
 AWAY = 1.5
 """Distance from a splat to the places on both of its sides whose openness is compared, cells."""
 
@@ -52,9 +54,15 @@ def _openness(splats: Splats, low: Array, size: float, counts: NDArray[np.int_])
     """Return the mean transmittance from each cell (z, y, x) to the outside, along 26 directions."""
     scales = np.sort(splats.scales.astype(np.float64), axis=1)
     mass = splats.depths() * 2 * np.pi * scales[:, 1] * scales[:, 2]
-    cell = np.clip(((splats.centres - low) / size).astype(int), 0, counts - 1)
-    number = (cell[:, 2] * counts[1] + cell[:, 1]) * counts[0] + cell[:, 0]
-    sigma = np.bincount(number, mass, int(np.prod(counts))).reshape(counts[::-1]) / size**3
+    axes = splats.axes() * splats.scales[:, None]
+    sigma, rng = np.zeros(int(np.prod(counts))), np.random.default_rng(0)
+    repeats = int(np.clip(POINTS // len(splats), 1, MOST_POINTS))
+    for _ in range(repeats):
+        points = splats.centres + (axes @ rng.normal(size=(len(splats), 3, 1)))[..., 0]
+        cell = np.clip(((points - low) / size).astype(int), 0, counts - 1)
+        number = (cell[:, 2] * counts[1] + cell[:, 1]) * counts[0] + cell[:, 0]
+        sigma += np.bincount(number, mass, len(sigma))
+    sigma = sigma.reshape(counts[::-1]) / (repeats * size**3)
     directions = [d for d in itertools.product((-1, 0, 1), repeat=3) if any(d)]
     total: Array = sum((np.exp(-_depth(sigma * size, d)) for d in directions), np.zeros(sigma.shape))
     return total / len(directions)

@@ -27,6 +27,7 @@ MAX_HEADER = 1 << 16
 LARGEST = 1e15
 """Largest coordinate that single precision can still square and sum."""
 MAX_LOG_SCALE = 30.0
+"""Largest absolute logarithm of a scale."""
 _TYPES = {"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
           "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
           "double": "f8", "float64": "f8"}
@@ -66,9 +67,11 @@ def read(path: str | Path) -> Splats:
 
 def _splats(columns: np.ndarray, path: Path) -> Splats:
     """Return the splats of `columns` (n, 14), in the order of ``COLUMNS``; raise MiNtfError if none is left."""
-    norm = np.linalg.norm(columns[:, 10:14], axis=1, keepdims=True)
-    with np.errstate(invalid="ignore"):
-        good = np.isfinite(columns).all(1) & (norm[:, 0] > 1e-12) & (np.abs(columns[:, :3]) < LARGEST).all(1)
+    with np.errstate(invalid="ignore", over="ignore"):
+        columns = columns.astype(np.float64)
+        norm = np.linalg.norm(columns[:, 10:14], axis=1, keepdims=True)
+        good = np.isfinite(columns).all(1) & (norm[:, 0] > 1e-12) & (norm[:, 0] < LARGEST)
+        good &= (np.abs(columns[:, :3]) < LARGEST).all(1)
         good &= (np.abs(columns[:, 7:10]) < MAX_LOG_SCALE).all(1)
     if not good.any():
         raise MiNtfError(f"{path}: none of its {len(columns)} splats has finite values and a rotation; "

@@ -59,9 +59,10 @@ def voxelised(splats: Splats, dj: ModuleType, resolution: int | None = None, emi
         raise MiNtfError(f"no splat has an opacity of {VISIBLE:.4f} or more, so there is nothing to import")
     lattice = lattice_of(splats, resolution)
     sums = SplatSums(splats, lattice, dj)
+    longer = 1.0
     while sums.count > MOST_BLOCKS:  # the blocks of a surface grow with the square of the resolution
-        fewer = 0.98 * (MOST_BLOCKS / sums.count) ** 0.5
-        lattice = lattice_of(splats, int(fewer * lattice.counts.max()))
+        longer *= 1.03 * (sums.count / MOST_BLOCKS) ** 0.5
+        lattice = lattice_of(splats, resolution, longer)
         sums = SplatSums(splats, lattice, dj)
     progress(0.2)
     density = sums.bricks(np.minimum(sums.total(), np.float32(OPAQUE / lattice.size)))
@@ -75,8 +76,8 @@ def voxelised(splats: Splats, dj: ModuleType, resolution: int | None = None, emi
     return header, density, reflectance
 
 
-def lattice_of(splats: Splats, resolution: int | None) -> Lattice:
-    """Return voxels that hold all `splats`, with an empty one at each side."""
+def lattice_of(splats: Splats, resolution: int | None, longer: float = 1.0) -> Lattice:
+    """Return voxels that hold all `splats`, with an empty one at each side; `longer`: factor of their length."""
     shortest = splats.scales.min(1).astype(np.float64)
     reach = splats.reach(3.0)
     low, high = (splats.centres - reach).min(0), (splats.centres + reach).max(0)
@@ -85,7 +86,7 @@ def lattice_of(splats: Splats, resolution: int | None) -> Lattice:
     order = np.argsort(shortest)
     thin = shortest[order][np.searchsorted(np.cumsum(area[order]), THIN * area.sum())]
     longest = float((high - low).max())
-    size = longest / resolution if resolution else max(FINER * thin, longest / MOST_VOXELS)
+    size = longer * (longest / resolution if resolution else max(FINER * thin, longest / MOST_VOXELS))
     counts = np.ceil((high - low) / size).astype(int) + 6  # the splats' tails, and an empty voxel
     ratio = _ratio(splats, counts, size)
     counts = -(-counts // ratio) * ratio

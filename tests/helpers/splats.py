@@ -1,5 +1,6 @@
 """Gaussian splats that cover a mesh, and their files."""
 
+import gzip
 from pathlib import Path
 
 import numpy as np
@@ -48,3 +49,37 @@ def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return the products of quaternions (n, 4), w first."""
     w = a[:, :1] * b[:, :1] - np.sum(a[:, 1:] * b[:, 1:], axis=1, keepdims=True)
     return np.concatenate([w, a[:, :1] * b[:, 1:] + b[:, :1] * a[:, 1:] + np.cross(a[:, 1:], b[:, 1:])], 1)
+
+
+def spz_bytes(splats: Splats, version: int = 2) -> bytes:
+    """Return the content of an ``.spz`` file of version 1, 2 or 3, rounded as the format does."""
+    n = len(splats)
+    place = splats.centres.astype("<f2").view(np.uint8).reshape(n, 6) if version == 1 else (
+        np.round(splats.centres * 4096).astype("<i4").view(np.uint8).reshape(n, 3, 4)[..., :3].reshape(n, 9))
+    srgb = np.where(splats.colours <= 0.0031308, 12.92 * splats.colours, 1.055 * splats.colours ** (1 / 2.4) - 0.055)
+    colour = np.round(((srgb - 0.5) / 0.28209479177387814 * 0.15 + 0.5) * 255)
+    scale = np.round((np.log(splats.scales) + 10) * 16)
+    turn = splats.rotations[:, [1, 2, 3, 0]] * np.where(splats.rotations[:, :1] < 0, -1, 1)
+    rotation = _three_bytes(splats.rotations) if version < 3 else _smallest_three(turn)
+    header = np.zeros(1, [("magic", "S4"), ("version", "<u4"), ("n", "<u4"), ("rest", "u1", 4)])
+    header["magic"], header["version"], header["n"], header["rest"] = b"NGSP", version, n, [0, 12, 0, 0]
+    parts = [place, np.round(255 * splats.opacities), colour, scale, rotation]
+    return gzip.compress(header.tobytes() + b"".join(np.clip(p, 0, 255).astype(np.uint8).tobytes() for p in parts))
+
+
+def _three_bytes(rotations: np.ndarray) -> np.ndarray:
+    return np.round((rotations[:, 1:] * np.where(rotations[:, :1] < 0, -1, 1) + 1) * 127.5)
+
+
+def _smallest_three(turn: np.ndarray) -> np.ndarray:
+    """Return 32 bits of each quaternion (x, y, z, w): number of the largest, and nine bits and sign of the others."""
+    words = []
+    for quaternion in turn:
+        largest = int(np.argmax(np.abs(quaternion)))
+        quaternion = quaternion * np.sign(quaternion[largest])
+        word = largest
+        for component in [c for c in range(4) if c != largest]:
+            size = int(511 * min(abs(quaternion[component]) / np.sqrt(0.5), 1) + 0.5)
+            word = word << 10 | int(quaternion[component] < 0) << 9 | size
+        words.append(word)
+    return np.array(words, "<u4").view(np.uint8).reshape(len(turn), 4)
