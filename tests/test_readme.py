@@ -10,7 +10,9 @@ from pathlib import Path
 import numpy as np
 import OpenEXR
 import pytest
+import trimesh
 from data import forms
+from helpers import splats
 from helpers.command_process import CommandProcess
 from helpers.programs import run_program
 
@@ -47,6 +49,7 @@ def folder(tmp_path_factory):
     for name in ("skull_flash", "mine"):
         forms.colmap(folder / name)
     grids.write_vol(folder / "smoke.vol", np.random.default_rng(0).uniform(0, 1, (6, 7, 8)), grids.UNIT)
+    splats.write_ply(folder / "splats.ply", splats.on_mesh(trimesh.creation.icosphere(2), 300))
     timeline = folder / "scenes/statue/circle.toml"
     timeline.write_text(timeline.read_text().replace("frames = 120", "frames = 4"))
     shutil.copy(ROOT / "scenes/statue/reference_point.exr", folder / "reference.exr")

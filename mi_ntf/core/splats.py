@@ -8,8 +8,8 @@ axis has the opacity α:
     k = −ln(1 − α) / (√(2π) s_min).
 
 A camera sees a flat splat of a surface along this axis. No ray through the centre is less opaque, since s ≥ s_min.
-Published work decides alike: The code of EVER (Mai et al. 2024) turns an opacity into a density along the minor axis. Condor et
-al. (2025, volumetric primitives) store the density itself. The integrator ``volprim_rf_basic`` of Mitsuba evaluates the
+The code of EVER (Mai et al. 2024) also turns an opacity into a density along the minor axis. Condor et al. (2025,
+volumetric primitives) store the density itself. The integrator ``volprim_rf_basic`` of Mitsuba evaluates the
 opacity of 3D Gaussian ray tracing, which is the same along every ray through the centre and so belongs to no density.
 """
 

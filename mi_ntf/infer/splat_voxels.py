@@ -1,4 +1,4 @@
-"""Voxels of Gaussian splats: sums of Gaussians in sparse blocks of 8³ voxels, one lane of Dr.Jit for a layer of a splat.
+"""Voxels of Gaussian splats: sums of Gaussians in sparse blocks of 8³ voxels.
 
 A trilinear lookup spreads each voxel over a kernel of variance h²/6 along every axis, h being the voxel's length. The
 voxels therefore sample a Gaussian whose variances are smaller by as much, so that the looked-up splat has the variances
@@ -38,7 +38,7 @@ Kernel = Callable[[UInt32, Float, "Array", Mask], None]
 
 @dataclass(frozen=True)
 class Lattice:
-    """Cubic voxels: the first corner `low`, the voxels' length `size`, their number `counts` along each axis, x first."""
+    """Cubic voxels: first corner `low`, length `size` of a voxel, number `counts` along each axis, x first."""
 
     low: np.ndarray
     size: float
@@ -136,7 +136,7 @@ class SplatSums:
         for corner, part, slot in zip(corners, parts, near, strict=True):
             to = tuple(slice(BLOCK, None) if c else slice(BLOCK) for c in corner)
             for k, channel in enumerate(channels):
-                values[(slice(None), k, *to)] = channel[part][slot[tuple(places.T)]]
+                values[(slice(None), k) + to] = channel[part][slot[tuple(places.T)]]  # noqa: RUF005
         octants = np.any([bricks.octants_of(values[:, k] != 0) for k in range(len(channels))], 0)
         return bricks.pack(values, places, octants, resolution, 0.0)
 

@@ -8,7 +8,7 @@ import trimesh
 
 from mi_ntf.core.splats import Splats
 
-LAYERS = 12.0
+LAYERS = 8.0
 """Mean number of splats over a point of the surface: its area counts as 2π s² for each."""
 
 
@@ -16,19 +16,21 @@ def on_mesh(mesh: trimesh.Trimesh, count: int, flatness: float = 0.4, opacity: f
             seed: int = 0) -> Splats:
     """Return `count` flat discs that cover `mesh`, uniformly distributed.
 
-    `flatness`: shortest over longest axis. Every disc is tangential and turned about the normal by chance.
+    `flatness`: shortest over longest axis. Every disc is tangential and turned about the normal by chance. It lies two
+    standard deviations beneath the surface, where grazing rays meet an opaque layer.
     """
     rng = np.random.default_rng(seed)
     points, faces = trimesh.sample.sample_surface(mesh, count, seed=seed)
     normals = np.asarray(mesh.face_normals)[faces]
     radius = np.sqrt(LAYERS * mesh.area / count / (2 * np.pi))
+    points = np.asarray(points) - 2 * flatness * radius * normals
     scales = np.tile([radius, radius, flatness * radius], (count, 1))
     half = np.stack([1 + normals[:, 2], -normals[:, 1], normals[:, 0], np.zeros(count)], 1)  # turns z to the normal
     half[half[:, 0] < 1e-6] = [0, 1, 0, 0]
     angle = rng.uniform(0, np.pi, count)
     quaternions = _product(half / np.linalg.norm(half, axis=1, keepdims=True),
                            np.stack([np.cos(angle), 0 * angle, 0 * angle, np.sin(angle)], 1))
-    return Splats(points, scales, quaternions, np.full(count, opacity), np.tile(colour, (count, 1)))
+    return Splats(np.array(points), scales, quaternions, np.full(count, opacity), np.tile(colour, (count, 1)))
 
 
 def write_ply(path: Path, splats: Splats) -> Path:
