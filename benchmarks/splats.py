@@ -37,7 +37,7 @@ sys.path.insert(0, str(record.ROOT / "tests"))
 from helpers.splats import on_mesh, write_ply
 
 MESH = record.ROOT / "scenes" / "animal" / "meshes" / "animal.ply"
-RAYS, LOOKUPS, TRACED, SIZE, SPP = 2000, 1 << 16, 1 << 11, 96, 64
+RAYS, LOOKUPS, TRACED, SIZE, SPP = 400, 1 << 16, 1 << 11, 96, 64
 """Numbers of rays of the error, of lookups, of traced rays; pixels along a side and samples of the floor."""
 EXTENT = 3.5
 """Standard deviations at which a traced ellipsoid ends."""
@@ -154,9 +154,10 @@ def measured(count: int, folder: Path) -> dict[str, Any]:
     splats = on_mesh(trimesh.load(MESH, process=False), count)
     file, path = write_ply(folder / "splats.ply", splats), folder / f"{count}.safetensors"
     row: dict[str, Any] = {"import": imported(file, path)}
+    print(count, row, file=sys.stderr)
     field = Field.load(path)
-    for name, figure in (("transmittance", lambda: error(splats, field)), ("shadow", lambda: shadow(field)),
-                         ("lookup", lambda: lookups(splats, field))):
+    for name, figure in (("shadow", lambda: shadow(field)), ("lookup", lambda: lookups(splats, field)),
+                         ("transmittance", lambda: error(splats, field))):
         row[name] = figure()
         print(count, row, file=sys.stderr)
     return row

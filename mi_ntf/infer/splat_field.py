@@ -22,7 +22,7 @@ MOST_VOXELS = 2048
 """Largest default number of voxels along the longest side."""
 COARSER = 2
 """Least length of the reflectance's voxels over that of the density's."""
-MOST_COLOURS = 384
+MOST_COLOURS = 192
 """Largest number of the reflectance's voxels along the longest side."""
 COLOUR_BLUR = 0.75
 """Smallest standard deviation of a splat in the reflectance, voxels: wide enough that no density lies outside of it."""
