@@ -39,6 +39,8 @@ from helpers.splats import on_mesh, write_ply
 MESH = record.ROOT / "scenes" / "animal" / "meshes" / "animal.ply"
 RAYS, LOOKUPS, TRACED, SIZE, SPP = 400, 1 << 16, 1 << 11, 96, 64
 """Numbers of rays of the error, of lookups, of traced rays; pixels along a side and samples of the floor."""
+STEPS = 1536
+"""Integrator's `samples`, enough for the finest voxels."""
 EXTENT = 3.5
 """Standard deviations at which a traced ellipsoid ends."""
 MEASURE = """import resource, sys
@@ -89,7 +91,8 @@ def floor(thing: dict[str, Any] | None, integrator: dict[str, Any]) -> np.ndarra
 def shadow(field: Field) -> float:
     """Return the relative error of the shadow of a field to that of the mesh."""
     mesh = {"type": "ply", "filename": str(MESH)}
-    return relative_rmse(floor(field.shape(), {"type": "nrf", "max_depth": 2}), floor(mesh, {"type": "direct"}))
+    splats = floor(field.shape(), {"type": "nrf", "max_depth": 2, "samples": STEPS})
+    return relative_rmse(splats, floor(mesh, {"type": "direct"}))
 
 
 def lookups(splats: Splats, field: Field) -> dict[str, Any]:
