@@ -122,6 +122,10 @@ class Train:
     """Assume that the photographs hold no light that the object throws on itself, as in renderings of one bounce."""
     no_fresnel: options.Flag = False
     """Assume that the materials have no Fresnel effect, as in renderings with lobes of fixed weight."""
+    smoke: options.Flag = False
+    """Learn smoke: a density that scatters light by a phase function, without normals and highlights."""
+    asymmetry: options.OptionalNumber = None
+    """Mean cosine of deflection in --smoke, -1 (back) to 1 (forward). The default is 0: even in all directions."""
     visibility_mlp: options.Flag = False
     """Also train NeRV's visibility network, a function of a point and a direction, on the same transmittance."""
     field: options.OptionalFile = None
@@ -145,6 +149,8 @@ class Train:
         if self.further and self.overwrite:
             raise options.UsageError("give --continue or --overwrite, not both")
         offset = options.flash_of(self.flash_offset)
+        if self.asymmetry is not None and not self.smoke:
+            raise options.UsageError("--asymmetry is that of smoke; add --smoke")
         files.check(self.output, (".safetensors",))
         if self.output.exists() and not (self.further or self.overwrite):
             raise MiNtfError(f"{self.output} exists; add --continue to train it further or --overwrite to replace it, "
@@ -162,7 +168,8 @@ class Train:
                        reading={"size": self.size, "masks": self.masks, "background": self.background,
                                 "flash_offset": offset}, estimate=offset == "estimate", gains=not self.no_gains,
                        visibility_mlp=self.visibility_mlp, bounces=not self.no_bounces,
-                       fresnel=not self.no_fresnel, view=self.view)
+                       fresnel=not self.no_fresnel, smoke=(self.asymmetry or 0.0) if self.smoke else None,
+                       view=self.view)
         if report:  # under torchrun, only the first process has one
             if self.baked:
                 from mi_ntf.render.commands.bake import bake_fields

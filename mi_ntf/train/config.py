@@ -135,22 +135,26 @@ are the paper's kind, one logistic from the end points: of a size that CPUs can 
 
 def configured(preset: str, *, ntf: str | None = None, augmentation: bool = True, colour_loss: bool = True,
                visibility_mlp: bool = False, bounces: bool = True, fresnel: bool = True,
-               gains: bool = True) -> Config:
+               gains: bool = True, smoke: float | None = None) -> Config:
     """Return the settings of `preset` with changes.
 
     `ntf` names another transmittance network. `visibility_mlp` adds the baseline's network (NeRV's, of a point and a
-    direction), trained on the same transmittance. `fresnel` is false for materials without a Fresnel effect. The others
-    are as in :class:`FastConfig`. Raises MiNtfError if a name is unknown.
+    direction), trained on the same transmittance. `fresnel` is false for materials without a Fresnel effect. `smoke` is
+    the asymmetry of the phase function of smoke; None means surfaces. The others are as in :class:`FastConfig`. Raises
+    MiNtfError if a name is unknown or the asymmetry is out of range.
     """
     if preset not in PRESETS:
         raise MiNtfError(f"preset '{preset}' is unknown; it is one of {', '.join(PRESETS)}")
     if ntf is not None and ntf not in NTF:
         raise MiNtfError(f"--ntf '{ntf}' is unknown; it is one of {', '.join(NTF)}")
+    if smoke is not None and not abs(smoke) < 1:
+        raise MiNtfError(f"--asymmetry is {smoke:g}; expected a number between -1 and 1, exclusive")
     config = replace(PRESETS[preset], augmentation=augmentation, colour_loss=colour_loss)
     architecture = config.architecture
     if isinstance(config, FastConfig):
-        architecture = replace(architecture, fresnel=fresnel)
+        architecture = replace(architecture, fresnel=fresnel and smoke is None)
         config = replace(config, bounces=bounces, gains=gains)
+    architecture = replace(architecture, phase=smoke)
     if ntf is not None:
         architecture = replace(architecture, transmittance=NTF[ntf])
     if visibility_mlp:

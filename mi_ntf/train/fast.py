@@ -16,7 +16,7 @@ from .finished import FinishedField
 from .flash import Flash
 from .networks import Tensors
 from .normal_targets import NormalTargets
-from .occupancy import LOG_EMPTY, Occupancy, Spans
+from .occupancy import FULL_BELOW, HAZE, LOG_EMPTY, Occupancy, Spans
 from .photometry import Gains, trust
 from .recipe import FIELD, Run, Snapshot, copy_into, total
 from .scoring import Light
@@ -63,6 +63,10 @@ class Fast:
 
     def __init__(self, config: FastConfig, run: Run, estimate: bool = False,
                  finished: FinishedField | None = None):
+        skins = run.data.solid and config.architecture.phase is None  # smoke has none, however dense it is
+        if estimate and config.architecture.phase is not None:
+            raise MiNtfError("--flash-offset estimate reads the shading of surfaces, which smoke has not; give --smoke "
+                             "the place of its flash")
         if estimate and not run.data.on_lens:
             raise MiNtfError("--flash-offset estimate: the data set says where its lights are; leave the option out")
         self.run, self.data, self.clock, self.learner = run, run.data, run.clock, run.learner
@@ -77,17 +81,18 @@ class Fast:
         self.learner.optimizers = {"field": self._optimizer(*FIELD),
                                    "ntf": self._optimizer("transmittance", "visibility")}
         hull = rays.visual_hull(pool, config.cells)
-        self.occupancy, self.spans = Occupancy(hull), Spans(hull)
+        self.occupancy = Occupancy(hull, FULL_BELOW if config.architecture.phase is None else HAZE)
+        self.spans = Spans(hull)
         # Rays that miss the hull have nothing to teach. All others stay for good: matter may grow into any of them.
         pool.look_at(self.spans.points(), Spans.BLOCK * math.sqrt(3) / config.cells)
         self.baked, self.marched = NormalTargets(config.bake), TransmittanceTargets()
-        self.flash = Flash(self.data.all, self.data.solid, self.marched)
+        self.flash = Flash(self.data.all, skins, self.marched)
         self.estimating = estimate
         self.at_lens = self.data.on_lens and not estimate  # True if the lights are at the lenses for the whole run
         self.bounced: Bounced | None = None
-        if config.bounces and self.data.solid:
+        if config.bounces and skins:
             self.bounced = Bounced(self.flash, torch.cat([p.light for p in self.data.all]), self.room)
-        self.course = Course(steep=not self.data.solid)
+        self.course = Course(steep=not skins)
         if finished is not None:
             self._take(finished)
 
@@ -207,7 +212,7 @@ class Fast:
         """
         course, clock = self.course, self.clock
         due = sum(time <= clock.progress for time in ESTIMATE_TIMES)
-        unknown = self.data.solid and (self.estimating or not self.data.splits["train"].located)
+        unknown = self.flash.solid and (self.estimating or not self.data.splits["train"].located)
         if unknown and course.estimates < due:
             course.estimates = due - 1
             with Stage("estimating the flash", inner=True):
@@ -310,19 +315,27 @@ class Fast:
         known = 1.0 if pool.masked else ((target[:, 3] == 0) | (target[:, 3] == 1)).float()
         terms = {"colour": losses.color(color, target[:, :3], self.data.exposure, weight),
                  "alpha": c.alpha * (known * (image.alpha - target[:, 3]).square()).mean()}
-        error, backward = losses.normals(image, batch.d, self.baked)
-        terms["normal"], terms["facing"] = c.normal * error, c.facing * backward
         terms["bounds"] = c.empty * torch.relu(image.raw - MAX_LOG_DENSITY).mean()
-        terms["even"] = c.even * losses.evenness(nets, image, c.even_over, 2048, g)
-        matter = image.raw[image.index].clamp(max=MAX_LOG_DENSITY)
-        terms["sharp"] = -c.sharp * self.data.opaque * (image.weight.detach() * matter).sum() / len(batch)
-        terms["gloss"] = c.gloss * losses.gloss(image, c.architecture.least_specular, self.fading, len(batch))
+        if nets.phase is None:
+            terms |= self.surface_loss(image, batch)
         x = self.occupancy.must_be_empty(1536, g)
         if len(x):
             terms["empty"] = c.empty * losses.emptiness(nets, x)
         if self.clock.step % 4 == 0:
             terms["smooth"] = 4 * c.smooth * losses.total_variation(nets)
         return terms, image
+
+    def surface_loss(self, image: volume.Image, batch: rays.Rays) -> Tensors:
+        """Return the weighted loss terms of normals, skins and specular lobes, which smoke does not have."""
+        c = self.config
+        error, backward = losses.normals(image, batch.d, self.baked)
+        matter = image.raw[image.index].clamp(max=MAX_LOG_DENSITY)
+        return {
+            "normal": c.normal * error, "facing": c.facing * backward,
+            "even": c.even * losses.evenness(self.networks, image, c.even_over, 2048, self.generator),
+            "sharp": -c.sharp * self.data.opaque * (image.weight.detach() * matter).sum() / len(batch),
+            "gloss": c.gloss * losses.gloss(image, c.architecture.least_specular, self.fading, len(batch)),
+        }
 
     def ntf_loss(self, image: volume.Image, batch: rays.Rays) -> Tensors:
         """Return the weighted loss terms of the networks that learn transmittance, by name."""

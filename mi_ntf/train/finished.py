@@ -61,12 +61,16 @@ class FinishedField:
         if not isinstance(config, FastConfig):
             raise MiNtfError(f"{option} goes with the preset 'fast' alone: the paper's learns field and transmittance "
                              "as one")
-        field = self.header.architecture
+        field, phase = self.header.architecture, config.architecture.phase
+        if phase not in (None, field.phase):
+            learned = "surfaces" if field.phase is None else f"smoke of the asymmetry {field.phase:g}"
+            raise MiNtfError(f"{self.path} was trained as {learned}, and {option} keeps that; leave --smoke and "
+                             "--asymmetry out")
         if self.further and field.density.encoding.kind != "planes":
             raise MiNtfError(f"{self.path} was trained with another preset; --continue takes fields of the preset "
                              "'fast' further")
         architecture = replace(config.architecture, density=field.density, reflectance=field.reflectance,
-                               fresnel=field.fresnel)
+                               fresnel=field.fresnel, phase=field.phase)
         if not self.further:
             return replace(config, architecture=architecture, ntf_from=0.0, ntf_alone=0.0)
         if ntf is None:

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 import torch
 import torch.nn.functional as F
 
-from ..core import fresnel, microfacet
+from ..core import fresnel, henyey_greenstein, microfacet
 from . import ops
 from .networks import Reflectance
 from .normal_targets import fetch
@@ -71,14 +71,19 @@ class Flash:
         return torch.exp(-depth)
 
     def send(self, optical: Optical, reflectance: Reflectance, d: torch.Tensor, x: torch.Tensor, view: torch.Tensor,
-             light: torch.Tensor, rim: bool) -> torch.Tensor:
+             light: torch.Tensor, rim: bool, phase: float | None = None) -> torch.Tensor:
         """Return the radiance (n, 3) that samples at `x` (n, 3) of rays along `d` send to the camera.
 
         `optical` are the samples' optical depths, `light` (n, 3) radiant intensities. `rim` is true if the field has a
-        Fresnel term. Shadows on skins are left out, see :meth:`lit`.
+        Fresnel term, `phase` is the asymmetry of smoke. Shadows on skins are left out, see :meth:`lit`.
         """
         normal, albedo, roughness, specular = reflectance
         toward, distance = self.toward(view, x)
+        if phase is not None:
+            weight = torch.exp(-optical.front) * -torch.expm1(-optical.depth) * self.reaching(view, x)
+            scattered = henyey_greenstein.phase(ops, phase, (toward * d).sum(1))
+            smoke: torch.Tensor = (weight * scattered)[:, None] * albedo * light / distance**2
+            return smoke
         wi, wo, n = toward.unbind(1), (-d).unbind(1), normal.unbind(1)
         diffuse_weight, gloss_weight = fresnel.weights(ops, wi, wo, n, roughness, specular, rim)
         if self.solid:

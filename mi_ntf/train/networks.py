@@ -59,6 +59,11 @@ class Networks:
         """True if the specular weight is the normal reflectance of :mod:`mi_ntf.core.fresnel`."""
         return self.architecture.fresnel
 
+    @property
+    def phase(self) -> float | None:
+        """Asymmetry of the phase function of smoke, see :mod:`mi_ntf.core.henyey_greenstein`; None for surfaces."""
+        return self.architecture.phase
+
     def log_density(self, x: torch.Tensor) -> torch.Tensor:
         """Return ln σ (n,) of the points `x` (n, 3), before it is clipped to the format's range."""
         features = encode(self.architecture.density.encoding, self.tensors, "density", x)
@@ -72,6 +77,9 @@ class Networks:
         """Return the reflectance of the points `x` (n, 3)."""
         features = encode(self.architecture.reflectance.encoding, self.tensors, "reflectance", x)
         raw = perceptron(self.tensors, "reflectance", features)
+        if self.phase is not None:
+            zero = raw.new_zeros(len(raw))
+            return Reflectance(raw.new_zeros(len(raw), 3), torch.sigmoid(raw[:, 3:6]), zero + 1, zero)
         rest = torch.sigmoid(raw[:, 3:])
         roughness = MIN_ROUGHNESS + (1 - MIN_ROUGHNESS) * rest[:, 3]
         least = self.architecture.least_specular

@@ -12,6 +12,8 @@ FULL_BELOW = 0.3
 """Density σ (1/radius) below which a cell counts as empty: a whole cell takes less than 1 % of the light."""
 LOG_EMPTY = -4.0
 """ln σ that counts as empty: a fifth of the density at which the renderer cuts (σ = 0.1)."""
+HAZE = 0.1
+"""The same for smoke, whose haze takes light along long paths. It is the density at which the renderer cuts."""
 STRAY_SAMPLES = 1 << 18
 """Cells outside the hull that an update samples, besides those in which the last one found matter."""
 OPAQUE_DEPTH = 10.0
@@ -19,10 +21,13 @@ OPAQUE_DEPTH = 10.0
 
 
 class Occupancy:
-    """Densities of [−1, 1]³ on cells³ cells, [x, y, z]; `hull` (bool) bounds where matter may be."""
+    """Densities of [−1, 1]³ on cells³ cells, [x, y, z]; `hull` (bool) bounds where matter may be.
 
-    def __init__(self, hull: torch.Tensor):
-        self.cells = hull.shape[0]
+    Cells below the density `empty` are empty.
+    """
+
+    def __init__(self, hull: torch.Tensor, empty: float = FULL_BELOW):
+        self.cells, self.empty = hull.shape[0], empty
         self.index = hull.reshape(-1).nonzero()[:, 0]  # Flat indices of the cells in the hull
         self.sigma = torch.full((self.cells**3,), -1.0)  # Density of each cell, −1 if it is empty
         self.sigma[self.index] = 0.0
@@ -58,7 +63,7 @@ class Occupancy:
         n = self.cells
         sampled = self.sample(networks, generator, 0.8)
         grid = torch.zeros(n**3)
-        grid[self.index] = (self.level > FULL_BELOW).float()
+        grid[self.index] = (self.level > self.empty).float()
         near = neighbour_maximum(grid.view(n, n, n)).reshape(-1)[self.index] > 0
         # A cell takes as much light as its thinnest neighbour would: skins, which fill cells in part, hide nothing.
         grid[self.index] = sampled

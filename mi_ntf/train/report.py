@@ -152,7 +152,8 @@ def _turning_lamp(page: Page, field: FieldView, photographs: Photographs, marche
     page.section("Under a turning lamp")
     rays, shape = _rays(photographs, 0, LAMP_WIDTH, detail)
     rays = replace(rays, view=torch.zeros_like(rays.view))
-    lamp = Flash([photographs], field.light.flash is None or field.light.flash.solid, marched)
+    skins = field.networks.phase is None and (field.light.flash is None or field.light.flash.solid)
+    lamp = Flash([photographs], skins, marched)
     camera = lamp.camera[0]
     up = lamp.rotation[0, :, 1]
     pictures, exposure = [], 1.0

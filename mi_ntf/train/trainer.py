@@ -42,7 +42,7 @@ def train(dataset: Path, out: Path, *, preset: str = "fast", minutes: float | No
           seed: int = 0, tensorboard: Path | None = None, field: Path | None = None, further: bool = False,
           reading: Reading | None = None, estimate: bool = False, view: bool = False, ntf: str | None = None,
           augmentation: bool = True, colour_loss: bool = True, visibility_mlp: bool = False, bounces: bool = True,
-          fresnel: bool = True, gains: bool = True, began: float | None = None) -> Report:
+          fresnel: bool = True, gains: bool = True, smoke: float | None = None, began: float | None = None) -> Report:
     """Train a field on the photographs in `dataset`, write it to `out`, and return the report, which its header holds.
 
     Parameters
@@ -61,7 +61,7 @@ def train(dataset: Path, out: Path, *, preset: str = "fast", minutes: float | No
         Estimate the position of the flash beside the lens.
     view
         Show the field in a browser while it learns.
-    ntf, augmentation, colour_loss, visibility_mlp, bounces, fresnel, gains
+    ntf, augmentation, colour_loss, visibility_mlp, bounces, fresnel, gains, smoke
         Changes of the preset, see :func:`mi_ntf.train.config.configured`.
     began
         Moment of `time.monotonic` from which `minutes` count; by default that of the call.
@@ -75,7 +75,7 @@ def train(dataset: Path, out: Path, *, preset: str = "fast", minutes: float | No
     :mod:`mi_ntf.train.parallel`. The first one prints and writes; the others return an empty report.
     """
     config = configured(preset, ntf=ntf, augmentation=augmentation, colour_loss=colour_loss,
-                        visibility_mlp=visibility_mlp, bounces=bounces, fresnel=fresnel, gains=gains)
+                        visibility_mlp=visibility_mlp, bounces=bounces, fresnel=fresnel, gains=gains, smoke=smoke)
     if further and field is not None:
         raise MiNtfError("--continue trains all of a field and --field its transmittance alone; give one of them")
     if further and not out.exists() and Path(f"{out}.ckpt").exists():

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import torch
 import torch.nn.functional as F
 
-from ..core import fresnel, microfacet
+from ..core import fresnel, henyey_greenstein, microfacet
 from . import ops
 from .bounced import Bounced
 from .flash import Flash
@@ -111,12 +111,17 @@ def scatter_sum(value: torch.Tensor, ray: torch.Tensor, count: int) -> torch.Ten
     return value.new_zeros(count, *value.shape[1:]).index_add(0, ray, value)
 
 
-def shade(reflectance: Reflectance, d: torch.Tensor, t: torch.Tensor, light: torch.Tensor, rim: bool) -> torch.Tensor:
+def shade(reflectance: Reflectance, d: torch.Tensor, t: torch.Tensor, light: torch.Tensor, rim: bool,
+          phase: float | None = None) -> torch.Tensor:
     """Return the radiance (n, 3) that points scatter back along −d, per unit of light weight v.
 
     `t` (n,) is the distance to the light at the lens, `light` (n, 3) its radiant intensity. `rim` is true if the field
-    has a Fresnel term.
+    has a Fresnel term. `phase` is the asymmetry of smoke, which sends light back by its phase function alone.
     """
+    if phase is not None:
+        back = henyey_greenstein.phase(ops, phase, t.new_tensor(-1.0))
+        smoke: torch.Tensor = back * reflectance.albedo * light / (t * t)[:, None]
+        return smoke
     normal, albedo, roughness, specular = reflectance
     cos = -(normal * d).sum(1)
     diffuse, glossy = microfacet.lobes_collocated(ops, cos, roughness)
@@ -148,10 +153,11 @@ def render(networks: Networks, rays: Rays, samples: Samples, bounced: Bounced | 
         reflectance = Reflectance(*reflectance[:2], *(v.detach() for v in reflectance[2:]))
         shaded = reflectance._replace(normal=_turned_to(reflectance.normal, -rays.d[ray]))
     if flash is None:
-        radiance = shade(shaded, rays.d[ray], t, rays.light[ray], networks.fresnel)
+        radiance = shade(shaded, rays.d[ray], t, rays.light[ray], networks.fresnel, networks.phase)
         color = scatter_sum(v[near, None] * radiance, ray, len(rays))
     else:
-        radiance = flash.send(optical[near], shaded, rays.d[ray], x, view, rays.light[ray], networks.fresnel)
+        radiance = flash.send(optical[near], shaded, rays.d[ray], x, view, rays.light[ray], networks.fresnel,
+                              networks.phase)
         color = scatter_sum(radiance, ray, len(rays)) * _lit(flash, rays, ray, w.detach(), x, shaded.normal.detach())
     indirect: torch.Tensor | float = 0.0
     if bounced is not None and bounced.known:

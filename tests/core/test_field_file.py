@@ -104,8 +104,13 @@ def test_fields_with_a_visibility_network_and_fresnel_effect_and_old_ones_withou
     header, actual = field_file.load(tmp_path / "f")
     assert header.architecture == both and set(actual) == set(tensors)
     old = Header(SMALL).to_json()
-    del old["architecture"]["visibility"], old["architecture"]["fresnel"]
+    del old["architecture"]["visibility"], old["architecture"]["fresnel"], old["architecture"]["phase"]
     assert header_from_json(json.loads(json.dumps(old)), "old").architecture == SMALL
+
+
+def test_the_phase_function_of_smoke_survives_json():
+    smoke = dataclasses.replace(FAST, phase=-0.25)
+    assert header_from_json(json.loads(json.dumps(Header(smoke).to_json())), "x").architecture == smoke
 
 
 def test_fast_preset_survives_json():
@@ -202,6 +207,8 @@ def test_foreign_and_absent_files(tmp_path):
     (lambda d: d.update(format=1), "field format 1, this build reads 2; train or export the field anew"),
     (lambda d: d.pop("architecture"), "incomplete .*architecture"),
     (lambda d: d["architecture"].pop("transmittance"), "incomplete .*transmittance"),
+    (lambda d: d["architecture"].update(phase=1), "phase function is 1, expected -1 to 1, exclusive"),
+    (lambda d: d["architecture"].update(phase="hg"), "phase function is 'hg', expected a finite number"),
     (lambda d: d["architecture"].update(fresnel=1), "fresnel is 1, expected true or false"),
     (lambda d: d["architecture"]["density"]["encoding"].update(kind="hash"),
      "'hash' of density, expected one of planes, frequency"),

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from helpers.frameworks import BACKENDS, oracle
 
-from mi_ntf.core import fresnel, logistic, microfacet, ops, spheres, srgb
+from mi_ntf.core import fresnel, henyey_greenstein, logistic, microfacet, ops, spheres, srgb
 
 COUNT = 4000
 STEP = 1e-6
@@ -99,6 +99,11 @@ FORMULAS = [
             (_uniform(0, 1), _uniform(0.15, 1), _uniform(0.02, 0.98)), 5e-7, 5e-6),
     Formula("diffuse_albedo", lambda o, *c: [microfacet.diffuse_albedo(*c)],
             (_uniform(0, 1), _uniform(0.15, 1), _uniform(0, 1)), 5e-7, 5e-7),
+    # 1 + g² − 2 g cos ≥ 0.01 is the difference of numbers that are rounded by 1e-7.
+    Formula("phase of smoke", lambda o, g, c: [henyey_greenstein.phase(o, g, c)],
+            (_uniform(-0.9, 0.9), _uniform(-1, 1)), 5e-5, 2e-4),
+    Formula("deflection", lambda o, g, u: [henyey_greenstein.deflection(g, u)],
+            (_uniform(-0.9, 0.9), _uniform(0, 1)), 2e-5, 1e-3),
     Formula("normalize", lambda o, *c: ops.normalize(o, c), (_point,), 5e-7, 1e-5, 1.0),
     Formula("sRGB", lambda o, x: [srgb.encode(o, x)], (_uniform(-0.2, 1.2),), 5e-7, 5e-6),
     Formula("sRGB, back", lambda o, x: [srgb.decode(o, x)], (_uniform(0, 1),), 5e-7, 5e-6),

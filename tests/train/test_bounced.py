@@ -58,6 +58,7 @@ class Outward:
     """The spheres' networks with the spheres' own normals."""
 
     fresnel = False
+    phase = None
 
     def __init__(self, nets):
         self._nets = nets

@@ -68,6 +68,7 @@ class Slab:
     """σ = 8 where z > 0, else 0; Lambertian, facing −z."""
 
     fresnel = False
+    phase = None
 
     def log_density(self, x):
         return torch.where(x[:, 2] > 0, float(np.log(8.0)), -12.0)

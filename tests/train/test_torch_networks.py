@@ -50,6 +50,17 @@ def test_networks_agree_with_the_oracle(dtype, tolerance):
         assert np.abs(have.detach().numpy() - want).max() <= tolerance * np.abs(want).max()
 
 
+def test_smoke_has_an_albedo_alone():
+    smoke = dataclasses.replace(SMALL, fresnel=False, phase=0.5)
+    tensors, _ = field(torch.float64)
+    x, _ = points(50)
+    matter = np.split(reference.reflectance(smoke, tensors, x), (3, 6, 7), axis=1)
+    learned = networks.from_tensors(smoke, tensors, torch.float64).reflectance(torch.tensor(x))
+    for want, have in zip(matter, learned, strict=True):
+        np.testing.assert_allclose(have.detach(), want.reshape(tuple(have.shape)), rtol=1e-12)
+    assert not learned.normal.any() and (learned.roughness == 1).all() and not learned.specular.any()
+
+
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 2e-5)])
 def test_mixture_read_from_optical_depths(dtype, tolerance):
     """The encoding `depth`, from crossings found by interpolation; float32 rounds ratios of small differences."""
