@@ -61,6 +61,8 @@ class FastConfig:
     sigmoids have no slope, and dark pixels would turn normals away from the light."""
     smooth: float = 2e-4
     """Weight of the total variation of the planes."""
+    smooth_smoke: float = 2e-3
+    """The same for smoke, which has no edges that it would blur."""
     shadows_from: float = 0.1
     """Time from which a flash beside the lens throws shadows: there has to be a skin first."""
     ntf_from: float = 0.8

@@ -316,13 +316,15 @@ class Fast:
         terms = {"colour": losses.color(color, target[:, :3], self.data.exposure, weight),
                  "alpha": c.alpha * (known * (image.alpha - target[:, 3]).square()).mean()}
         terms["bounds"] = c.empty * torch.relu(image.raw - MAX_LOG_DENSITY).mean()
+        terms["even"] = c.even * losses.evenness(nets, image, c.even_over, 2048, g)
         if nets.phase is None:
             terms |= self.surface_loss(image, batch)
         x = self.occupancy.must_be_empty(1536, g)
         if len(x):
             terms["empty"] = c.empty * losses.emptiness(nets, x)
         if self.clock.step % 4 == 0:
-            terms["smooth"] = 4 * c.smooth * losses.total_variation(nets)
+            smooth = c.smooth if nets.phase is None else c.smooth_smoke
+            terms["smooth"] = 4 * smooth * losses.total_variation(nets)
         return terms, image
 
     def surface_loss(self, image: volume.Image, batch: rays.Rays) -> Tensors:
@@ -332,7 +334,6 @@ class Fast:
         matter = image.raw[image.index].clamp(max=MAX_LOG_DENSITY)
         return {
             "normal": c.normal * error, "facing": c.facing * backward,
-            "even": c.even * losses.evenness(self.networks, image, c.even_over, 2048, self.generator),
             "sharp": -c.sharp * self.data.opaque * (image.weight.detach() * matter).sum() / len(batch),
             "gloss": c.gloss * losses.gloss(image, c.architecture.least_specular, self.fading, len(batch)),
         }

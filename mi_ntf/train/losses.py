@@ -69,14 +69,17 @@ def evenness(networks: Networks, image: Image, length: float, count: int, genera
 
     Photographs with the light at the lens hardly show small bumps of the density, since nothing is in shadow. Under
     other lights bumps shade each other and show as blotches. Differences are taken over a quarter of `length` to all
-    of it, at `count` samples.
+    of it, at `count` samples. Smoke has no normals, so its directions are uniform: noise of the photographs would be
+    learned as streaks.
     """
     visible = (image.weight.detach() > 0.02).nonzero()[:, 0]
     if not len(visible):
         return image.weight.sum() * 0
     pick = visible[torch.randint(len(visible), (count,), generator=generator)]
-    normal = image.reflectance.normal[pick].detach()
-    along = F.normalize(torch.linalg.cross(normal, uniform_directions(count, generator)), dim=1)
+    along = uniform_directions(count, generator)
+    if networks.phase is None:
+        normal = image.reflectance.normal[pick].detach()
+        along = F.normalize(torch.linalg.cross(normal, along), dim=1)
     offset = along * length * (0.25 + 0.75 * torch.rand(count, 1, generator=generator))
     x = image.x[pick]
     raw = networks.log_density(torch.cat([x + offset, x - offset])).clamp(LOG_EMPTY, MAX_LOG_DENSITY)

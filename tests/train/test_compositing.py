@@ -269,6 +269,8 @@ def test_a_new_field_is_matt():
 def test_evenness_sees_slopes_along_the_surface_alone():
     """ln σ = 8z does not change along surfaces of normal −z; for normals x it differs by 16·offset·cos, ⟨cos²⟩ = ½."""
     class Ramp:
+        phase = None
+
         def log_density(self, x):
             return 8 * x[:, 2]
 

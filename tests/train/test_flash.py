@@ -52,6 +52,7 @@ class Skin:
 
     def __init__(self, roughness: float, specular: float, rim: bool):
         self.gloss, self.fresnel = (roughness, specular), rim
+        self.phase = None
 
     def log_density(self, x):
         return torch.where(x[:, 2] < 0, 6 + torch.sin(900 * x[:, 2]) - 200 * x[:, 2].abs() * (x[:, 2] < -0.01), -12.0)
