@@ -18,7 +18,7 @@ def evaluate(wi: Vector, wo: Vector, reflectance: Reflectance) -> tuple[Vector, 
 
     The value is the phase function (linear RGB, 1/sr), the density that of :func:`sample` (1/sr).
     """
-    normal, albedo, roughness, specular, softness, rim, lobe = reflectance
+    normal, albedo, roughness, specular, softness, rim, lobe, _ = reflectance
     if lobe:
         phase, pdf = lobe.evaluate(wi, wo)
         return tuple(k * c for k, c in zip(albedo, phase, strict=True)), pdf
