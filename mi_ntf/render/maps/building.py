@@ -30,8 +30,7 @@ from ..scene.settings import Settings
 from . import map_cache
 
 DENSE_TEXELS = 2
-"""Length of the marched part of a ray through smoke in texels; smoke is dense where it is longer than a mean free path.
-"""
+"""Length, in texels, of the marched part of a ray through dense smoke, whose mean free path is shorter than a texel."""
 
 
 def resolved(settings: Settings, lights: int, media: Sequence[NRFMedium]) -> Settings:
@@ -121,7 +120,7 @@ def build(name: str, medium: NRFMedium, table: LightTable | None, options: Optio
     with timing.building(), log.Work("nrf integrator", f"making the {name}{size}"):
         lookup = method.build(medium, table, options, module_of(mi.Float), keep)
     length = DENSE_TEXELS * 2 / (ATLAS_RESOLUTION if method.per_field else options.map_resolution)
-    if lookup is None or medium.field.trained or medium.source.majorant * length < 1:
+    if lookup is None or medium.field.trained or medium.source.majorant * length < DENSE_TEXELS:
         return lookup
     return MarchedBegin(lookup, cast(RayMarch, march(medium, table, options)), length, module_of(mi.Float))
 
