@@ -354,7 +354,7 @@ def setting_figures(medium: Any, sizes: Sizes) -> Figures:
 
 def _like(medium: Any, source: Any, network: Any) -> Any:
     """Return a stand-in for `medium` with the density of `source`, for visibility methods."""
-    field = SimpleNamespace(grid=medium.field.grid, network=network, softness=medium.field.softness)
+    field = SimpleNamespace(grid=medium.field.grid, network=network, softness=medium.field.softness, trained=True)
     return SimpleNamespace(field=field, source=source)
 
 

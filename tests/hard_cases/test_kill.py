@@ -121,7 +121,7 @@ def write_transforms(path, field):
 
 
 def write_manifest(path, field):
-    return lambda: capture_module._open_manifest(path.parent, {"a": "b" * 5000})
+    return lambda: capture_module._open_manifest(path.parent, {"a": "b" * 5000}, {})
 
 
 def write_scene(path, field):

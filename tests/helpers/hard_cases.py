@@ -50,7 +50,8 @@ def baked(header, tensors, resolution: int = 192):
     """A field as a render holds it: stands for a medium whose frame is the identity."""
     network = NetworkField(header, tensors, mi)
     grid = grid_of(network, resolution, mi)
-    return SimpleNamespace(source=grid, field=SimpleNamespace(network=network, grid=grid, softness=measured(grid, mi)))
+    field = SimpleNamespace(network=network, grid=grid, softness=measured(grid, mi), trained=True)
+    return SimpleNamespace(source=grid, field=field)
 
 
 def seen_from(x: np.ndarray, light) -> tuple:

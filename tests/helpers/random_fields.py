@@ -75,7 +75,8 @@ def _balls(what: Balls, factor: float):
             values[:] = rng.normal(size=values.shape) * 0.5 * what.wild
     network = NetworkField(header, tensors, mi)
     grid = baked(network, 48, mi)
-    return SimpleNamespace(source=grid, field=SimpleNamespace(network=network, grid=grid, softness=measured(grid, mi)))
+    field = SimpleNamespace(network=network, grid=grid, softness=measured(grid, mi), trained=True)
+    return SimpleNamespace(source=grid, field=field)
 
 
 class Exact:
@@ -138,7 +139,7 @@ class Exact:
         corners = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), -1).reshape(-1, 3)
         volume = Formula(self.density, corners)
         network = Balls(0).medium().field.network
-        field = SimpleNamespace(network=network, grid=volume, softness=SimpleNamespace(opaque=True))
+        field = SimpleNamespace(network=network, grid=volume, softness=SimpleNamespace(opaque=True), trained=True)
         volume.reflectance = self.reflectance
         return SimpleNamespace(source=volume, field=field)
 
