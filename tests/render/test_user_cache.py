@@ -166,7 +166,7 @@ def test_voxels_in_a_file_that_are_wrong_are_not_used(path, bakes, monkeypatch, 
     """Crafted ones would be read outside of their memory."""
     truth = loaded.load(str(path), 48)
     field = truth.digest
-    arrays = dict(loaded._baked(str(path), truth.network, 48, mi))
+    arrays = dict(loaded._baked(str(path), truth.header, truth.network, 48, mi))
     if change == "index":
         arrays["density.index"] = arrays["density.index"] | 0xFFFFFF
     elif change == "words":
