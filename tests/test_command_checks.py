@@ -9,7 +9,7 @@ from mi_ntf import cli
 
 @pytest.mark.parametrize(("line", "name", "right"), [
     ("train d -o f.png", "f.png", ".safetensors"),
-    ("export f.safetensors -o m.png", "m.png", ".ply, .obj, .glb or .stl"),
+    ("export f.safetensors -o m.png", "m.png", ".ply, .obj, .glb, .stl, .vol or .vdb"),
     ("swap s.xml f.safetensors -o n.exr", "n.exr", ".xml"),
     ("bake s.xml -o m.png", "m.png", ".exr"),
     ("inspect d -o p.txt", "p.txt", ".html"),

@@ -206,7 +206,7 @@ SPLATS_HAVE = {"emissive": False, "resolution": None}
 
 @dataclass
 class Import:
-    """Make a field of a grid of density (.vol, .npz, .npy, .vdb) or of Gaussian splats (.ply, .spz)."""
+    """Make a field of a grid of density or of Gaussian splats."""
 
     source: Annotated[Positional[Path], options.named("FILE", "Grid, .vol, .npz, .npy, .vdb; or splats, .ply, .spz.")]
     output: options.Output
