@@ -221,7 +221,7 @@ class Import:
     """Corners x0,y0,z0,x1,y1,z1 in place of the file's."""
     order: Annotated[Literal["zyx", "xyz"], options.named("{zyx,xyz}")] = "zyx"
     """Axes of arrays of NumPy; many NeRF programs have x first."""
-    emissive: bool = False
+    emissive: options.Flag = False
     """Splats keep their colours as emitted light. The default takes them as the albedo of a surface."""
     resolution: options.OptionalCount = None
     """Voxels of splats along the longest side, 16 to 2048. The default follows from the splats' sizes."""
