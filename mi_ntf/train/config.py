@@ -62,7 +62,7 @@ class FastConfig:
     smooth: float = 2e-4
     """Weight of the total variation of the planes."""
     smooth_smoke: float = 2e-3
-    """The same for smoke, which has no edges that it would blur."""
+    """Weight of the total variation of the planes of smoke. It is larger, since smoke has no edges to blur."""
     shadows_from: float = 0.1
     """Time from which a flash beside the lens throws shadows: there has to be a skin first."""
     ntf_from: float = 0.8

@@ -13,7 +13,7 @@ FULL_BELOW = 0.3
 LOG_EMPTY = -4.0
 """ln σ that counts as empty: a fifth of the density at which the renderer cuts (σ = 0.1)."""
 HAZE = 0.1
-"""The same for smoke, whose haze takes light along long paths. It is the density at which the renderer cuts."""
+"""Density σ (1/radius) below which a cell of smoke counts as empty. The renderer leaves out lower densities, too."""
 STRAY_SAMPLES = 1 << 18
 """Cells outside the hull that an update samples, besides those in which the last one found matter."""
 OPAQUE_DEPTH = 10.0
