@@ -245,7 +245,7 @@ def _camera_times(sensor: Any, medium: Any, paper: PaperField, sizes: Sizes) -> 
         matter = shade.Reflectance(normal, albedo, roughness, specular, medium.field.softness(x))
         p = shade.Points(x, tuple(-c for c in along), matter)
         last[:] = [p]
-        return [*p.x, *p.wo, *p.normal, *p.albedo, p.roughness, p.specular]
+        return [*p.x, *p.wo, *p.normal, *p.albedo, p.roughness, *p.specular]
 
     camera = [v / sizes.pixels**2 for v in rounds({"camera": view}, sizes.repeats)["camera"]]
     count, *sides = sizes.tables

@@ -7,7 +7,7 @@ A PLY file has for each vertex, in this order:
     red green blue alpha        albedo, sRGB, 8 bits: Blender's colour attribute `Col`
     albedo_r albedo_g albedo_b  the same, linear float; Mitsuba 3.9's `vertex_albedo_color`
     roughness                   as Blender's Principled BSDF has it: α = roughness²
-    specular                    weight of the specular lobe
+    specular_r specular_g specular_b  weight of the specular lobe, linear; `vertex_specular_color`
 
 Source of the names: Blender's `io/ply/importer/ply_import_data.cc`, where other than standard names become float
 attributes, and Mitsuba's plugin `ply`, which ignores attributes of a single number and warns about them.
@@ -44,6 +44,7 @@ _SHAPE = """<shape type="ply">
                 <string name="material" value="none"/>
                 <string name="distribution" value="ggx"/>
                 <float name="alpha" value="{alpha:.4g}"/>
+                <rgb name="specular_reflectance" value="{colour}"/>
             </bsdf>
         </bsdf>
     </bsdf>
@@ -53,7 +54,7 @@ _SHAPE = """<shape type="ply">
 
 @dataclass(frozen=True)
 class MeshFile:
-    """Figures of a mesh: its `size` is in scene units, `roughness` and `specular` are means over the vertices."""
+    """Figures of a mesh: `size` in scene units; `roughness` and `specular` (linear RGB), means over the vertices."""
 
     file: str
     vertices: int
@@ -61,7 +62,7 @@ class MeshFile:
     level: float
     size: list[float]
     roughness: float
-    specular: float
+    specular: list[float]
 
 
 def export(field: Path, output: Path, resolution: int = 256, level: float | None = None) -> MeshFile:
@@ -85,14 +86,15 @@ def export(field: Path, output: Path, resolution: int = 256, level: float | None
         vertices = mesh.vertices * header.similarity.radius + np.array(header.similarity.center)
         files.write(output, _encoded(mesh, vertices, output.suffix.lower()))
     return MeshFile(str(output), len(vertices), len(mesh.faces), mesh.level, np.ptp(vertices, axis=0).round(6).tolist(),
-                    float(mesh.roughness.mean()), float(mesh.specular.mean()))
+                    float(mesh.roughness.mean()), mesh.specular.mean(0, np.float64).round(6).tolist())
 
 
 def print_summary(mesh: MeshFile) -> None:
     """Print the file, the figures of the mesh, and the use of it."""
     size = " × ".join(f"{length:.3g}" for length in mesh.size)
+    specular = ", ".join(dict.fromkeys(f"{value:.2f}" for value in mesh.specular))
     print(f"mesh: {mesh.file} ({mesh.vertices} vertices, {mesh.faces} faces, {size} in scene units)",
-          f"surface: at density {mesh.level:.3g}; mean roughness {mesh.roughness:.2f}, specular {mesh.specular:.2f}",
+          f"surface: at density {mesh.level:.3g}; mean roughness {mesh.roughness:.2f}, specular {specular}",
           f"next: import {mesh.file} in Blender or another program", sep="\n")
 
 
@@ -103,8 +105,10 @@ def mitsuba_shape(path: Path, mesh: MeshFile, to_world: np.ndarray) -> str:
     hold all over the mesh, because the plugin ``ply`` has no attributes of a single number. `to_world` is the (4, 4)
     matrix from the capture's coordinates to the scene's.
     """
+    weight = max(*mesh.specular, 1e-6)
+    colour = ", ".join(f"{value / weight:.4g}" for value in mesh.specular)
     return _SHAPE.format(file=escape(str(path)), place=" ".join(f"{value:.9g}" for value in to_world.ravel()),
-                         specular=mesh.specular, alpha=mesh.roughness**2)
+                         specular=weight, colour=colour, alpha=mesh.roughness**2)
 
 
 def _encoded(surface: Surface, vertices: np.ndarray, suffix: str) -> bytes | str:
@@ -117,8 +121,8 @@ def _encoded(surface: Surface, vertices: np.ndarray, suffix: str) -> bytes | str
     mesh = trimesh.Trimesh(vertices, surface.faces, vertex_normals=surface.normals, process=False,
                            vertex_colors=np.round(255 * np.concatenate([colours, alpha], 1)).astype(np.uint8))
     if suffix == ".ply":
-        names = ("albedo_r", "albedo_g", "albedo_b", "roughness", "specular")
-        values = (*surface.albedo.T, surface.roughness, surface.specular)
+        names = ("albedo_r", "albedo_g", "albedo_b", "roughness", "specular_r", "specular_g", "specular_b")
+        values = (*surface.albedo.T, surface.roughness, *surface.specular.T)
         mesh.vertex_attributes.update(dict(zip(names, map(np.ascontiguousarray, values), strict=True)))
     contents = mesh.export(file_type=suffix[1:])
     assert isinstance(contents, bytes | str)  # not a dict, as for other formats

@@ -37,7 +37,8 @@ class Reflectance(NamedTuple):
     roughness
         Roughness of the specular lobe, 0 to 1, (n,); 1 for smoke.
     specular
-        Weight of the specular lobe, 0 to 1, (n,); 0 for smoke.
+        Weight of the specular lobe in linear RGB, 0 to 1, (n, 3); 0 for smoke. It is the reflectance at normal
+        incidence of fields that are trained with a Fresnel effect.
     """
 
     normal: Array
@@ -217,8 +218,8 @@ class Field:
     def reflectance(self, points: ArrayLike) -> Reflectance:
         """Return normal, albedo, roughness and specular weight at `points`. They mean nothing where density is 0."""
         normal, albedo, roughness, specular = self._grid.reflectance(self._frame.point_to_field(_vectors(points)))
-        world = self._frame.direction_to_world(normal)
-        return Reflectance(*(_like(points, value) for value in (world, mi.Color3f(*albedo), roughness, specular)))
+        values = self._frame.direction_to_world(normal), mi.Color3f(*albedo), roughness, mi.Color3f(*specular)
+        return Reflectance(*(_like(points, value) for value in values))
 
     def shape(self) -> dict[str, Any]:
         """Return the field as a shape for ``mi.load_dict``: a sphere without surface, filled by the ``nrf`` medium."""

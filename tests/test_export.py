@@ -90,7 +90,7 @@ def test_colours_are_the_albedo_in_srgb_and_roughness_is_the_fields(statue):
     np.testing.assert_allclose(stack(mesh, "red", "green", "blue"), 255 * shown, atol=0.51)
     assert (mesh["alpha"] == 255).all()
     assert list(mesh)[:6] == ["x", "y", "z", "nx", "ny", "nz"]
-    assert 0.05 < mesh["roughness"].min() and mesh["roughness"].max() <= 1 and 0 <= mesh["specular"].min()
+    assert 0.05 < mesh["roughness"].min() and mesh["roughness"].max() <= 1 and 0 <= mesh["specular_r"].min()
     np.testing.assert_allclose(np.linalg.norm(stack(mesh, "nx", "ny", "nz"), axis=1), 1, atol=1e-5)
 
 
@@ -109,7 +109,7 @@ def test_mitsuba_reads_vertices_normals_and_albedo(statue):
 
 
 def test_a_ball_of_known_density_and_reflectance_in_scene_units(tmp_path: Path):
-    header, tensors = fields.blobs([(0.1, 0, 0)], [0.5], log_density=3.0, roughness=0.5, specular=0.2,
+    header, tensors = fields.blobs([(0.1, 0, 0)], [0.5], log_density=3.0, roughness=0.5, specular=(0.2, 0.3, 0.1),
                                    albedo=(0.6, 0.5, 0.4), similarity=Similarity((1, 2, 3), 2.0))
     field_file.save(tmp_path / "f.safetensors", header, tensors, np.float32)
     export(tmp_path / "f.safetensors", tmp_path / "m.ply", resolution=96)
@@ -121,7 +121,8 @@ def test_a_ball_of_known_density_and_reflectance_in_scene_units(tmp_path: Path):
     albedo = stack(mesh, "albedo_r", "albedo_g", "albedo_b")
     np.testing.assert_allclose(albedo, np.broadcast_to([0.6, 0.5, 0.4], albedo.shape), atol=1e-3)
     np.testing.assert_allclose(mesh["roughness"], 0.5, atol=1e-3)
-    np.testing.assert_allclose(mesh["specular"], 0.2, atol=1e-3)
+    specular = stack(mesh, "specular_r", "specular_g", "specular_b")
+    np.testing.assert_allclose(specular, np.broadcast_to([0.2, 0.3, 0.1], specular.shape), atol=1e-3)
 
 
 @pytest.mark.parametrize("suffix", module.SUFFIXES)

@@ -82,7 +82,7 @@ def test_arrays_of_drjit_give_arrays_of_drjit(field):
 def test_reflectance_has_its_shapes_and_ranges(field):
     normal, albedo, roughness, specular = field.reflectance(points_of(field, 7))
     np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1, atol=1e-5)
-    assert albedo.shape == (7, 3) and roughness.shape == specular.shape == (7,)
+    assert albedo.shape == specular.shape == (7, 3) and roughness.shape == (7,)
     assert all(((0 <= values) & (values <= 1)).all() for values in (albedo, roughness, specular))
 
 

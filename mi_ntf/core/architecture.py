@@ -3,7 +3,7 @@
 A field has three or four networks, each an encoding followed by a ReLU multilayer perceptron:
 
     density        x → 1        raw; σ = exp(raw), see :data:`MAX_LOG_DENSITY`; 1/(unit-sphere radius)
-    reflectance    x → 8        raw normal (3), albedo (3), roughness (1), specular weight (1)
+    reflectance    x → 7 + c    raw normal (3), albedo (3), roughness (1), specular weight (c = 1 or 3, a colour)
     transmittance  ray → 3K−1   raw (a, b) of K logistics, then K−1 weights; :mod:`mi_ntf.core.mixture`
     visibility     x, ω → 1     raw τ, through a sigmoid, of the ray from x towards the light; optional
 
@@ -73,9 +73,9 @@ class Network:
         """Return the number of inputs of the network called `name`."""
         return self.encoding.width(6 if name in ("transmittance", "visibility") else 3)
 
-    def outputs(self, name: str) -> int:
+    def outputs(self, name: str, specular_channels: int = 1) -> int:
         """Return the number of outputs of the network called `name`."""
-        return {"density": 1, "reflectance": 8, "transmittance": 3 * self.components - 1,
+        return {"density": 1, "reflectance": 7 + specular_channels, "transmittance": 3 * self.components - 1,
                 "visibility": 1}[name]
 
 
@@ -92,6 +92,8 @@ class Architecture:
     phase: float | None = None
     """Asymmetry g of smoke, which scatters by :mod:`mi_ntf.core.henyey_greenstein`; None: a surface's reflectance.
     Smoke has no normal and no specular lobe: the reflectance network's albedo alone counts."""
+    specular_channels: int = 1
+    """Channels of the specular weight: 3 for linear RGB, as metals need it; 1 for a grey one."""
 
     @property
     def least_specular(self) -> float:
@@ -110,7 +112,7 @@ class Architecture:
             if net.encoding.kind == "planes":
                 for i, r in enumerate(net.encoding.resolutions):
                     shapes[f"{name}.planes.{i}"] = (3, r, r, net.encoding.channels)
-            sizes = [net.inputs(name), *net.hidden, net.outputs(name)]
+            sizes = [net.inputs(name), *net.hidden, net.outputs(name, self.specular_channels)]
             for i, (n_in, n_out) in enumerate(pairwise(sizes)):
                 shapes[f"{name}.layers.{i}.weight"] = (n_out, n_in)
                 shapes[f"{name}.layers.{i}.bias"] = (n_out,)
@@ -153,6 +155,9 @@ def header_from_json(data: object, source: str) -> Header:
         phase = described.get("phase")  # likewise
         if phase is not None and not abs(number(phase, "the asymmetry of the phase function")) < 1:
             raise ValueError(f"the asymmetry of the phase function is {shown(phase)}, expected -1 to 1, exclusive")
+        channels = described.get("specular_channels", 1)  # likewise
+        if channels not in (1, 3) or isinstance(channels, bool):
+            raise ValueError(f"the specular weight has {shown(channels)} channels, expected 1 or 3")
         similarity = member(data, "similarity", dict)
         center = member(similarity, "center", list)
         if len(center) != 3:
@@ -160,7 +165,8 @@ def header_from_json(data: object, source: str) -> Header:
         x, y, z = (number(c, "the similarity's center") for c in center)
         radius = number(member(similarity, "radius", object), "the similarity's radius", above=0)
         provenance = member({"provenance": {}} | data, "provenance", dict)
-        return Header(Architecture(**nets, fresnel=fresnel, phase=phase), Similarity((x, y, z), radius), provenance)
+        architecture = Architecture(**nets, fresnel=fresnel, phase=phase, specular_channels=int(channels))
+        return Header(architecture, Similarity((x, y, z), radius), provenance)
     except ValueError as error:
         raise MiNtfError(f"{source}: the header's description is incomplete or wrong: {error}; "
                          "was it written by `mi-ntf train`?") from None

@@ -62,19 +62,19 @@ def density(arch: Architecture, tensors: Tensors, x: np.ndarray) -> np.ndarray:
 
 
 def reflectance(arch: Architecture, tensors: Tensors, x: np.ndarray) -> np.ndarray:
-    """Return unit normal, albedo, roughness and specular weight, (n, 8).
+    """Return unit normal, albedo, roughness and specular weight, (n, 7 + ``arch.specular_channels``).
 
     The albedo lies in [0, 1], the roughness in [MIN_ROUGHNESS, 1], the weight in [``arch.least_specular``, 1]. Smoke
     has the normal 0, the roughness 1 and the weight 0.
     """
     raw = perceptron(tensors, "reflectance", encode(arch.reflectance.encoding, tensors, "reflectance", x))
     if arch.phase is not None:
-        rest = np.tile([1.0, 0.0], (len(raw), 1))
+        rest = np.tile([1.0] + [0.0] * arch.specular_channels, (len(raw), 1))
         return np.concatenate([np.zeros((len(raw), 3)), logistic.sigmoid(ops, raw[:, 3:6]), rest], axis=1)
     normal = np.stack(ops.normalize(ops, tuple(raw[:, :3].T)), axis=1)
     rest = logistic.sigmoid(ops, raw[:, 3:])
-    for column, least in ((3, MIN_ROUGHNESS), (4, arch.least_specular)):
-        rest[:, column] = least + (1 - least) * rest[:, column]
+    for columns, least in ((slice(3, 4), MIN_ROUGHNESS), (slice(4, None), arch.least_specular)):
+        rest[:, columns] = least + (1 - least) * rest[:, columns]
     return np.concatenate([normal, rest], axis=1)
 
 

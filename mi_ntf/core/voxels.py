@@ -4,7 +4,8 @@ The file is one ``.safetensors`` as that of a trained field. Its arrays are thos
 :class:`mi_ntf.infer.bricks.Bricks`, under two prefixes:
 
     density.*       one channel: extinction σ, linear, 1/scene unit
-    reflectance.*   3 channels: albedo; or 8: normal (3), albedo (3), roughness, specular weight; optional with `phase`
+    reflectance.*   3 channels: albedo; optional with `phase`
+                    8 or 10: normal (3), albedo (3), roughness, specular weight (1 or 3)
 
 Both are trilinear between the centres of their voxels, which fill the same box, and continue to its faces with the
 values of the nearest centre, as in Mitsuba's ``gridvolume``.
@@ -51,7 +52,7 @@ class Voxels:
     reflectance_counts
         Number of voxels of the reflectance along each axis; None: there is none, and `albedo` holds everywhere.
     phase
-        Asymmetry g of the Henyey-Greenstein phase function; None: matter reflects as a surface (8 channels).
+        Asymmetry g of the Henyey-Greenstein phase function; None: matter reflects as a surface (8 or 10 channels).
     albedo
         Single-scattering albedo, linear RGB, 0 to 1, where the file has no reflectance.
     emissive
@@ -116,8 +117,8 @@ def save(path: str | Path, header: Voxels, density: Tensors, reflectance: Tensor
     header
         Box, number of voxels, phase function and origin.
     density, reflectance
-        Results of :func:`mi_ntf.infer.bricks.pack` or ``of_dense``: linear extinction in 1/scene unit, and 3 or 8
-        channels of reflectance.
+        Results of :func:`mi_ntf.infer.bricks.pack` or ``of_dense``: linear extinction in 1/scene unit, and 3, 8
+        or 10 channels of reflectance.
 
     Raises
     ------
@@ -167,9 +168,9 @@ def print_rest(description: Json) -> None:
 def check(source: str, header: Voxels, arrays: Tensors) -> None:
     """Raise MiNtfError unless `arrays` are those of bricks, as many and as wide as `header` says."""
     voxels_from_json(json.loads(json.dumps(header.to_json())), source)
-    parts = {"density": (header.counts, (1,))}
+    parts: dict[str, tuple[Counts, tuple[int, ...]]] = {"density": (header.counts, (1,))}
     if header.reflectance_counts is not None:
-        parts["reflectance"] = header.reflectance_counts, (3,) if header.phase is not None else (8,)
+        parts["reflectance"] = header.reflectance_counts, (3,) if header.phase is not None else (8, 10)
     expected = [f"{part}.{name}" for part in parts for name in ARRAYS]
     faults = [f"missing array {name}" for name in expected if name not in arrays]
     faults += [f"unknown array {name[:80]}" for name in arrays if name not in expected]

@@ -21,6 +21,8 @@ SURVEY = 192
 """Largest number of voxels per side of the first, dense sampling. Bricks are sampled only near its density."""
 REFLECTANCE_RESOLUTION = 128
 """Largest number of voxels per side of reflectance and of softness."""
+CHANNELS = 10
+"""Channels of a reflectance: normal (3), albedo (3), roughness, specular weight (3)."""
 PART = 1 << 20
 """Number of points that are evaluated together, which bounds the memory."""
 Progress: TypeAlias = Callable[[float], None]
@@ -34,7 +36,7 @@ def bake(field: NetworkField, resolution: int, dj: ModuleType,
     Names with a dot are arrays of :class:`mi_ntf.infer.bricks.Bricks`. ``density`` holds ln σ, since the networks' own
     σ is the exponential of a smooth function. Its voxels hold the coefficients f − f″/12 along each axis, between which
     trilinear interpolation is right on average (Condat and Möller 2011, quasi-interpolation); none exceeds the highest
-    sample. ``reflectance``, only of fields with a slow network, has the 8 channels of :func:`flat`. ``hull`` (k, 3):
+    sample. ``reflectance``, only of fields with a slow network, has the channels of :func:`flat`. ``hull`` (k, 3):
     points whose convex hull holds all density. ``numbers``: upper bound of the density; highest specular lobe,
     s/(4 α²), at a voxel with matter. `progress` receives about the fraction of the time.
     """
@@ -47,13 +49,13 @@ def bake(field: NetworkField, resolution: int, dj: ModuleType,
     del values
     progress(0.7)
     index = np.flatnonzero(matter)
-    matter_reflectance = at_voxels(lambda p: flat(field.reflectance(p)), 8, index, coarse, dj)
-    gloss = float((matter_reflectance[:, 7] / (4 * matter_reflectance[:, 6] ** 4)).max(initial=0.0))
+    matter_reflectance = at_voxels(lambda p: flat(field.reflectance(p)), CHANNELS, index, coarse, dj)
+    gloss = float((matter_reflectance[:, 7:] / (4 * matter_reflectance[:, 6:7] ** 4)).max(initial=0.0))
     if not field.quick:
         near = np.flatnonzero(grown(matter))
-        dense = np.zeros((coarse**3, 8), np.float32)
-        dense[near] = at_voxels(lambda p: flat(field.reflectance(p)), 8, near, coarse, dj)
-        result |= _named("reflectance", bricks.of_dense(dense.reshape(coarse, coarse, coarse, 8), matter))
+        dense = np.zeros((coarse**3, CHANNELS), np.float32)
+        dense[near] = at_voxels(lambda p: flat(field.reflectance(p)), CHANNELS, near, coarse, dj)
+        result |= _named("reflectance", bricks.of_dense(dense.reshape(coarse, coarse, coarse, CHANNELS), matter))
     return result | {"hull": support_points(ends, resolution), "numbers": np.array([majorant, gloss])}
 
 
@@ -120,9 +122,9 @@ def at_voxels(function: Callable[[Vector], Sequence[Float]], count: int, index: 
 
 
 def flat(reflectance: Reflected) -> list[Float]:
-    """Return a reflectance as 8 channels."""
+    """Return a reflectance as ``CHANNELS`` channels."""
     normal, albedo, roughness, specular = reflectance
-    return [*normal, *albedo, roughness, specular]
+    return [*normal, *albedo, roughness, *specular]
 
 
 def _outline(places: np.ndarray, values: np.ndarray, n: int, coarse: int) -> tuple[np.ndarray, np.ndarray]:

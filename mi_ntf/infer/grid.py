@@ -10,7 +10,7 @@ from ..core.ops import normalize
 from . import ops
 from .bake import bake
 from .bricks import Bricks
-from .network import NOTHING, NetworkField, cut, density_of, inside
+from .network import NOTHING, NetworkField, coloured, cut, density_of, inside
 from .types import Float, Place, Reflected, Vector
 
 
@@ -78,7 +78,7 @@ class GridField(InSphere):
         self.majorant, self.gloss = map(float, arrays["numbers"])
         self.hull = arrays["hull"]
         channels = 8 if self._reflectance is None else self._reflectance.channels
-        if (self.hull.shape[1:], channels) != ((3,), 8) or not np.isfinite(self.hull).all():
+        if self.hull.shape[1:] != (3,) or channels not in (8, 10) or not np.isfinite(self.hull).all():
             raise ValueError("these arrays are no baked field")
         self.bounds = self.hull.min(0), self.hull.max(0)
 
@@ -100,7 +100,7 @@ class GridField(InSphere):
         if self._reflectance is None:
             return self._field.reflectance(p)
         v = self._reflectance.at(self._reflectance.place(p))
-        return normalize(ops, tuple(v[:3])), tuple(v[3:6]), v[6], v[7]
+        return normalize(ops, tuple(v[:3])), tuple(v[3:6]), v[6], coloured(v[7:])
 
 
 class NetworkVolume(InSphere):

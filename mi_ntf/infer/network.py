@@ -1,7 +1,7 @@
 """The field as its networks, in Dr.Jit: the twin of :mod:`mi_ntf.core.reference` (conventions there)."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import TypeAlias
 
@@ -46,6 +46,11 @@ def density_of(log_sigma: Float) -> Float:
     return dr.select(log_sigma > NOTHING, dr.exp(log_sigma), 0)
 
 
+def coloured(values: Sequence[Float]) -> Vector:
+    """Return one or three channels as linear RGB."""
+    return tuple(values) if len(values) == 3 else (values[0],) * 3
+
+
 class NetworkField:
     """Density, reflectance and ray transmittance of one field, evaluated by its networks.
 
@@ -79,11 +84,12 @@ class NetworkField:
         raw = self._reflectance.layers(self._reflectance.encode(p))
         if self._smoke:
             zero, one = dr.zeros(type(raw[3]), dr.width(raw[3])), dr.ones(type(raw[3]), dr.width(raw[3]))
-            return (zero, zero, zero), tuple(logistic.sigmoid(ops, v) for v in raw[3:6]), one, zero
+            return (zero, zero, zero), tuple(logistic.sigmoid(ops, v) for v in raw[3:6]), one, (zero, zero, zero)
         normal = normalize(ops, tuple(raw[:3]))
-        r, g, b, rough, spec = (logistic.sigmoid(ops, v) for v in raw[3:])
+        r, g, b, rough, *weight = (logistic.sigmoid(ops, v) for v in raw[3:])
         least = self._least_specular
-        return normal, (r, g, b), MIN_ROUGHNESS + (1 - MIN_ROUGHNESS) * rough, least + (1 - least) * spec
+        specular = coloured([least + (1 - least) * value for value in weight])
+        return normal, (r, g, b), MIN_ROUGHNESS + (1 - MIN_ROUGHNESS) * rough, specular
 
     def visibility(self, p: Vector, d: Vector) -> Float:
         """Return τ from `p` along the unit directions `d` towards the light, by a query of the baseline's network."""

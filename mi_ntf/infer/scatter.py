@@ -23,8 +23,8 @@ def evaluate(wi: Vector, wo: Vector, reflectance: Reflectance) -> tuple[Vector, 
         phase, pdf = lobe.evaluate(wi, wo)
         return tuple(k * c for k, c in zip(albedo, phase, strict=True)), pdf
     diffuse, glossy = microfacet.scattering(ops, wi, wo, normal, roughness, softness)
-    diffuse_weight, specular_weight = fresnel.weights(ops, wi, wo, normal, roughness, specular, rim)
-    value = tuple(diffuse_weight * k * diffuse + specular_weight * glossy for k in albedo)
+    weights = [fresnel.weights(ops, wi, wo, normal, roughness, s, rim) for s in specular]
+    value = tuple(k * w * diffuse + s * glossy for k, (w, s) in zip(albedo, weights, strict=True))
     half = normalize(ops, tuple(a + b for a, b in zip(wi, wo, strict=True)))
     cos_h = dr.maximum(dot(normal, half), 0)
     across = cross(normal, half)
@@ -64,8 +64,9 @@ def _specular_chance(wo: Vector, reflectance: Reflectance) -> tuple[Float, Float
     """
     normal, albedo, specular = reflectance.normal, reflectance.albedo, reflectance.specular
     above = dr.maximum(dot(normal, wo), 0)
-    diffuse = (1 - specular) * (albedo[0] + albedo[1] + albedo[2]) / 3
-    chance = dr.clip(specular / dr.maximum(specular + diffuse, 1e-6), 0.1, 0.9)
+    diffuse = sum((1 - s) * k for s, k in zip(specular, albedo, strict=True))
+    gloss = sum(specular)
+    chance = dr.clip(gloss / dr.maximum(gloss + diffuse, 1e-6), 0.1, 0.9)
     return dr.select(above > 0, chance, 0), above
 
 

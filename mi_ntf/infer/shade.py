@@ -27,15 +27,15 @@ class Lobe(Protocol):
 class Reflectance(NamedTuple):
     """Reflectance of field points: ranges as in :mod:`mi_ntf.core.microfacet`, softness as in :mod:`mi_ntf.core.skin`.
 
-    `fresnel`: the specular weight is that at normal incidence (:mod:`mi_ntf.core.fresnel`). `lobe`: a phase function
-    that is weighted by the albedo, in place of normal, roughness and specular weight. `emission`: emitted radiance of
-    matter that reflects nothing.
+    `specular`: weight of the specular lobe, linear RGB. `fresnel`: it is that at normal incidence
+    (:mod:`mi_ntf.core.fresnel`). `lobe`: a phase function that is weighted by the albedo, in place of normal, roughness
+    and specular weight. `emission`: emitted radiance of matter that reflects nothing.
     """
 
     normal: Vector
     albedo: Vector
     roughness: Float
-    specular: Float
+    specular: Vector
     softness: Float
     fresnel: bool = False
     lobe: Lobe | None = None
@@ -43,7 +43,8 @@ class Reflectance(NamedTuple):
 
     def diffuse_albedo(self) -> list[Float]:
         """Return the linear RGB albedo of a diffuse surface that reflects as much of uniform light."""
-        return [fresnel.diffuse_albedo(ops, k, self.roughness, self.specular, self.fresnel) for k in self.albedo]
+        return [fresnel.diffuse_albedo(ops, k, self.roughness, s, self.fresnel)
+                for k, s in zip(self.albedo, self.specular, strict=True)]
 
 
 class Points:
@@ -152,6 +153,5 @@ def _value(wi: Vector, points: Points, skin: bool, specular: bool) -> tuple[Mask
     diffuse, glossy = (
         microfacet.scattering(ops, *direction, points.softness) if skin else microfacet.lobes(ops, *direction)
     )
-    diffuse_weight, specular_weight = fresnel.weights(ops, *direction, points.specular, points.reflectance.fresnel)
-    diffuse_part, glossy = diffuse_weight * diffuse, specular_weight * glossy
-    return diffuse > 0, [k * diffuse_part + glossy for k in points.albedo]
+    weights = [fresnel.weights(ops, *direction, s, points.reflectance.fresnel) for s in points.specular]
+    return diffuse > 0, [k * w * diffuse + s * glossy for k, (w, s) in zip(points.albedo, weights, strict=True)]

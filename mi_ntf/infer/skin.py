@@ -9,7 +9,7 @@ from ..core import skin
 from ..core.ops import dot
 from . import ops
 from .backend import floats
-from .bake import REFLECTANCE_RESOLUTION, Progress, at_voxels, flat
+from .bake import REFLECTANCE_RESOLUTION, Progress, at_voxels
 from .bricks import of_dense
 from .bundle import density_where, onward, safe_inverse
 from .grid import Density, GridField, bricks_of
@@ -61,7 +61,7 @@ def _measure(grid: Density, n: int, dj: ModuleType, progress: Progress) -> tuple
     solid = 0.0
     result, known = np.zeros((n, n, n), np.float32), np.zeros((n, n, n), bool)
     index = np.flatnonzero(_occupied(grid, n, dj))
-    normals = at_voxels(lambda p: flat(grid.reflectance(p)), 8, index, n, dj)[:, :3]
+    normals = at_voxels(lambda p: list(grid.reflectance(p)[0]), 3, index, n, dj)
 
     def depth(directions: np.ndarray, limit: float) -> np.ndarray:
         """Return the optical depths from the voxels `index` along the `directions` (k, 3)."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..core.architecture import LOG_FLOOR, MAX_LOG_DENSITY
 from ..core.errors import MiNtfError
-from .bake import Progress, sampled_bricks
+from .bake import CHANNELS, Progress, flat, sampled_bricks
 from .bricks import SIDE
 from .network import NetworkField
 from .types import Array
@@ -37,8 +37,8 @@ PART = 1 << 18
 class Surface:
     """A surface in the coordinates of the field.
 
-    `level`: its σ; `vertices`, `normals`, `albedo` (V, 3), the last linear RGB; `roughness`, `specular` (V,); `faces`
-    (F, 3), counter-clockwise seen from outside.
+    `level`: its σ; `vertices`, `normals`, `albedo` (V, 3), the last linear RGB; `roughness` (V,);
+    `specular` (V, 3), the weight of the specular lobe, linear RGB; `faces` (F, 3), counter-clockwise seen from outside.
     """
 
     level: float
@@ -123,23 +123,22 @@ def _reflectance(field: NetworkField, vertices: np.ndarray, normals: np.ndarray,
 
     They are means weighted by opacity, as in rendering.
     """
-    result = np.empty((len(vertices), 8), np.float32)
+    result = np.empty((len(vertices), CHANNELS), np.float32)
     for first in range(0, len(vertices), PART):
         progress(first / len(vertices))
         part = slice(first, first + PART)
         p, n = (tuple(dj.Float(np.ascontiguousarray(column, np.float32)) for column in array[part].T)
                 for array in (vertices, normals))
-        clear, sums = dj.Float(1), [dj.Float(0) for _ in range(8)]
+        clear, sums = dj.Float(1), [dj.Float(0) for _ in range(CHANNELS)]
         for depth in np.arange(-BEFORE, BEHIND, STEP) + STEP / 2:
             at = tuple(c - dr.opaque(dj.Float, float(depth)) * m for c, m in zip(p, n, strict=True))
             after = clear * dr.exp(-STEP * field.density(at))
-            normal, albedo, roughness, specular = field.reflectance(at)
-            sums = [s + (clear - after) * v for s, v in zip(sums, (*normal, *albedo, roughness, specular), strict=True)]
+            sums = [s + (clear - after) * v for s, v in zip(sums, flat(field.reflectance(at)), strict=True)]
             clear = after
             dr.eval(clear, sums)
         weight = dr.maximum(1 - clear, 1e-6)
         result[part] = np.stack([(s / weight).numpy() for s in sums], axis=1)
-    return _outward(result[:, :3], normals), result[:, 3:6], result[:, 6], result[:, 7]
+    return _outward(result[:, :3], normals), result[:, 3:6], result[:, 6], result[:, 7:]
 
 
 def _outward(normals: np.ndarray, geometric: np.ndarray) -> np.ndarray:

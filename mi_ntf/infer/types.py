@@ -17,8 +17,8 @@ Color3: TypeAlias = Array
 Ray: TypeAlias = Array
 Place: TypeAlias = tuple[Array, ...]
 """Points as a density prepares them for lookups (:class:`mi_ntf.infer.grid.Density`)."""
-Reflected: TypeAlias = tuple[Vector, Vector, Float, Float]
-"""Normal, albedo, roughness and specular weight; ranges as in :func:`mi_ntf.core.reference.reflectance`."""
+Reflected: TypeAlias = tuple[Vector, Vector, Float, Vector]
+"""Normal, albedo, roughness, specular weight (linear RGB); ranges as in :func:`mi_ntf.core.reference.reflectance`."""
 
 __all__ = ["Array", "Color3", "Float", "Mask", "Place", "Ray", "Reflected", "UInt32", "Vector", "Vector3", "Visibility"]
 

@@ -13,13 +13,13 @@ from ..core.voxels import ARRAYS, Voxels
 from . import bricks, ops
 from .convex import Convex, box
 from .grid import bricks_of
-from .network import NOTHING, density_of
+from .network import NOTHING, coloured, density_of
 from .types import Float, Place, Reflected, Vector
 
 FAINTEST = 1e-20
 """Extinction, 1/(unit-sphere radius), below which there is no matter."""
 ROUGHNESS, SPECULAR = 6, 7
-"""Channels of a surface's reflectance after its normal and its albedo."""
+"""First channels of a surface's reflectance after its normal and its albedo; the specular weight has one or three."""
 DIRECTIONS = 1200
 """Number of directions along which the furthest points of the matter make its hull."""
 
@@ -134,12 +134,13 @@ class VoxelVolume:
         width = dr.width(p[0])
         zero, one = dr.zeros(type(p[0]), width), dr.ones(type(p[0]), width)
         if self._reflectance is None:
-            return (zero, zero, zero), tuple(one * value for value in self._albedo), one, zero
+            return (zero, zero, zero), tuple(one * value for value in self._albedo), one, (zero, zero, zero)
         values = self._reflectance.bricks.at(self._reflectance.place(p))
         if len(values) == 3:
-            return (zero, zero, zero), tuple(values), one, zero
+            return (zero, zero, zero), tuple(values), one, (zero, zero, zero)
         normal = normalize(ops, tuple(values[:3]))
-        return normal, tuple(values[3:6]), dr.maximum(values[ROUGHNESS], MIN_ROUGHNESS), values[SPECULAR]
+        roughness = dr.maximum(values[ROUGHNESS], MIN_ROUGHNESS)
+        return normal, tuple(values[3:6]), roughness, coloured(values[SPECULAR:])
 
     def place(self, p: Vector) -> Place:
         """Return the places of `p` in the bricks and in the body."""
@@ -183,9 +184,10 @@ def _highest(ranges: np.ndarray) -> float:
 def _gloss(arrays: dict[str, np.ndarray]) -> float:
     """Return the highest specular lobe, s/(4 α²), of a surface's reflectance; 0 if there is none."""
     ranges = arrays.get("reflectance.range", np.zeros((2, 0)))
-    if ranges.shape[1] <= SPECULAR or not _channel(arrays, SPECULAR).any():
+    weights = [_channel(arrays, channel) for channel in range(SPECULAR, ranges.shape[1])]
+    if not any(weight.any() for weight in weights):
         return 0.0
-    roughness, specular = _channel(arrays, ROUGHNESS), _channel(arrays, SPECULAR)
+    roughness, specular = _channel(arrays, ROUGHNESS), np.max(weights, axis=0)
     gloss: np.ndarray = specular / (4 * np.maximum(roughness, MIN_ROUGHNESS) ** 4)
     return float(gloss[roughness > 0].max(initial=0.0))
 

@@ -154,7 +154,8 @@ def configured(preset: str, *, ntf: str | None = None, augmentation: bool = True
     config = replace(PRESETS[preset], augmentation=augmentation, colour_loss=colour_loss)
     architecture = config.architecture
     if isinstance(config, FastConfig):
-        architecture = replace(architecture, fresnel=fresnel and smoke is None)
+        fresnel &= smoke is None
+        architecture = replace(architecture, fresnel=fresnel, specular_channels=3 if fresnel else 1)
         config = replace(config, bounces=bounces, gains=gains)
     architecture = replace(architecture, phase=smoke)
     if ntf is not None:

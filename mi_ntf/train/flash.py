@@ -85,7 +85,7 @@ class Flash:
             smoke: torch.Tensor = (weight * scattered)[:, None] * albedo * light / distance**2
             return smoke
         wi, wo, n = toward.unbind(1), (-d).unbind(1), normal.unbind(1)
-        diffuse_weight, gloss_weight = fresnel.weights(ops, wi, wo, n, roughness, specular, rim)
+        diffuse_weight, gloss_weight = fresnel.weights(ops, wi, wo, n, roughness, specular.T, rim)
         if self.solid:
             diffuse, glossy = microfacet.lobes(ops, wi, wo, n, roughness)
             with torch.no_grad():
@@ -96,7 +96,7 @@ class Flash:
         else:
             diffuse, glossy = microfacet.scattering(ops, wi, wo, n, roughness)
             weight = torch.exp(-optical.front) * -torch.expm1(-optical.depth) * self.reaching(view, x)
-        lobe: torch.Tensor = (diffuse_weight * diffuse)[:, None] * albedo + (gloss_weight * glossy)[:, None]
+        lobe: torch.Tensor = (diffuse_weight * diffuse).T * albedo + (gloss_weight * glossy).T
         return weight[:, None] * lobe * light / distance**2
 
     @torch.no_grad()

@@ -58,9 +58,10 @@ def gloss(image: Image, least: float, fading: float, count: int) -> torch.Tensor
     only the diffuse one is right. Only sharp lobes explain sharp highlights, so their cost may fade during training.
     Vanishing weights cost (FAINT − ln s)²/10. `count` is the number of rays.
     """
-    roughness, specular = image.reflectance.roughness, image.reflectance.specular
-    specular = (specular - least) / (1 - least)
-    lost = torch.relu(FAINT - specular.clamp(min=1e-30).log()).square()
+    roughness = image.reflectance.roughness
+    specular = (image.reflectance.specular - least) / (1 - least)
+    lost = torch.relu(FAINT - specular.clamp(min=1e-30).log()).square().mean(1)
+    specular = specular.mean(1)
     return (image.weight.detach() * (specular * (fading + ROUGH * roughness**8) + 0.1 * lost)).sum() / count
 
 

@@ -35,15 +35,14 @@ class Reflectance(NamedTuple):
     normal: torch.Tensor  # Unit normals (n, 3)
     albedo: torch.Tensor  # (n, 3)
     roughness: torch.Tensor  # (n,)
-    specular: torch.Tensor  # Specular weights (n,)
+    specular: torch.Tensor  # Specular weights (n, 1) or, linear RGB, (n, 3)
 
     def diffuse_albedo(self, rim: bool) -> torch.Tensor:
         """Return the albedo (n, 3) of diffuse surfaces that reflect the same fraction of uniform light.
 
         `rim` is true if the field has a Fresnel term.
         """
-        albedo: torch.Tensor = fresnel.diffuse_albedo(ops, self.albedo, self.roughness[:, None],
-                                                      self.specular[:, None], rim)
+        albedo: torch.Tensor = fresnel.diffuse_albedo(ops, self.albedo, self.roughness[:, None], self.specular, rim)
         return albedo
 
 
@@ -79,11 +78,11 @@ class Networks:
         raw = perceptron(self.tensors, "reflectance", features)
         if self.phase is not None:
             zero = raw.new_zeros(len(raw))
-            return Reflectance(raw.new_zeros(len(raw), 3), torch.sigmoid(raw[:, 3:6]), zero + 1, zero)
+            return Reflectance(raw.new_zeros(len(raw), 3), torch.sigmoid(raw[:, 3:6]), zero + 1, 0 * raw[:, 7:])
         rest = torch.sigmoid(raw[:, 3:])
         roughness = MIN_ROUGHNESS + (1 - MIN_ROUGHNESS) * rest[:, 3]
         least = self.architecture.least_specular
-        specular = least + (1 - least) * rest[:, 4]
+        specular = least + (1 - least) * rest[:, 4:]
         return Reflectance(F.normalize(raw[:, :3], dim=1, eps=1e-10), rest[:, :3], roughness, specular)
 
     def ray_mixture(self, o: torch.Tensor, d: torch.Tensor, profile: torch.Tensor
@@ -253,7 +252,7 @@ def initial(architecture: Architecture, log_density: float, generator: torch.Gen
         tensors[f"{name}.layers.{len(net.hidden)}.weight"] *= 0.1
     tensors[f"density.layers.{len(architecture.density.hidden)}.bias"] += log_density
     lobe = tensors[f"reflectance.layers.{len(architecture.reflectance.hidden)}.bias"][6:]
-    lobe += torch.tensor([INITIAL_ROUGHNESS_LOGIT, INITIAL_SPECULAR_LOGIT])
+    lobe += torch.tensor([INITIAL_ROUGHNESS_LOGIT] + [INITIAL_SPECULAR_LOGIT] * architecture.specular_channels)
     return Networks(architecture, {k: v.requires_grad_() for k, v in tensors.items()})
 
 

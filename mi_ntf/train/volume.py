@@ -125,8 +125,8 @@ def shade(reflectance: Reflectance, d: torch.Tensor, t: torch.Tensor, light: tor
     normal, albedo, roughness, specular = reflectance
     cos = -(normal * d).sum(1)
     diffuse, glossy = microfacet.lobes_collocated(ops, cos, roughness)
-    diffuse_weight, gloss_weight = fresnel.weights_collocated(ops, cos, roughness, specular, rim)
-    lobe: torch.Tensor = (diffuse_weight * diffuse)[:, None] * albedo + (gloss_weight * glossy)[:, None]
+    diffuse_weight, gloss_weight = fresnel.weights_collocated(ops, cos, roughness, specular.T, rim)
+    lobe: torch.Tensor = (diffuse_weight * diffuse).T * albedo + (gloss_weight * glossy).T
     return SURFACE * lobe * light / (t * t)[:, None]
 
 

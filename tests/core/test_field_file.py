@@ -104,8 +104,23 @@ def test_fields_with_a_visibility_network_and_fresnel_effect_and_old_ones_withou
     header, actual = field_file.load(tmp_path / "f")
     assert header.architecture == both and set(actual) == set(tensors)
     old = Header(SMALL).to_json()
-    del old["architecture"]["visibility"], old["architecture"]["fresnel"], old["architecture"]["phase"]
+    for name in ("visibility", "fresnel", "phase", "specular_channels"):
+        del old["architecture"][name]
     assert header_from_json(json.loads(json.dumps(old)), "old").architecture == SMALL
+
+
+def test_a_coloured_specular_weight_has_three_outputs_and_a_grey_one_has_one(tmp_path):
+    colour = dataclasses.replace(SMALL, fresnel=True, specular_channels=3)
+    outputs = [arch.skeleton()[f"reflectance.layers.{len(arch.reflectance.hidden)}.bias"] for arch in (SMALL, colour)]
+    assert outputs == [(8,), (10,)]
+    field_file.save(tmp_path / "f", Header(colour), make_tensors(colour))
+    assert field_file.load(tmp_path / "f")[0].architecture == colour
+    with pytest.raises(MiNtfError, match="does not match its architecture"):
+        field_file.save(tmp_path / "g", Header(colour), make_tensors(SMALL))
+    data = json.loads(json.dumps(Header(colour).to_json()))
+    data["architecture"]["specular_channels"] = 2
+    with pytest.raises(MiNtfError, match="the specular weight has 2 channels, expected 1 or 3"):
+        header_from_json(data, "f")
 
 
 def test_the_phase_function_of_smoke_survives_json():

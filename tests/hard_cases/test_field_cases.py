@@ -193,7 +193,7 @@ def _drjit(header, tensors, name, x):
         values = [dr.exp(network.log_density(p))]
     else:
         _, albedo, roughness, specular = network.reflectance(p)
-        values = [*albedo, roughness, specular]
+        values = [*albedo, roughness, *specular[:1]]
     dr.backward(sum(dr.sum(v) for v in values))
     return [np.array(v) for v in values], [np.array(dr.grad(c)) for c in p]
 
@@ -207,6 +207,6 @@ def _torch(header, tensors, name, x):
         values = model.density(p)[None]
     else:
         _, albedo, roughness, specular = model.reflectance(p)
-        values = torch.stack([*albedo.T, roughness, specular])
+        values = torch.stack([*albedo.T, roughness, *specular.T])
     values.sum().backward()
     return values.detach().numpy(), bias.grad.numpy()

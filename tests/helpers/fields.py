@@ -45,8 +45,9 @@ def blobs(
     """Opaque balls: ln σ rises from −12 to `log_density` over about radius/`edge`.. around each radius. Normals point
     away from the origin. At most 8 balls; a ball is the level set of a Gaussian, which the three planes' product holds
     exactly. `visibility`: with the baseline's network, too, whose τ is anything between 0 and 1 and smooth. `fresnel`:
-    `specular` is the normal reflectance. `phase`: asymmetry of smoke."""
-    arch = replace(architecture(components, visibility), fresnel=fresnel, phase=phase)
+    `specular` is the normal reflectance, a number or three of a colour. `phase`: asymmetry of smoke."""
+    weight = np.atleast_1d(specular)
+    arch = replace(architecture(components, visibility), fresnel=fresnel, phase=phase, specular_channels=len(weight))
     t = {k: np.zeros(s) for k, s in arch.skeleton().items()}
     u, v = _axes()
     for i, (c, r) in enumerate(zip(centers, radii, strict=True)):
@@ -66,7 +67,7 @@ def blobs(
         t["density.layers.0.bias"][8 + i] = t["density.layers.0.bias"][i] - span
         t["density.layers.1.weight"][0, 8 + i] = -1
     least = arch.least_specular
-    _outward_reflectance(t, albedo, roughness, (specular - least) / (1 - least))
+    _outward_reflectance(t, albedo, roughness, (weight - least) / (1 - least))
     for name, scale in (("transmittance", 0.5), ("visibility", 0.3)):
         rng = np.random.default_rng(0)
         for k in t:
@@ -86,7 +87,7 @@ def _outward_reflectance(t, albedo, roughness, specular) -> None:
         w1[i, 2 * i], w1[i, 2 * i + 1] = 1, -1
     b1[3:6] = [_logit(a) for a in albedo]
     b1[6] = _logit((roughness - MIN_ROUGHNESS) / (1 - MIN_ROUGHNESS))
-    b1[7] = _logit(specular)
+    b1[7:] = [_logit(s) for s in specular]
 
 
 def _slopes(t, x, y) -> None:

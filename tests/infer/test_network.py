@@ -15,7 +15,7 @@ from mi_ntf.core.architecture import LOG_FLOOR, Architecture, Encoding, Header, 
 from mi_ntf.core.depth_profile import LEVELS
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.infer import network as network_module
-from mi_ntf.infer.bake import support_points
+from mi_ntf.infer.bake import flat, support_points
 from mi_ntf.infer.grid import baked
 from mi_ntf.infer.network import CLEAR_DEPTH, MIN_DENSITY, NetworkField
 
@@ -23,11 +23,11 @@ HALF = VARIANT.startswith("cuda")
 SCENES = Path(__file__).parents[2] / "scenes"
 
 
-def random_field(rng, encoding=None):
+def random_field(rng, encoding=None, channels=3):
     encoding = encoding or Encoding("planes", (16, 32), 4)
     rays = Encoding("frequency", octaves=3)
     arch = Architecture(*(Network(encoding, (16, 24)) for _ in range(2)), Network(rays, (16, 24), components=2),
-                        Network(rays, (24, 16)), fresnel=True)
+                        Network(rays, (24, 16)), fresnel=True, specular_channels=channels)
     return Header(arch), {k: rng.normal(size=s) * 0.4 for k, s in arch.skeleton().items()}
 
 
@@ -83,7 +83,7 @@ def test_float16_of_cuda(case, rng, monkeypatch):
     assert_close(field.log_density(arrays(x)), np.log(truth), half=True)
     reflectance = reference.reflectance(header.architecture, tensors, x.astype(np.float32).astype(np.float64))
     normal, albedo, roughness, specular = field.reflectance(arrays(x))
-    for i, value in enumerate([*normal, *albedo, roughness, specular]):
+    for i, value in enumerate([*normal, *albedo, roughness, *specular]):
         assert_close(value, reflectance[:, i], half=True)
     header, tensors = fields.blobs([(0, 0, 0)], [0.5])
     for raw, sigma in ((1e30, np.exp(6.5)), (-1e30, np.exp(-12.0))):
@@ -97,7 +97,7 @@ def test_reflectance(case, rng):
     x = rng.uniform(-0.57, 0.57, (20000, 3))
     truth = reference.reflectance(header.architecture, tensors, x.astype(np.float32).astype(np.float64))
     normal, albedo, roughness, specular = NetworkField(header, tensors, mi).reflectance(arrays(x))
-    for i, value in enumerate([*normal, *albedo, roughness, specular]):
+    for i, value in enumerate([*normal, *albedo, roughness, *specular]):
         # Normalisation divides by the raw normal's length, which can be small.
         assert_close(value, truth[:, i], 2e-4 if i < 3 else 3e-5)
 
@@ -200,7 +200,7 @@ def test_voxels_hold_the_density_that_interpolates_it_and_the_reflectance_at_the
     # ln σ to 2e-3: texture coordinates are float32, and ln σ rises by some hundred per unit.
     np.testing.assert_allclose(np.array(grid.density(p)), expected, rtol=2e-3, atol=1e-6)
     ours, truth = grid.reflectance(p), network.reflectance(p)
-    for a, b in zip([*ours[0], *ours[1], *ours[2:]], [*truth[0], *truth[1], *truth[2:]], strict=True):
+    for a, b in zip(flat(ours), flat(truth), strict=True):
         np.testing.assert_allclose(np.array(a), np.array(b), atol=2e-4)
 
 

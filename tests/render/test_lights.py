@@ -84,10 +84,10 @@ def points(n: int, copies: int, rng) -> shade.Points:
     x, normal = rng.uniform(-0.5, 0.5, (3, n)), unit()
     towards = normal + 0.8 * unit()
     wo = towards / np.linalg.norm(towards, axis=0)
-    roughness, specular = rng.uniform(0.3, 0.9, n), rng.uniform(0, 0.4, n)
+    roughness, specular = rng.uniform(0.3, 0.9, n), rng.uniform(0, 0.4, (3, n))
     albedo = rng.uniform(0.2, 0.8, (3, n))
-    x, wo, normal, albedo = (tuple(tile(c) for c in v) for v in (x, wo, normal, albedo))
-    return shade.Points(x, wo, shade.Reflectance(normal, albedo, tile(roughness), tile(specular), tile(0 * specular)))
+    x, wo, normal, albedo, specular = (tuple(tile(c) for c in v) for v in (x, wo, normal, albedo, specular))
+    return shade.Points(x, wo, shade.Reflectance(normal, albedo, tile(roughness), specular, tile(0 * roughness)))
 
 
 SEED = 2654435769

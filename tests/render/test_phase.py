@@ -14,7 +14,8 @@ from mi_ntf.core import fresnel, microfacet, ops
 from mi_ntf.render.scene import loaded
 
 
-@pytest.fixture(params=[(0.3, 0.4, False), (0.8, 0.1, False), (0.4, 0.06, True)], ids=["glossy", "rough", "fresnel"])
+@pytest.fixture(params=[(0.3, 0.4, False), (0.8, 0.1, False), (0.4, 0.06, True), (0.6, (0.95, 0.6, 0.5), True)],
+                ids=["glossy", "rough", "fresnel", "metal"])
 def medium(request, variant, tmp_path):
     mi_ntf.render.register()
     roughness, specular, rim = request.param
@@ -74,14 +75,15 @@ def test_value_is_the_formula_and_weight_is_value_over_density(medium, rng):
     np.testing.assert_allclose(np.array(pdf), np.array(pdf_again), rtol=2e-3, atol=1e-5)
     # Peaks of GGX amplify the rounding of sampled directions.
     np.testing.assert_allclose(np.array(weight) * np.array(pdf), np.array(value), rtol=5e-3, atol=1e-5)
-    roughness, specular = (float(v[0]) for v in medium.source.reflectance(tuple(mi.Float(c) for c in NORMAL_POINT))[2:])
+    _, _, *gloss = medium.source.reflectance(tuple(mi.Float(c) for c in NORMAL_POINT))
+    roughness, specular = float(gloss[0][0]), [float(s[0]) for s in gloss[1]]
     softness = float(medium.field.softness(tuple(mi.Float(c) for c in NORMAL_POINT))[0])
     d = np.array(wo, np.float64)
     directions = tuple(d), tuple(np.full(count, c) for c in viewer), (0.0, 0.0, 1.0), roughness
     diffuse, gloss = microfacet.scattering(ops, *directions, softness)
     rim = medium.field.header.architecture.fresnel
-    weights = fresnel.weights(ops, *directions, specular, True) if rim else (1 - specular, specular)
-    for channel, albedo in enumerate((0.7, 0.5, 0.3)):
+    for channel, (albedo, s) in enumerate(zip((0.7, 0.5, 0.3), specular, strict=True)):
+        weights = fresnel.weights(ops, *directions, s, True) if rim else (1 - s, s)
         truth = weights[0] * albedo * diffuse + weights[1] * gloss
         # Baked normals are off by 1e-3 between voxels.
         np.testing.assert_allclose(np.array(value)[channel], truth, rtol=0.03, atol=2e-3)

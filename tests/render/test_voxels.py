@@ -201,7 +201,7 @@ def surface_voxels(path: Path, folder: Path) -> Path:
     points = low + np.stack([x, y, z], -1).reshape(-1, 3) * (high - low)
     density = field.density(points).reshape(n, n, n, 1)
     surface = field.reflectance(points)
-    values = np.column_stack([surface.normal, surface.albedo, surface.roughness, surface.specular]).reshape(n, n, n, 8)
+    values = np.column_stack([surface.normal, surface.albedo, surface.roughness, surface.specular]).reshape(n, n, n, 10)
     mask = density[..., 0] > 0
     header = voxels.Voxels(tuple(low.tolist()), tuple(high.tolist()), (n, n, n), (n, n, n), None)
     voxels.save(folder / "surface.safetensors", header, bricks.of_dense(density, mask),

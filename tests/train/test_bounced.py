@@ -160,7 +160,7 @@ def test_albedo_learns_of_the_bounced_light(spheres, light):
     assert float(whole.bounced.max()) > 0.01 and without.bounced == 0.0
     albedo = torch.tensor([[0.5, 0.5, 0.5]], requires_grad=True)
     one = torch.ones(1)
-    sent = networks.Reflectance(None, albedo, 0.9 * one, 0.0 * one).diffuse_albedo(False)
+    sent = networks.Reflectance(None, albedo, 0.9 * one, torch.zeros(1, 1)).diffuse_albedo(False)
     sent.sum().backward()
     assert sent.tolist()[0] == pytest.approx([0.5] * 3) and albedo.grad.tolist()[0] == pytest.approx([1] * 3)
 

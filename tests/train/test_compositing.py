@@ -52,7 +52,7 @@ class Slab:
     def reflectance(self, x):
         one = torch.ones(len(x))
         normal = torch.tensor([0.0, 0.0, -1.0]).expand(len(x), 3)
-        return networks.Reflectance(normal, ALBEDO * torch.ones(len(x), 3), one, 0 * one)
+        return networks.Reflectance(normal, ALBEDO * torch.ones(len(x), 3), one, 0 * one[:, None])
 
 
 def test_packed_weights_equal_a_double_loop():
@@ -262,7 +262,7 @@ def test_a_new_field_is_matt():
     learned = nets.reflectance(torch.rand(100, 3, generator=generator) - 0.5)
     facing = torch.ones(100)
     _, gloss = microfacet.lobes_collocated(ops, facing, learned.roughness)
-    _, weight = fresnel.weights_collocated(ops, facing, learned.roughness, learned.specular, True)
+    _, weight = fresnel.weights_collocated(ops, facing, learned.roughness, learned.specular.T, True)
     assert float((math.pi * weight * gloss).max().detach()) < 0.03
 
 
@@ -320,15 +320,16 @@ def test_psnr_of_a_known_error(monkeypatch):
 @pytest.mark.parametrize("rim", [False, True])
 def test_training_shades_by_the_phase_function_seen_from_the_light(rim):
     """Photographs are compared with the value of the renderers' phase function for ω_i = ω_o."""
-    cos, roughness, specular = np.linspace(0.05, 1, 20), np.linspace(0.2, 1, 20), np.linspace(0, 0.9, 20)
+    cos, roughness = np.linspace(0.05, 1, 20), np.linspace(0.2, 1, 20)
+    specular = np.stack([np.linspace(0, 0.9, 20), np.linspace(0.9, 0, 20), np.full(20, 0.5)])
     w, n = (np.sqrt(1 - cos**2), 0 * cos, cos), (0 * cos, 0 * cos, 1 + 0 * cos)
     diffuse, gloss = microfacet.scattering(numpy_ops, w, w, n, roughness)
     weights = fresnel.weights(numpy_ops, w, w, n, roughness, specular, True) if rim else (1 - specular, specular)
     rows = [torch.as_tensor(np.stack(v, 1)) for v in (n, [0.6 + 0 * cos] * 3, w)]
-    reflectance = *rows[:2], *map(torch.as_tensor, (roughness, specular))
+    reflectance = *rows[:2], *map(torch.as_tensor, (roughness, specular.T))
     actual = volume.shade(reflectance, -rows[2], torch.full((20,), 2.0), torch.full((20, 3), 4.0), rim)
     expected = weights[0] * 0.6 * diffuse + weights[1] * gloss
-    np.testing.assert_allclose(actual[:, 1], expected, rtol=1e-9)  # float64 rounding of sines
+    np.testing.assert_allclose(actual.T, expected, rtol=1e-9)  # float64 rounding of sines
 
 
 def test_held_out_score_of_a_network_that_knows_no_shadow():
@@ -356,8 +357,11 @@ def test_held_out_score_of_a_network_that_knows_no_shadow():
 
 
 def test_rough_lobes_cost_more():
-    """Σ w ((fading + 60 α⁴) s + (−5 − ln s)²/10) per ray, the square where s lies below e^−5; s above the least."""
-    gloss = torch.tensor([1.0, 0.5, 1.0]), torch.tensor([0.2, 0.4, math.exp(-7)])
+    """Σ w ((fading + 60 α⁴) s + (−5 − ln s)²/10) per ray, the square where s lies below e^−5; s above the least.
+
+    Of colours it is the mean over the channels.
+    """
+    gloss = torch.tensor([1.0, 0.5, 1.0]), torch.tensor([[0.1, 0.2, 0.3], [0.4] * 3, [math.exp(-7)] * 3])
     image = volume.Image(color=None, alpha=None, x=None, shaded=None, index=None,
                          weight=torch.tensor([0.5, 0.25, 0.25]), reflectance=networks.Reflectance(None, None, *gloss),
                          radiance=None, raw=None, bounced=0.0)

@@ -25,9 +25,9 @@ def directions(n: int, seed: int = 0) -> torch.Tensor:
 
 
 def materials(n: int, seed: int = 1):
-    """``(albedo (n, 3), roughness (n,), specular (n,))`` of all kinds."""
-    u = torch.rand(n, 5, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-    return u[:, :3], 0.15 + 0.85 * u[:, 3], 0.04 + 0.9 * u[:, 4]
+    """``(albedo (n, 3), roughness (n,), specular (n, 3))`` of all kinds."""
+    u = torch.rand(n, 7, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return u[:, :3], 0.15 + 0.85 * u[:, 3], 0.04 + 0.9 * u[:, 4:]
 
 
 @pytest.mark.parametrize("rim", [False, True])
@@ -60,7 +60,7 @@ class Skin:
     def reflectance(self, x):
         roughness, specular = (torch.full((len(x),), v) for v in self.gloss)
         normal, albedo = (torch.tensor(v).expand(len(x), 3) for v in ([0.0, 0.0, 1.0], [0.7, 0.5, 0.2]))
-        return Reflectance(normal, albedo, roughness, specular)
+        return Reflectance(normal, albedo, roughness, specular[:, None])
 
 
 def toward(degrees: float) -> np.ndarray:
@@ -116,7 +116,7 @@ def test_a_thin_skin_is_the_integral_over_its_depth(rim):
         one = torch.ones(31).double()
         row = {"n": n, "wo": wo, "wi": wi}
         row = {k: torch.as_tensor(v).expand(31, 3) for k, v in row.items()}
-        reflectance = row["n"], albedo * one[:, None].expand(31, 3), roughness * one, specular * one
+        reflectance = row["n"], albedo * one[:, None].expand(31, 3), roughness * one, specular * one[:, None]
         actual = shots.flash(torch.as_tensor(2 * wi[None]), TransmittanceTargets()).send(
             optical, reflectance, -row["wo"], torch.zeros(31, 3).double(), torch.zeros(31).long(),
             5 * one[:, None].expand(31, 3), rim)
@@ -307,6 +307,6 @@ def test_points_in_smoke_are_lit_one_by_one():
     distance = np.linalg.norm(path, axis=1)
     wi, wo, m = ((v / np.linalg.norm(v, axis=1, keepdims=True)).T for v in (path, -d.numpy(), normal.numpy()))
     diffuse, gloss = microfacet.scattering(numpy_ops, tuple(wi), tuple(wo), tuple(m), roughness.numpy())
-    lobe = ((1 - specular.numpy()) * diffuse)[:, None] * albedo.numpy() + (specular.numpy() * gloss)[:, None]
+    lobe = (1 - specular.numpy()) * diffuse[:, None] * albedo.numpy() + specular.numpy() * gloss[:, None]
     weight = np.exp(-0.7) * (1 - np.exp(-0.2)) * np.exp(-sigma * length) * 6 / distance**2
     np.testing.assert_allclose(actual, weight[:, None] * lobe, rtol=0.06, atol=1e-6)

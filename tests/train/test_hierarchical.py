@@ -76,7 +76,7 @@ class Slab:
     def reflectance(self, x):
         one = torch.ones(len(x))
         normal = torch.tensor([0.0, 0.0, -1.0]).expand(len(x), 3)
-        return Reflectance(normal, one[:, None].expand(-1, 3) / 2, one, 0 * one)
+        return Reflectance(normal, one[:, None].expand(-1, 3) / 2, one, 0 * one[:, None])
 
 
 def test_view_of_a_half_space():

@@ -25,7 +25,7 @@ def smoke(n: int, seed: int = 0) -> networks.Reflectance:
     """Return smoke of random albedo, float64, whose albedo has gradients."""
     albedo = torch.rand(n, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).requires_grad_()
     zero = torch.zeros(n, dtype=torch.float64)
-    return networks.Reflectance(torch.zeros(n, 3, dtype=torch.float64), albedo, zero + 1, zero)
+    return networks.Reflectance(torch.zeros(n, 3, dtype=torch.float64), albedo, zero + 1, zero[:, None])
 
 
 def unit(n: int, seed: int) -> torch.Tensor:
