@@ -1,0 +1,93 @@
+"""Coloured specular lobes: the phase function of ``nrf`` against BSDFs of Mitsuba, and the mesh that is exported."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers import scenes
+
+import mi_ntf.render
+from mi_ntf import export
+from mi_ntf.core import microfacet, ops
+from mi_ntf.render.scene.loaded import LoadedField
+
+POINT = (0.0, 0.0, 0.5)
+"""Point of the field whose normal is +z."""
+GOLD = (0.98, 0.72, 0.30)
+ROUGHNESS = 0.6
+BLACK = 1e-6
+
+
+def directions(rng, count=400):
+    """Return ``(wi, wo)``, unit vectors (3, count) of cosines above 0.1 to +z."""
+    cos, phi = rng.uniform(0.1, 1, (2, count)), rng.uniform(0, 2 * np.pi, (2, count))
+    sin = np.sqrt(1 - cos**2)
+    return np.stack([sin * np.cos(phi), sin * np.sin(phi), cos], 1)
+
+
+def reflected(folder, rng, rim: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return ρ ⟨n,ω_i⟩ (3, n) of a field of gold as the phase function has it, and the directions."""
+    mi_ntf.render.register()
+    path = scenes.write_blobs(folder, roughness=ROUGHNESS, specular=GOLD, albedo=(BLACK,) * 3, fresnel=rim)
+    (shape,) = scenes.scene(path, {"type": "nrf"}, {"light": scenes.light("directional")}).shapes()
+    medium = shape.interior_medium()
+    field: LoadedField = medium.field
+    assert field.header.architecture.specular_channels == 3
+    wi, wo = directions(rng)
+    mei = dr.zeros(mi.MediumInteraction3f, wi.shape[1])
+    at = tuple(mi.Float(c) for c in POINT)
+    mei.p, mei.wi = medium.frame.point_to_world(at), mi.Vector3f(wo)
+    value = np.array(medium.phase_function().eval_pdf(mi.PhaseFunctionContext(None), mei, mi.Vector3f(wi))[0])
+    joint = microfacet.joint_cosine(ops, wi[2], wo[2], float(field.softness(at)[0]))
+    return value / joint * wi[2], wi, wo
+
+
+def evaluated(bsdf: dict, wi: np.ndarray, wo: np.ndarray) -> np.ndarray:
+    """Return ρ ⟨n,ω_i⟩ (3, n) of a BSDF of Mitsuba."""
+    si = dr.zeros(mi.SurfaceInteraction3f, wi.shape[1])
+    si.wi = mi.Vector3f(wo)
+    return np.array(mi.load_dict(bsdf).eval(mi.BSDFContext(), si, mi.Vector3f(wi)))
+
+
+def colour(values) -> dict:
+    return {"type": "rgb", "value": list(values)}
+
+
+def test_a_weight_without_fresnel_effect_is_a_coloured_roughconductor(variant, tmp_path, rng):
+    value, wi, wo = reflected(tmp_path, rng, rim=False)
+    truth = evaluated({"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": ROUGHNESS**2,
+                       "specular_reflectance": colour(GOLD)}, wi, wo)
+    # 1e-3: baked normals, and float16 weights on CUDA.
+    np.testing.assert_allclose(value, truth, rtol=0.02, atol=2e-3)
+
+
+def test_a_normal_reflectance_is_a_metal_of_the_principled_bsdf(variant, tmp_path, rng):
+    """Disney's metal has the same lobe with Schlick's term (Burley 2012). Both are 1 at grazing angles."""
+    value, wi, wo = reflected(tmp_path, rng, rim=True)
+    truth = evaluated({"type": "principled", "metallic": 1.0, "roughness": ROUGHNESS, "base_color": colour(GOLD)},
+                      wi, wo)
+    np.testing.assert_allclose(value, truth, rtol=0.02, atol=3e-3)
+
+
+@pytest.mark.parametrize("material", ["Cu", "Au"])
+def test_measured_metals_are_close_to_schlick(variant, tmp_path, rng, material):
+    """The normal reflectance of a measured metal gives its reflectance at other angles, too.
+
+    Without it, as one grey weight, the channels of gold would be wrong by half.
+    """
+    bsdf = {"type": "roughconductor", "material": material, "distribution": "ggx", "alpha": ROUGHNESS**2}
+    wi, wo = directions(rng)
+    grey = evaluated({"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": ROUGHNESS**2},
+                     wi, wo)
+    fresnel = evaluated(bsdf, wi, wo) / grey
+    up = np.tile([[0.0], [0.0], [1.0]], 1)
+    normal = evaluated(bsdf, up, up) / evaluated({**bsdf, "material": "none"}, up, up)
+    cos = np.sqrt(0.5 + 0.5 * (wi * wo).sum(0))
+    np.testing.assert_allclose(normal + (1 - normal) * (1 - cos) ** 5, fresnel, atol=0.05)
+
+
+def test_the_exported_mesh_has_the_colour(variant, tmp_path):
+    exported = export.MeshFile("m.ply", 3, 1, 10.0, [1.0, 1.0, 1.0], ROUGHNESS, [0.8, 0.6, 0.2])
+    text = export.mitsuba_shape(tmp_path / "m.ply", exported, np.eye(4))
+    assert '<float name="weight" value="0.8"/>' in text
+    assert '<rgb name="specular_reflectance" value="1, 0.75, 0.25"/>' in text
