@@ -4,8 +4,10 @@
 
 replaces the specular weight s, which is the reflectance at normal incidence: at least DIELECTRIC, more for metal. In
 photographs with the light at the camera the half vector h lies along the view, so F = s there, and the formula extends
-it to other angles. The bound holds because no smooth surface reflects less than a dielectric, although highlights of
-0.04 are too faint to be separated from errors of normals. Rough surfaces have the same s, with a hardly visible lobe.
+it to other angles. Metals have another s in each channel of linear RGB, and hardly a diffuse part. All formulas hold
+for each channel alone. The bound holds because no smooth surface reflects less than a dielectric, although highlights
+of 0.04 are too faint to be separated from errors of normals. Rough surfaces have the same s, with a hardly visible
+lobe.
 The diffuse lobe lacks the light of the rim, on its way in and out alike (Kelemen and Szirmay-Kalos 2001; Ashikhmin and
 Shirley 2000). Its weight is
 

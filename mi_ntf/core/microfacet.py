@@ -2,9 +2,9 @@
 
     ρ = (1 − s) k/π + s D(h; α) G1(ω_i) G1(ω_o) / (4 ⟨n,ω_i⟩ ⟨n,ω_o⟩),        α = roughness²
 
-k: diffuse albedo (linear RGB, [0, 1]); s: specular weight in [0, 1]; roughness in [MIN_ROUGHNESS, 1]. It is Mitsuba's
-``blendbsdf`` of ``diffuse`` and a GGX ``roughconductor`` with ``material = none``. Fields of real materials weigh the
-two lobes by :mod:`mi_ntf.core.fresnel` instead of 1 − s and s.
+k: diffuse albedo (linear RGB, [0, 1]); s: specular weight in [0, 1], of each channel; roughness in [MIN_ROUGHNESS, 1].
+It is Mitsuba's ``blendbsdf`` of ``diffuse`` and a GGX ``roughconductor`` with ``material = none``. Fields of real
+materials weigh the two lobes by :mod:`mi_ntf.core.fresnel` instead of 1 − s and s.
 
 ω_i points to the light, ω_o to the viewer, n is the normal: unit 3-vectors. The diffuse lobe needs only ⟨n,ω_i⟩ > 0;
 the specular lobe also needs ⟨n,ω_o⟩ > 0. So ρ is reciprocal where both are positive, and the directional albedo
