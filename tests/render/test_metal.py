@@ -9,6 +9,7 @@ from helpers import scenes
 import mi_ntf.render
 from mi_ntf import export
 from mi_ntf.core import microfacet, ops
+from mi_ntf.infer import scatter, shade
 from mi_ntf.render.scene.loaded import LoadedField
 
 POINT = (0.0, 0.0, 0.5)
@@ -47,6 +48,20 @@ def evaluated(bsdf: dict, wi: np.ndarray, wo: np.ndarray) -> np.ndarray:
     si = dr.zeros(mi.SurfaceInteraction3f, wi.shape[1])
     si.wi = mi.Vector3f(wo)
     return np.array(mi.load_dict(bsdf).eval(mi.BSDFContext(), si, mi.Vector3f(wi)))
+
+
+def test_single_scattering_reflects_by_the_phase_function(variant, rng):
+    """The sum over lights and the sampled paths have the same colour, in skins and at light from all sides."""
+    wi, wo = (tuple(mi.Float(c) for c in v) for v in directions(rng))
+    count = dr.width(wi[0])
+    values = [tuple(dr.full(mi.Float, c, count) for c in v) for v in (POINT, (0.0, 0.0, 1.0), (0.3, 0.2, 0.1), GOLD)]
+    x, normal, albedo, specular = values
+    for rim in (False, True):
+        matter = shade.Reflectance(normal, albedo, dr.full(mi.Float, ROUGHNESS, count), specular, mi.Float(0.1), rim)
+        _, summed = shade._value(wi, shade.Points(x, wo, matter), True, True)
+        sampled, _ = scatter.evaluate(wi, wo, matter)
+        np.testing.assert_allclose(np.array(summed), np.array(sampled), rtol=1e-5)
+        assert np.ptp(np.array(summed), axis=0).min() > 0
 
 
 def colour(values) -> dict:
