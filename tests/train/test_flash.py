@@ -146,7 +146,7 @@ def test_gradients():
     wi, distance = lamp.toward(torch.zeros(n).long(), torch.zeros(n, 3).double())
     albedo, one = torch.full((n, 3), 0.6, dtype=torch.float64), torch.ones(n).double()
     d = torch.tensor([[0.0, 0, -1]]).double().expand(n, 3)
-    sent = lamp.send(Optical(depth, front), (normal, albedo, one, 0 * one), d, torch.zeros(n, 3).double(),
+    sent = lamp.send(Optical(depth, front), (normal, albedo, one, 0 * one[:, None]), d, torch.zeros(n, 3).double(),
                      torch.zeros(n).long(), 7 * one[:, None].expand(n, 3), False)
     sent[:, 0].sum().backward()
     cos_i, cos_o = ((normal.detach() * v).sum(1) for v in (wi, -d))
@@ -159,7 +159,7 @@ def test_gradients():
     np.testing.assert_allclose(front.grad, -size * r * weight, rtol=1e-6)
     # A highlight: brighter towards the half vector.
     normal = F.normalize(wi - d + 0.1 * directions(n, 9), dim=1).requires_grad_()
-    lamp.send(Optical(depth, front), (normal, 0 * albedo, 0.5 * one, one), d,
+    lamp.send(Optical(depth, front), (normal, 0 * albedo, 0.5 * one, one[:, None]), d,
               torch.zeros(n, 3).double(), torch.zeros(n).long(), one[:, None].expand(n, 3), False).sum().backward()
     half = F.normalize(wi - d, dim=1)
     across = half - (half * normal.detach()).sum(1, keepdim=True) * normal.detach()
