@@ -10,7 +10,8 @@ import numpy as np
 from drjit import nn
 
 from ..core import depth_profile, logistic, mixture, spheres
-from ..core.architecture import MAX_LOG_DENSITY, MIN_LOG_DENSITY, NO_VISIBILITY, Encoding, Header
+from ..core import ops as numpy_ops
+from ..core.architecture import MAX_LOG_DENSITY, MIN_LOG_DENSITY, NO_VISIBILITY, RETRO, Architecture, Encoding, Header
 from ..core.errors import MiNtfError
 from ..core.microfacet import MIN_ROUGHNESS
 from ..core.ops import Tensors, normalize
@@ -67,6 +68,8 @@ class NetworkField:
         self._visibility = None if baseline is None else _Network(baseline.encoding, "visibility", tensors, dj)
         self.has_visibility = baseline is not None
         self._least_specular, self._smoke = arch.least_specular, arch.phase is not None
+        self.retro = _retro(arch, tensors)
+        """Retro-reflection of :mod:`mi_ntf.core.fresnel`, None without a Fresnel term."""
         self.quick = arch.reflectance.encoding.kind == "planes"
         """True if a reflectance costs no more than a few fetches."""
 
@@ -115,6 +118,12 @@ class NetworkField:
             raw = net.layers(net.encode((*p1, *p2)))
             pairs = [logistic.parameters(ops, raw[i], raw[i + 1], h) for i in range(0, count, 2)]
         return hit, h, mixture.from_outputs(ops, pairs, raw[count:], h)
+
+
+def _retro(architecture: Architecture, tensors: Tensors) -> float | None:
+    if not architecture.fresnel:
+        return None
+    return float(logistic.sigmoid(numpy_ops, tensors[RETRO][0])) if architecture.retro else 0.0
 
 
 def _half(dj: ModuleType) -> bool:

@@ -18,12 +18,12 @@ def evaluate(wi: Vector, wo: Vector, reflectance: Reflectance) -> tuple[Vector, 
 
     The value is the phase function (linear RGB, 1/sr), the density that of :func:`sample` (1/sr).
     """
-    normal, albedo, roughness, specular, softness, rim, lobe, _ = reflectance
+    normal, albedo, roughness, specular, softness, retro, lobe, _ = reflectance
     if lobe:
         phase, pdf = lobe.evaluate(wi, wo)
         return tuple(k * c for k, c in zip(albedo, phase, strict=True)), pdf
     diffuse, glossy = microfacet.scattering(ops, wi, wo, normal, roughness, softness)
-    weights = [fresnel.weights(ops, wi, wo, normal, roughness, s, rim) for s in specular]
+    weights = [fresnel.weights(ops, wi, wo, normal, roughness, s, retro) for s in specular]
     value = tuple(k * w * diffuse + s * glossy for k, (w, s) in zip(albedo, weights, strict=True))
     half = normalize(ops, tuple(a + b for a, b in zip(wi, wo, strict=True)))
     cos_h = dr.maximum(dot(normal, half), 0)

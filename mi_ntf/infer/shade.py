@@ -27,9 +27,10 @@ class Lobe(Protocol):
 class Reflectance(NamedTuple):
     """Reflectance of field points: ranges as in :mod:`mi_ntf.core.microfacet`, softness as in :mod:`mi_ntf.core.skin`.
 
-    `specular`: weight of the specular lobe, linear RGB. `fresnel`: it is that at normal incidence
-    (:mod:`mi_ntf.core.fresnel`). `lobe`: a phase function that is weighted by the albedo, in place of normal, roughness
-    and specular weight. `emission`: emitted radiance of matter that reflects nothing.
+    `specular`: weight of the specular lobe, linear RGB; at normal incidence if there is a Fresnel term. `retro`: the
+    field's retro-reflection (:mod:`mi_ntf.core.fresnel`), None without a Fresnel term. `lobe`: a phase function that is
+    weighted by the albedo, in place of normal, roughness and specular weight. `emission`: emitted radiance of matter
+    that reflects nothing.
     """
 
     normal: Vector
@@ -37,13 +38,14 @@ class Reflectance(NamedTuple):
     roughness: Float
     specular: Vector
     softness: Float
-    fresnel: bool = False
+    retro: Float | None = None
     lobe: Lobe | None = None
     emission: Vector | None = None
 
     def diffuse_albedo(self) -> list[Float]:
         """Return the linear RGB albedo of a diffuse surface that reflects as much of uniform light."""
-        return [fresnel.diffuse_albedo(ops, k, self.roughness, s, self.fresnel)
+        rim = self.retro is not None
+        return [fresnel.diffuse_albedo(ops, k, self.roughness, s, rim)
                 for k, s in zip(self.albedo, self.specular, strict=True)]
 
 
@@ -153,5 +155,5 @@ def _value(wi: Vector, points: Points, skin: bool, specular: bool) -> tuple[Mask
     diffuse, glossy = (
         microfacet.scattering(ops, *direction, points.softness) if skin else microfacet.lobes(ops, *direction)
     )
-    weights = [fresnel.weights(ops, *direction, s, points.reflectance.fresnel) for s in points.specular]
+    weights = [fresnel.weights(ops, *direction, s, points.reflectance.retro) for s in points.specular]
     return diffuse > 0, [k * w * diffuse + s * glossy for k, (w, s) in zip(points.albedo, weights, strict=True)]

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass
 
 import torch
 
-from ..core.architecture import MAX_LOG_DENSITY
+from ..core.architecture import MAX_LOG_DENSITY, RETRO
 from ..core.errors import MiNtfError
 from ..core.progress import Stage
 from . import device, losses, networks, offset, parallel, rays, volume
@@ -100,10 +100,11 @@ class Fast:
         tensors = {k: v for k, v in self.networks.tensors.items() if k.split(".")[0] in names}
         planes = {"params": [v for k, v in tensors.items() if ".planes." in k], "base": self.config.lr_planes}
         layers = {"params": [v for k, v in tensors.items() if ".layers." in k], "base": self.config.lr_layers}
-        groups = [planes, layers]
+        numbers = [v for k, v in tensors.items() if k == RETRO]
         if self.gains is not None and names == FIELD:
-            groups.append({"params": [self.gains.logs, self.room], "base": self.config.lr_gains})
-        return torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12, fused=True)
+            numbers += [v for v in (self.gains.logs, self.room) if v is not None]
+        single = {"params": numbers, "base": self.config.lr_gains}
+        return torch.optim.Adam([planes, layers, single], betas=(0.9, 0.99), eps=1e-12, fused=True)
 
     def _take(self, finished: FinishedField) -> None:
         """Take density and reflectance of a finished field; for further training, all that it has learned."""

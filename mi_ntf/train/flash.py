@@ -71,11 +71,12 @@ class Flash:
         return torch.exp(-depth)
 
     def send(self, optical: Optical, reflectance: Reflectance, d: torch.Tensor, x: torch.Tensor, view: torch.Tensor,
-             light: torch.Tensor, rim: bool, phase: float | None = None) -> torch.Tensor:
+             light: torch.Tensor, retro: torch.Tensor | None, phase: float | None = None) -> torch.Tensor:
         """Return the radiance (n, 3) that samples at `x` (n, 3) of rays along `d` send to the camera.
 
-        `optical` are the samples' optical depths, `light` (n, 3) radiant intensities. `rim` is true if the field has a
-        Fresnel term, `phase` is the asymmetry of smoke. Shadows on skins are left out, see :meth:`lit`.
+        `optical` are the samples' optical depths, `light` (n, 3) radiant intensities. `retro` is the
+        retro-reflection, None without a Fresnel term. `phase` is the asymmetry of smoke. Shadows on skins are left out,
+        see :meth:`lit`.
         """
         normal, albedo, roughness, specular = reflectance
         toward, distance = self.toward(view, x)
@@ -85,7 +86,7 @@ class Flash:
             smoke: torch.Tensor = (weight * scattered)[:, None] * albedo * light / distance**2
             return smoke
         wi, wo, n = toward.unbind(1), (-d).unbind(1), normal.unbind(1)
-        diffuse_weight, gloss_weight = fresnel.weights(ops, wi, wo, n, roughness, specular.T, rim)
+        diffuse_weight, gloss_weight = fresnel.weights(ops, wi, wo, n, roughness, specular.T, retro)
         if self.solid:
             diffuse, glossy = microfacet.lobes(ops, wi, wo, n, roughness)
             with torch.no_grad():

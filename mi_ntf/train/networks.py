@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 
 from ..core import depth_profile, fresnel, logistic, mixture, spheres
-from ..core.architecture import MAX_LOG_DENSITY, MIN_LOG_DENSITY, NO_VISIBILITY, Architecture, Encoding
+from ..core.architecture import MAX_LOG_DENSITY, MIN_LOG_DENSITY, NO_VISIBILITY, RETRO, Architecture, Encoding
 from ..core.errors import MiNtfError
 from ..core.microfacet import MIN_ROUGHNESS
 from ..core.reference import PLANES
@@ -25,6 +25,8 @@ Tensors = dict[str, torch.Tensor]
 INITIAL_SPECULAR_LOGIT, INITIAL_ROUGHNESS_LOGIT = -3.0, 1.5
 """Start of the specular weight and of the roughness, 0.86: nearly matt, so that highlights have to appear in the
 photographs first. A sharper lobe would be brighter than a black surface, whose normals would turn away from it."""
+INITIAL_RETRO_LOGIT = -2.0
+"""Start of the retro-reflection, 0.12: small, and its sigmoid has a slope there."""
 POINTS_PER_PART = 65536
 """Points that :func:`in_parts` evaluates at once, which bounds the memory."""
 
@@ -57,6 +59,14 @@ class Networks:
     def fresnel(self) -> bool:
         """True if the specular weight is the normal reflectance of :mod:`mi_ntf.core.fresnel`."""
         return self.architecture.fresnel
+
+    @property
+    def retro(self) -> torch.Tensor | None:
+        """Retro-reflection (1,) of :mod:`mi_ntf.core.fresnel`, None without a Fresnel term."""
+        if not self.fresnel:
+            return None
+        raw = self.tensors.get(RETRO)
+        return torch.zeros(1) if raw is None else torch.sigmoid(raw)
 
     @property
     def phase(self) -> float | None:
@@ -251,6 +261,8 @@ def initial(architecture: Architecture, log_density: float, generator: torch.Gen
     for name, net in architecture.networks().items():
         tensors[f"{name}.layers.{len(net.hidden)}.weight"] *= 0.1
     tensors[f"density.layers.{len(architecture.density.hidden)}.bias"] += log_density
+    if RETRO in tensors:
+        tensors[RETRO] += INITIAL_RETRO_LOGIT
     lobe = tensors[f"reflectance.layers.{len(architecture.reflectance.hidden)}.bias"][6:]
     lobe += torch.tensor([INITIAL_ROUGHNESS_LOGIT] + [INITIAL_SPECULAR_LOGIT] * architecture.specular_channels)
     return Networks(architecture, {k: v.requires_grad_() for k, v in tensors.items()})

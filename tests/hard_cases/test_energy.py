@@ -20,7 +20,7 @@ def direction(cosine, angle=0.0):
 def f(o, wi, wo, roughness, albedo, specular, normal=UP, softness=0.0, rim=False):
     """The phase function; `rim`: with a Fresnel term."""
     diffuse, gloss = microfacet.scattering(o, wi, wo, normal, roughness, softness)
-    weights = fresnel.weights(o, wi, wo, normal, roughness, specular, True) if rim else (1 - specular, specular)
+    weights = fresnel.weights(o, wi, wo, normal, roughness, specular, 0.0 if rim else None)
     return weights[0] * albedo * diffuse + weights[1] * gloss
 
 

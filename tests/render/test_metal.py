@@ -9,6 +9,7 @@ from helpers import scenes
 import mi_ntf.render
 from mi_ntf import export
 from mi_ntf.core import microfacet, ops
+from mi_ntf.core.fresnel import weights
 from mi_ntf.infer import scatter, shade
 from mi_ntf.render.scene.loaded import LoadedField
 
@@ -26,10 +27,10 @@ def directions(rng, count=400):
     return np.stack([sin * np.cos(phi), sin * np.sin(phi), cos], 1)
 
 
-def reflected(folder, rng, rim: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def reflected(folder, rng, retro: float | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return ρ ⟨n,ω_i⟩ (3, n) of a field of gold as the phase function has it, and the directions."""
     mi_ntf.render.register()
-    path = scenes.write_blobs(folder, roughness=ROUGHNESS, specular=GOLD, albedo=(BLACK,) * 3, fresnel=rim)
+    path = scenes.write_blobs(folder, roughness=ROUGHNESS, specular=GOLD, albedo=(BLACK,) * 3, retro=retro)
     (shape,) = scenes.scene(path, {"type": "nrf"}, {"light": scenes.light("directional")}).shapes()
     medium = shape.interior_medium()
     field: LoadedField = medium.field
@@ -56,8 +57,8 @@ def test_single_scattering_reflects_by_the_phase_function(variant, rng):
     count = dr.width(wi[0])
     values = [tuple(dr.full(mi.Float, c, count) for c in v) for v in (POINT, (0.0, 0.0, 1.0), (0.3, 0.2, 0.1), GOLD)]
     x, normal, albedo, specular = values
-    for rim in (False, True):
-        matter = shade.Reflectance(normal, albedo, dr.full(mi.Float, ROUGHNESS, count), specular, mi.Float(0.1), rim)
+    for retro in (None, 0.5):
+        matter = shade.Reflectance(normal, albedo, dr.full(mi.Float, ROUGHNESS, count), specular, mi.Float(0.1), retro)
         _, summed = shade._value(wi, shade.Points(x, wo, matter), True, True)
         sampled, _ = scatter.evaluate(wi, wo, matter)
         np.testing.assert_allclose(np.array(summed), np.array(sampled), rtol=1e-5)
@@ -69,7 +70,7 @@ def colour(values) -> dict:
 
 
 def test_a_weight_without_fresnel_effect_is_a_coloured_roughconductor(variant, tmp_path, rng):
-    value, wi, wo = reflected(tmp_path, rng, rim=False)
+    value, wi, wo = reflected(tmp_path, rng, retro=None)
     truth = evaluated({"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": ROUGHNESS**2,
                        "specular_reflectance": colour(GOLD)}, wi, wo)
     # 1e-3: baked normals, and float16 weights on CUDA.
@@ -77,15 +78,18 @@ def test_a_weight_without_fresnel_effect_is_a_coloured_roughconductor(variant, t
 
 
 def test_a_normal_reflectance_is_a_metal_of_the_principled_bsdf(variant, tmp_path, rng):
-    """Disney's metal has the same lobe with Schlick's term (Burley 2012). Both are 1 at grazing angles."""
-    value, wi, wo = reflected(tmp_path, rng, rim=True)
+    """Disney's metal has the same lobe with Schlick's term (Burley 2012). Both are 1 at grazing angles.
+
+    Between 30° and 80° Fresnel's equations have up to 0.02 (1 − s) more than Schlick's term.
+    """
+    value, wi, wo = reflected(tmp_path, rng, retro=0.0)
     truth = evaluated({"type": "principled", "metallic": 1.0, "roughness": ROUGHNESS, "base_color": colour(GOLD)},
                       wi, wo)
-    np.testing.assert_allclose(value, truth, rtol=0.02, atol=3e-3)
+    np.testing.assert_allclose(value, truth, rtol=0.06, atol=3e-3)
 
 
 @pytest.mark.parametrize("material", ["Cu", "Au"])
-def test_measured_metals_are_close_to_schlick(variant, tmp_path, rng, material):
+def test_measured_metals_follow_their_normal_reflectance(variant, tmp_path, rng, material):
     """The normal reflectance of a measured metal gives its reflectance at other angles, too.
 
     Without it, as one grey weight, the channels of gold would be wrong by half.
@@ -97,8 +101,8 @@ def test_measured_metals_are_close_to_schlick(variant, tmp_path, rng, material):
     fresnel = evaluated(bsdf, wi, wo) / grey
     up = np.tile([[0.0], [0.0], [1.0]], 1)
     normal = evaluated(bsdf, up, up) / evaluated({**bsdf, "material": "none"}, up, up)
-    cos = np.sqrt(0.5 + 0.5 * (wi * wo).sum(0))
-    np.testing.assert_allclose(normal + (1 - normal) * (1 - cos) ** 5, fresnel, atol=0.05)
+    modelled = [weights(ops, wi, wo, (0.0, 0.0, 1.0), ROUGHNESS, s, 0.0)[1] for s in normal.ravel()]
+    np.testing.assert_allclose(modelled, fresnel, atol=0.05)
 
 
 def test_the_exported_mesh_has_the_colour(variant, tmp_path):

@@ -14,12 +14,13 @@ from mi_ntf.core import fresnel, microfacet, ops
 from mi_ntf.render.scene import loaded
 
 
-@pytest.fixture(params=[(0.3, 0.4, False), (0.8, 0.1, False), (0.4, 0.06, True), (0.6, (0.95, 0.6, 0.5), True)],
-                ids=["glossy", "rough", "fresnel", "metal"])
+@pytest.fixture(params=[(0.3, 0.4, None), (0.8, 0.1, None), (0.4, 0.06, 0.0), (0.4, 0.06, 0.6),
+                        (0.6, (0.95, 0.6, 0.5), 0.2)], ids=["glossy", "rough", "fresnel", "retro-reflection", "metal"])
 def medium(request, variant, tmp_path):
     mi_ntf.render.register()
-    roughness, specular, rim = request.param
-    path = scenes.write_blobs(tmp_path, roughness=roughness, specular=specular, albedo=(0.7, 0.5, 0.3), fresnel=rim)
+    roughness, specular, retro = request.param
+    path = scenes.write_blobs(tmp_path, roughness=roughness, specular=specular, albedo=(0.7, 0.5, 0.3),
+                              retro=retro)
     scene = scenes.scene(path, {"type": "nrf"}, {"light": scenes.light("directional")})
     (shape,) = scene.shapes()
     return shape.interior_medium()
@@ -81,9 +82,8 @@ def test_value_is_the_formula_and_weight_is_value_over_density(medium, rng):
     d = np.array(wo, np.float64)
     directions = tuple(d), tuple(np.full(count, c) for c in viewer), (0.0, 0.0, 1.0), roughness
     diffuse, gloss = microfacet.scattering(ops, *directions, softness)
-    rim = medium.field.header.architecture.fresnel
     for channel, (albedo, s) in enumerate(zip((0.7, 0.5, 0.3), specular, strict=True)):
-        weights = fresnel.weights(ops, *directions, s, True) if rim else (1 - s, s)
+        weights = fresnel.weights(ops, *directions, s, medium.field.retro)
         truth = weights[0] * albedo * diffuse + weights[1] * gloss
         # Baked normals are off by 1e-3 between voxels.
         np.testing.assert_allclose(np.array(value)[channel], truth, rtol=0.03, atol=2e-3)

@@ -58,6 +58,7 @@ class Outward:
     """The spheres' networks with the spheres' own normals."""
 
     fresnel = False
+    retro = None
     phase = None
 
     def __init__(self, nets):

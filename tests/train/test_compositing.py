@@ -13,7 +13,7 @@ from train import shots  # noqa: E402
 
 from mi_ntf.core import fresnel, microfacet  # noqa: E402
 from mi_ntf.core import ops as numpy_ops  # noqa: E402
-from mi_ntf.core.architecture import Encoding, Network  # noqa: E402
+from mi_ntf.core.architecture import RETRO, Encoding, Network  # noqa: E402
 from mi_ntf.train import held_out, losses, networks, ops, scoring, volume  # noqa: E402
 from mi_ntf.train.config import PRESETS  # noqa: E402
 from mi_ntf.train.normal_targets import NormalTargets  # noqa: E402
@@ -41,7 +41,7 @@ class Slab:
     """Uniform density, Lambert reflectance, normals towards the camera."""
 
     fresnel = False
-    phase = None
+    retro = phase = None
 
     def log_density(self, x):
         return torch.full((len(x),), float(np.log(SIGMA)))
@@ -235,23 +235,26 @@ def test_transmittance_loss_leaves_the_field_alone(kind):
 
 @pytest.mark.parametrize("rim", [False, True])
 def test_lobes_wait_for_normals(rim):
-    """Roughness and specular weight (rows 6 and 7) learn nothing without lobes, and no normal turns from the light.
+    """Roughness, specular weight (rows 6, 7) and retro-reflection learn nothing without lobes, and no normal turns
+    from the light.
 
     Colours that are too dark still turn normals (rows 0 to 2) towards it, and the albedo learns.
     """
-    arch = dataclasses.replace(PRESETS["fast"].architecture, fresnel=rim)
+    arch = dataclasses.replace(PRESETS["fast"].architecture, fresnel=rim, retro=rim)
     samples = torch.arange(4).repeat_interleave(5), torch.linspace(2.8, 3.2, 5).repeat(4), torch.full((20,), 0.1)
-    grads, pictures = [], []
+    grads, pictures, back = [], [], []
     for lobes, sign in ((True, 1.0), (False, 1.0), (False, -1.0)):
         nets = networks.initial(arch, 1.0, torch.Generator().manual_seed(0))
         nets.tensors["reflectance.layers.1.bias"].data[:3] = -rays().d[0]  # seen from the front
         image = volume.render(nets, rays(), samples, lobes=lobes)
         (sign * image.color.square().sum()).backward()
         grads.append(nets.tensors["reflectance.layers.1.weight"].grad.abs().sum(1))
+        back.append(rim and nets.tensors[RETRO].grad is not None)
         pictures.append(image.color.detach())
     whole, darker, brighter = grads
     assert (whole > 0).all() and (darker[3:6] > 0).all() and (darker[6:] == 0).all()
     assert darker[:3].sum() < 1e-3 * brighter[:3].sum()
+    assert not rim or back == [True, False, False]
     assert torch.equal(pictures[0], pictures[1]) and image.reflectance.normal.requires_grad
 
 
@@ -262,7 +265,7 @@ def test_a_new_field_is_matt():
     learned = nets.reflectance(torch.rand(100, 3, generator=generator) - 0.5)
     facing = torch.ones(100)
     _, gloss = microfacet.lobes_collocated(ops, facing, learned.roughness)
-    _, weight = fresnel.weights_collocated(ops, facing, learned.roughness, learned.specular.T, True)
+    _, weight = fresnel.weights_collocated(ops, facing, learned.roughness, learned.specular.T, 0.0)
     assert float((math.pi * weight * gloss).max().detach()) < 0.03
 
 
@@ -317,17 +320,17 @@ def test_psnr_of_a_known_error(monkeypatch):
     assert fit.srgb == pytest.approx(120, abs=20)  # float32
 
 
-@pytest.mark.parametrize("rim", [False, True])
-def test_training_shades_by_the_phase_function_seen_from_the_light(rim):
+@pytest.mark.parametrize("retro", [None, 0.0, 0.7])
+def test_training_shades_by_the_phase_function_seen_from_the_light(retro):
     """Photographs are compared with the value of the renderers' phase function for ω_i = ω_o."""
     cos, roughness = np.linspace(0.05, 1, 20), np.linspace(0.2, 1, 20)
     specular = np.stack([np.linspace(0, 0.9, 20), np.linspace(0.9, 0, 20), np.full(20, 0.5)])
     w, n = (np.sqrt(1 - cos**2), 0 * cos, cos), (0 * cos, 0 * cos, 1 + 0 * cos)
     diffuse, gloss = microfacet.scattering(numpy_ops, w, w, n, roughness)
-    weights = fresnel.weights(numpy_ops, w, w, n, roughness, specular, True) if rim else (1 - specular, specular)
+    weights = fresnel.weights(numpy_ops, w, w, n, roughness, specular, retro)
     rows = [torch.as_tensor(np.stack(v, 1)) for v in (n, [0.6 + 0 * cos] * 3, w)]
     reflectance = *rows[:2], *map(torch.as_tensor, (roughness, specular.T))
-    actual = volume.shade(reflectance, -rows[2], torch.full((20,), 2.0), torch.full((20, 3), 4.0), rim)
+    actual = volume.shade(reflectance, -rows[2], torch.full((20,), 2.0), torch.full((20, 3), 4.0), retro)
     expected = weights[0] * 0.6 * diffuse + weights[1] * gloss
     np.testing.assert_allclose(actual.T, expected, rtol=1e-9)  # float64 rounding of sines
 

@@ -30,8 +30,8 @@ def materials(n: int, seed: int = 1):
     return u[:, :3], 0.15 + 0.85 * u[:, 3], 0.04 + 0.9 * u[:, 4:]
 
 
-@pytest.mark.parametrize("rim", [False, True])
-def test_light_at_the_camera_is_the_collocated_formula(rim):
+@pytest.mark.parametrize("retro", [None, 0.0, 0.7])
+def test_light_at_the_camera_is_the_collocated_formula(retro):
     """Term by term: light weight times what points scatter back, whatever the sample's normal and depth."""
     n = 2000
     u = torch.rand(n, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
@@ -40,9 +40,9 @@ def test_light_at_the_camera_is_the_collocated_formula(rim):
     x, optical = camera + t[:, None] * d, Optical(0.01 + 3 * u[:, 1], 5 * u[:, 2])
     reflectance = directions(n, 3), *materials(n)
     lamp = shots.flash(camera, TransmittanceTargets())
-    actual = lamp.send(optical, reflectance, d, x, torch.zeros(n).long(), light, rim)
+    actual = lamp.send(optical, reflectance, d, x, torch.zeros(n).long(), light, retro)
     _, v = optical.weights()
-    expected = v[:, None] * volume.shade(reflectance, d, t, light, rim)
+    expected = v[:, None] * volume.shade(reflectance, d, t, light, retro)
     assert 0.4 < float((expected > 0).any(1).double().mean()) < 0.6, "what faces the camera, and what does not"
     np.testing.assert_allclose(actual, expected, rtol=1e-9, atol=1e-15)
 
@@ -50,8 +50,8 @@ def test_light_at_the_camera_is_the_collocated_formula(rim):
 class Skin:
     """A half space below z = 0, of a density that goes up and down, and one reflectance."""
 
-    def __init__(self, roughness: float, specular: float, rim: bool):
-        self.gloss, self.fresnel = (roughness, specular), rim
+    def __init__(self, roughness: float, specular: float, retro: float | None):
+        self.gloss, self.retro, self.fresnel = (roughness, specular), retro, retro is not None
         self.phase = None
 
     def log_density(self, x):
@@ -67,17 +67,17 @@ def toward(degrees: float) -> np.ndarray:
     return np.array([np.sin(np.radians(degrees)), 0.0, np.cos(np.radians(degrees))])
 
 
-def surface(wi, wo, roughness, specular, rim) -> np.ndarray:
+def surface(wi, wo, roughness, specular, retro) -> np.ndarray:
     """ρ ⟨n,ω_i⟩ (3,) of the surface z = 0 of that reflectance, as the renderers have it, float64."""
     n = np.array([0.0, 0.0, 1.0])
     diffuse, gloss = microfacet.lobes(numpy_ops, wi, wo, n, roughness)
-    a, b = fresnel.weights(numpy_ops, wi, wo, n, roughness, specular, rim)
+    a, b = fresnel.weights(numpy_ops, wi, wo, n, roughness, specular, retro)
     return np.float32([0.7, 0.5, 0.2]) * a * diffuse + b * gloss
 
 
-@pytest.mark.parametrize("rim", [False, True])
+@pytest.mark.parametrize("retro", [None, 0.0, 0.7])
 @pytest.mark.parametrize(("roughness", "specular"), [(0.9, 0.0), (0.3, 0.6), (0.5, 1.0)])
-def test_an_opaque_skin_lit_from_aside_is_its_surface(roughness, specular, rim):
+def test_an_opaque_skin_lit_from_aside_is_its_surface(roughness, specular, retro):
     """ρ ⟨n,ω_i⟩ I/d², from all sides and of any profile (Lommel and Seeliger), however coarse the cells are."""
     power = torch.tensor([30.0, 20.0, 10.0])
     for viewer, light in ANGLES:
@@ -90,15 +90,15 @@ def test_an_opaque_skin_lit_from_aside_is_its_surface(roughness, specular, rim):
             t = 4 + width * (torch.arange(cells) + 0.5)
             batch = rays.Rays(o, d, torch.tensor([3.0]), torch.tensor([5.0]), torch.zeros(1, 4), power[None],
                               torch.zeros(1).long())
-            image = volume.render(Skin(roughness, specular, rim), batch, (torch.zeros(cells).long(), t, torch.full(
+            image = volume.render(Skin(roughness, specular, retro), batch, (torch.zeros(cells).long(), t, torch.full(
                 (cells,), width)), flash=shots.flash(place, TransmittanceTargets()))
-            expected = surface(wi, wo, roughness, specular, rim) * power.numpy() / 9
+            expected = surface(wi, wo, roughness, specular, retro) * power.numpy() / 9
             # Light that comes back from down to 0.02 sees other angles and distances: sharp lobes most.
             np.testing.assert_allclose(image.color[0], expected, rtol=0.03, err_msg=f"{viewer}, {light}, {cells}")
 
 
-@pytest.mark.parametrize("rim", [False, True])
-def test_a_thin_skin_is_the_integral_over_its_depth(rim):
+@pytest.mark.parametrize("retro", [None, 0.0, 0.7])
+def test_a_thin_skin_is_the_integral_over_its_depth(retro):
     """L = ∫ e^{−τ/c_o − τ/c_i} f dτ/c_o · I/d² with the renderer's phase function f, by quadrature."""
     edges = np.linspace(0, 0.8, 20001)  # optical depth along the normal
     tau = (edges[1:] + edges[:-1]) / 2
@@ -106,7 +106,7 @@ def test_a_thin_skin_is_the_integral_over_its_depth(rim):
         wi, wo = toward(light), toward(viewer)
         n, albedo, roughness, specular = np.array([0.0, 0, 1]), 0.4, 0.4, 0.3
         diffuse, gloss = microfacet.scattering(numpy_ops, wi, wo, n, roughness)
-        a, b = fresnel.weights(numpy_ops, wi, wo, n, roughness, specular, rim)
+        a, b = fresnel.weights(numpy_ops, wi, wo, n, roughness, specular, retro)
         lost = np.exp(-tau / wo[2] - tau / wi[2]).sum() * edges[1] / wo[2]
         expected = (a * albedo * diffuse + b * gloss) * lost * 5 / 2**2
         # Cells of unequal depths.
@@ -119,7 +119,7 @@ def test_a_thin_skin_is_the_integral_over_its_depth(rim):
         reflectance = row["n"], albedo * one[:, None].expand(31, 3), roughness * one, specular * one[:, None]
         actual = shots.flash(torch.as_tensor(2 * wi[None]), TransmittanceTargets()).send(
             optical, reflectance, -row["wo"], torch.zeros(31, 3).double(), torch.zeros(31).long(),
-            5 * one[:, None].expand(31, 3), rim)
+            5 * one[:, None].expand(31, 3), retro)
         np.testing.assert_allclose(actual.sum(0), expected, rtol=1e-6)  # of the quadrature
 
 
@@ -131,7 +131,7 @@ def test_nothing_is_sent_from_below():
     optical = Optical(torch.full((n,), 0.5).double(), torch.zeros(n).double())
     wi, _ = lamp.toward(torch.zeros(n).long(), torch.zeros(n, 3).double())
     actual = lamp.send(optical, (normal, *materials(n)), d, torch.zeros(n, 3).double(), torch.zeros(n).long(),
-                      torch.ones(n, 3).double(), False)
+                      torch.ones(n, 3).double(), None)
     both = ((normal * wi).sum(1) > 0) & ((normal * -d).sum(1) > 0)
     assert (actual[both] > 0).all() and (actual[~both] == 0).all() and 30 < int(both.sum()) < n - 30
 
@@ -147,7 +147,7 @@ def test_gradients():
     albedo, one = torch.full((n, 3), 0.6, dtype=torch.float64), torch.ones(n).double()
     d = torch.tensor([[0.0, 0, -1]]).double().expand(n, 3)
     sent = lamp.send(Optical(depth, front), (normal, albedo, one, 0 * one[:, None]), d, torch.zeros(n, 3).double(),
-                     torch.zeros(n).long(), 7 * one[:, None].expand(n, 3), False)
+                     torch.zeros(n).long(), 7 * one[:, None].expand(n, 3), None)
     sent[:, 0].sum().backward()
     cos_i, cos_o = ((normal.detach() * v).sum(1) for v in (wi, -d))
     assert float(cos_i.min()) > flash.LEAST_COSINE < float(cos_o.min())
@@ -160,7 +160,7 @@ def test_gradients():
     # A highlight: brighter towards the half vector.
     normal = F.normalize(wi - d + 0.1 * directions(n, 9), dim=1).requires_grad_()
     lamp.send(Optical(depth, front), (normal, 0 * albedo, 0.5 * one, one[:, None]), d,
-              torch.zeros(n, 3).double(), torch.zeros(n).long(), one[:, None].expand(n, 3), False).sum().backward()
+              torch.zeros(n, 3).double(), torch.zeros(n).long(), one[:, None].expand(n, 3), None).sum().backward()
     half = F.normalize(wi - d, dim=1)
     across = half - (half * normal.detach()).sum(1, keepdim=True) * normal.detach()
     assert ((normal.grad * across).sum(1) > 0).all()
@@ -229,7 +229,7 @@ def test_shadow_and_light_are_where_an_opaque_ball_puts_them():
     for number in (0, 1):
         actual = lamp.reaching(torch.full((len(x),), number), torch.as_tensor(x, dtype=torch.float32)).numpy()
         nearest, _ = way(x, LAMPS[number].numpy().astype(float))
-        # Voxels of 1/64 smear the ball's rim.
+        # Voxels of 1/64 smear the ball's retro.
         shadow, light = nearest < RADIUS - 0.025, nearest > RADIUS + 0.025
         assert shadow.sum() > 100 and light.sum() > 1000
         assert (actual[shadow] < 0.01).all(), actual[shadow].max()
@@ -302,7 +302,7 @@ def test_points_in_smoke_are_lit_one_by_one():
     albedo, roughness, specular = (v.float() for v in materials(n))
     optical = Optical(torch.full((n,), 0.2), torch.full((n,), 0.7))
     light = torch.full((n, 3), 6.0)
-    actual = lamp.send(optical, (normal, albedo, roughness, specular), d, tx, view, light, False)
+    actual = lamp.send(optical, (normal, albedo, roughness, specular), d, tx, view, light, None)
     path = LAMPS[view].numpy() - x
     distance = np.linalg.norm(path, axis=1)
     wi, wo, m = ((v / np.linalg.norm(v, axis=1, keepdims=True)).T for v in (path, -d.numpy(), normal.numpy()))

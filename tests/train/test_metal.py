@@ -26,7 +26,7 @@ def learned(albedo, specular, roughness: float) -> networks.Reflectance:
     arch = config.architecture
     generator = torch.Generator().manual_seed(0)
     small = Network(Encoding("planes", (8,), 4), (16,))
-    fresh = networks.initial(type(arch)(small, small, arch.transmittance, fresnel=arch.fresnel,
+    fresh = networks.initial(type(arch)(small, small, arch.transmittance, fresnel=arch.fresnel, retro=arch.retro,
                                         specular_channels=arch.specular_channels), 1.0, generator)
     field = {k: v for k, v in fresh.tensors.items() if k.startswith("reflectance")}
     optimizer = torch.optim.Adam(field.values(), lr=0.01, betas=(0.9, 0.99))
@@ -39,7 +39,7 @@ def learned(albedo, specular, roughness: float) -> networks.Reflectance:
         normal, view, cos = normal[seen], view[seen], cos[seen]
         now = fresh.reflectance(0.5 * normal)._replace(normal=normal)
         one = torch.ones(len(cos))
-        color = 0.5 * volume.shade(now, -view, one, one[:, None].expand(-1, 3), True)
+        color = 0.5 * volume.shade(now, -view, one, one[:, None].expand(-1, 3), fresh.retro)
         image = volume.Image(color, one, normal, one.long(), one.long(), one, now, color, one, 0.0)
         fading = config.lr_end ** (step / STEPS)
         loss = losses.color(color, flash_of(cos, albedo, specular, roughness), exposure)

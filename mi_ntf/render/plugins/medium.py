@@ -71,12 +71,13 @@ from . import properties
 REPRESENTATIONS = ("grid", "network")
 
 
-def _reflectance(source: Density, softness: Softness | Smoke, fresnel: bool, phase: float | None, emissive: bool
+def _reflectance(source: Density, softness: Softness | Smoke, retro: float | None, phase: float | None, emissive: bool
                  ) -> Callable[[Vector], Reflectance]:
     """Return the reflectance of field points as a function.
 
     The phase function holds it rather than the medium, which holds the phase function. The two would never be freed.
     """
+    back: Float | None = None if retro is None else dr.opaque(mi.Float, retro)
     lobe = None if phase is None else HenyeyGreenstein(phase, module_of(mi.Float))
 
     def reflectance(x: Vector) -> Reflectance:
@@ -86,7 +87,7 @@ def _reflectance(source: Density, softness: Softness | Smoke, fresnel: bool, pha
             return smoke(black, lobe)._replace(emission=colour)
         if lobe:
             return smoke(source.reflectance(x)[1], lobe)
-        return Reflectance(*source.reflectance(x), softness(x), fresnel)
+        return Reflectance(*source.reflectance(x), softness(x), back)
 
     return reflectance
 
@@ -122,7 +123,7 @@ def medium_class(phase_class: type) -> type:
             else:
                 self.source = (
                     grid if self.representation == "grid" else NetworkVolume(self.field.network, grid, bound))
-            self.reflectance = _reflectance(self.source, self.field.softness, self.field.fresnel, self.field.phase,
+            self.reflectance = _reflectance(self.source, self.field.softness, self.field.retro, self.field.phase,
                                             self.field.emissive)
             self.frame = Frame(self.field.similarity, to_world, scale)
             self.path = path

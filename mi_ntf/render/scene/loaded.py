@@ -59,9 +59,9 @@ class LoadedField:
         return self.header.architecture.phase
 
     @property
-    def fresnel(self) -> bool:
-        """True if the specular weight grows towards grazing angles."""
-        return self.header.architecture.fresnel
+    def retro(self) -> float | None:
+        """Retro-reflection of :mod:`mi_ntf.core.fresnel`, None if the specular weight is the same at all angles."""
+        return self.network.retro
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,8 @@ class VolumeField:
     phase: float | None = None
     softness: Softness | Smoke = field(default_factory=Smoke)
     emissive: bool = False
-    fresnel = trained = False
+    retro: float | None = None
+    trained = False
 
     @property
     def digest(self) -> str:

@@ -99,7 +99,7 @@ def describe(scene: mi.Scene, settings: Settings, sensor: mi.Sensor, spp: int, m
     if collocated:
         reason += "; not needed where the camera's own transmittance is the light's"
     in_view = _in_view(sensor, media)
-    rims = [m.field.fresnel for m in media]
+    rims = [m.field.retro is not None for m in media]
     return Effects(
         emitters=tuple(lights.kinds),
         lit=lit,
