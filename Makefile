@@ -4,8 +4,9 @@ RUN := .venv/bin/python
 
 .PHONY: setup demo docs test hard-cases mutants clean
 
+# EXTRAS="train view" also installs these extras of pyproject.toml.
 setup:
-	@$(PYTHON) tools/setup_env.py
+	@$(PYTHON) tools/setup_env.py $(EXTRAS)
 
 demo:
 	@$(PYTHON) tools/setup_env.py eval mesh
