@@ -51,7 +51,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with interruption.noticed():
             command = parse(words)
-            with progress.silent(bool(getattr(command, "json", False))):
+            with (progress.silent(bool(getattr(command, "json", False))),
+                  progress.before_imports(f"starting {words[0]}")):
                 return command.run() or 0
     except SystemExit as leave:  # argument parsers end this way, with 0 after help and 2 on bad usage
         return leave.code if isinstance(leave.code, int) else 2

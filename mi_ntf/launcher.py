@@ -11,85 +11,36 @@ import argparse
 import ctypes
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import NoReturn
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import OpenEXR
 
-from mi_ntf.commands.options import SCENE_HELP, SceneOptions, UsageError
+from mi_ntf.commands.options import SceneOptions
 from mi_ntf.core import files, ops, progress, srgb
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.core.variants import enough_threads
 from mi_ntf.render import log
 from mi_ntf.render.scene import scene_file
 from mi_ntf.render.scene.environment_option import Environment
-from mi_ntf.watch import TEV, Tev, printed, watch
+from mi_ntf.watch import Tev, printed, watch
 
 SUFFIXES = {"OpenEXR": ".exr", "RGBE": ".rgbe", "PFM": ".pfm"}
 """Suffix of the files that a film writes, by its ``file_format``."""
 
 
-class _Parser(argparse.ArgumentParser):
-    """Parser that answers bad usage with one sentence, without the line of usage."""
-
-    def error(self, message: str) -> NoReturn:
-        """Raise UsageError."""
-        raise UsageError(f"{message}; `{self.prog} -h` describes the options")
-
-
-def parser() -> argparse.ArgumentParser:
-    """Return the parser of the stock program's command line and of further options."""
-    p = _Parser("mi-ntf render", description="Render Mitsuba scenes with the flags of the program "
-                                "`mitsuba` and some more.")
-    p.add_argument("scenes", nargs="+", metavar="SCENE.xml", help="Scenes to render, one after the other.")
-    p.add_argument("-m", "--mode", default="", metavar="VARIANT", help=SCENE_HELP["mode"])
-    p.add_argument("-v", "--verbose", action="count", default=0, help="More messages; may be given twice.")
-    p.add_argument("-t", "--threads", type=int, metavar="COUNT", help="Number of CPU threads (1 counts as 2).")
-    p.add_argument("-D", "--define", action="append", default=[], metavar="KEY=VALUE",
-                   help=SCENE_HELP["define"])
-    p.add_argument("-s", "--sensor", type=int, default=0, metavar="INDEX", help="Sensor to render (default 0).")
-    p.add_argument("-a", "--append", default="", metavar="PATH;PATH", help="Folders to search for resources.")
-    p.add_argument("-o", "--output", metavar="FILE",
-                   help="Image to write: .exr, or .png, which has 8 bits, sRGB's curve and a black background. The "
-                        "default is an EXR file beside the scene.")
-    p.add_argument("-O", type=int, choices=range(6), dest="optimise", metavar="0-5",
-                   help="Optimisation level of Dr.Jit.")
-    p.add_argument("-S", action="store_true", dest="print_ir", help="Print the intermediate representation.")
-    p.add_argument("-V", type=int, dest="width", metavar="WIDTH", help="Vector width of LLVM kernels, a power of two.")
-    p.add_argument("-W", action="count", default=0, dest="wavefront", help="Wavefronts in place of a megakernel.")
-    extra = p.add_argument_group("options that the program `mitsuba` does not have")
-    extra.add_argument("--env", type=Path, metavar="FILE",
-                       help=SCENE_HELP["env"])
-    extra.add_argument("--env-rotate", type=float, default=0.0, metavar="DEG",
-                       help=SCENE_HELP["env_rotate"])
-    extra.add_argument("--env-scale", type=float, default=1.0, metavar="S", help=SCENE_HELP["env_scale"])
-    extra.add_argument("--exposure", type=float, default=0.0, metavar="STOPS",
-                       help="Exposure of a PNG image (default 0).")
-    extra.add_argument("--watch", action="store_true",
-                       help="Render again when a file of the scene changes, until Ctrl-C, and send pictures to tev.")
-    extra.add_argument("--tev", default=TEV, metavar="HOST:PORT", help=f"Address of tev (default {TEV}).")
-    return p
-
-
-def main(arguments: Sequence[str]) -> None:
-    """Run the command line `arguments` (without the program's name).
+def main(args: argparse.Namespace) -> None:
+    """Render as :func:`mi_ntf.commands.render_line.parsed` says.
 
     Raises MiNtfError, OSError or RuntimeError if the work failed and UsageError on bad usage.
     """
-    p = parser()
-    args = p.parse_args(arguments)
     options = SceneOptions(args.mode, tuple(args.define), args.env, args.env_rotate, args.env_scale)
     parameters = options.parameters()
     output = Path(args.output) if args.output else None
-    if args.exposure and (output is None or output.suffix.lower() != ".png"):
-        p.error("--exposure is for PNG images: give -o IMAGE.png")
-    if args.watch and len(args.scenes) > 1:
-        p.error(f"--watch takes one scene, found {len(args.scenes)}")
     _set_log_level(args.verbose)
     environment = options.environment()
     _apply_settings(args)

@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional
 
 from mi_ntf.commands import options
-from mi_ntf.core import extras, files, progress
+from mi_ntf.core import extras, files
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.jobs.options import Workers
 
@@ -158,8 +158,7 @@ class Train:
         extras.need("train", "training", "torch", "matplotlib", "PIL")
         if self.view:
             extras.need("view", "--view")
-        with progress.Stage("starting PyTorch"):
-            from mi_ntf.train import train
+        from mi_ntf.train import train
 
         report = train(self.dataset, self.output, preset=self.preset, minutes=self.minutes, steps=self.steps,
                        seed=self.seed, tensorboard=self.tensorboard, field=self.field, further=self.further,

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from mi_ntf.commands import options
 from mi_ntf.commands.options import Flag, Json
+from mi_ntf.core import progress
 
 
 @dataclass
@@ -16,7 +17,8 @@ class Doctor:
         """Print the checks. The result is 1 if rendering is impossible."""
         from mi_ntf.doctor import examine, print_table
 
-        report = examine()
+        with progress.Stage("examining this machine"):
+            report = examine()
         options.print_report(report, self.json, print_table)
         return 0 if report.ok else 1
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
 from tyro.conf import Positional, UseAppendAction, arg
 
+from mi_ntf.core import progress
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.core.variants import VARIANTS
 from mi_ntf.jobs.options import Workers
@@ -147,6 +148,7 @@ def flash_of(text: str | None) -> tuple[float, float, float] | Literal["estimate
 
 def print_report(report: Report, as_json: bool, print_table: Callable[[Report], None]) -> None:
     """Print the result of a command as JSON, or for a reader by `print_table`."""
+    progress.give_way()
     if as_json:
         data = asdict(report) if is_dataclass(report) and not isinstance(report, type) else report
         print(json.dumps(data, indent=2, default=str))

@@ -7,8 +7,8 @@ from typing import Annotated
 
 from tyro.conf import Positional
 
-from mi_ntf.commands import options
-from mi_ntf.core import extras, files
+from mi_ntf.commands import options, render_line
+from mi_ntf.core import extras, files, progress
 from mi_ntf.jobs.options import Workers
 
 
@@ -47,9 +47,11 @@ class Render:
 
     def run(self) -> None:
         """Render the scenes."""
+        args = render_line.parsed(self.arguments)
         from mi_ntf.launcher import main as launch
 
-        launch(self.arguments)
+        progress.give_way()  # Mitsuba's log shows the progress
+        launch(args)
 
 
 @dataclass

@@ -13,7 +13,7 @@ Work is done in stages. The title of a stage that counts is a plural noun, that 
 
 A terminal shows one line, which is removed at the end of the stage: ``photographs: 12 of 120, 25 s left``. Elsewhere
 the line is printed when the stage begins, and every ten seconds. Stages within others are appended to it. Within
-:func:`silent`, which is `--json`, nothing is shown.
+:func:`silent`, which is `--json`, nothing is shown. A stage that gives way ends when the next one begins.
 
 Time that is left is counted down from `seconds` if they are given. Otherwise it is estimated from the second update on,
 since what is done first also compiles kernels.
@@ -29,7 +29,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from types import TracebackType
 from typing import TypeVar
 
@@ -40,6 +40,8 @@ S = TypeVar("S", bound="Stage")
 
 BLINK, PLAIN = 0.25, 10.0
 """Seconds between two updates of a terminal's line, and between two plain lines."""
+HEAVY = frozenset(("mitsuba", "drjit", "torch", "matplotlib", "scipy", "skimage", "cv2", "PIL", "viser", "OpenEXR"))
+"""Packages that take long to import."""
 
 
 class Stage:
@@ -59,6 +61,8 @@ class Stage:
         End of the sentence after Ctrl-C: how to go on. By default it says that nothing was written.
     warm
         Number of things at the beginning that compile kernels, so that their time says nothing on that of the others.
+    gives_way
+        The stage is shown until another one begins, and has no sentence after Ctrl-C from then on.
     inner
         Show the stage within another one only, unless it has `write`. The other one has the sentence after Ctrl-C.
     shown
@@ -68,10 +72,10 @@ class Stage:
     """
 
     def __init__(self, title: str, total: int = 0, *, done: int = 0, seconds: float = 0.0, then: str = "",
-                 warm: int = 1, inner: bool = False, shown: bool = True, write: Callable[[str], None] | None = None,
-                 interval: float = PLAIN) -> None:
+                 warm: int = 1, gives_way: bool = False, inner: bool = False, shown: bool = True,
+                 write: Callable[[str], None] | None = None, interval: float = PLAIN) -> None:
         self.title, self.total, self.then, self.write, self.interval = title, total, then, write, interval
-        self.done, self.text = float(done), ""
+        self.done, self.text, self.gives_way = float(done), "", gives_way
         self._seconds, self._warm, self._inner, self._shown = seconds, done + warm if total else 0, inner, shown
         self._begin = self._last = time.monotonic()
         self.visible = False
@@ -84,8 +88,9 @@ class Stage:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
                  ) -> None:
+        was_visible = self.visible
         _shown.end(self)
-        if error is not None and interruption.caused(error):
+        if error is not None and interruption.caused(error) and (was_visible or not self.gives_way):
             if isinstance(error, KeyboardInterrupt) and (self._inner or (str(error) and not self.then)):
                 return
             where = f"after {self.done:.0f} of {self.total} {self.title}" if self.total else f"while {self.title}"
@@ -136,6 +141,7 @@ class _Shown:
 
     def __init__(self) -> None:
         self.silent = False
+        self.count = 0  # Number of stages that were shown so far
         self._stages: list[Stage] = []
         self._lock = threading.RLock()
         self._over = threading.Event()
@@ -144,9 +150,12 @@ class _Shown:
 
     def begin(self, stage: Stage, inner: bool) -> None:
         with self._lock:
-            if self.silent or (inner and not self._stages and not stage.write):
+            work = [earlier for earlier in self._stages if not earlier.gives_way]
+            if self.silent or (inner and not work and not stage.write):
                 return
+            self.give_way()
             self._stages.append(stage)
+            self.count += 1
             stage.visible = True
             try:
                 if len(self._stages) == 1:
@@ -156,6 +165,11 @@ class _Shown:
             except BaseException:
                 self.end(stage)
                 raise
+
+    def give_way(self) -> None:
+        """End the stages that give way, where other output begins."""
+        for stage in [stage for stage in self._stages if stage.gives_way]:
+            self.end(stage)
 
     def end(self, stage: Stage) -> None:
         with self._lock:
@@ -217,7 +231,7 @@ class _Shown:
 
 
 _shown = _Shown()
-clear = _shown.clear
+clear, give_way = _shown.clear, _shown.give_way
 
 
 @contextmanager
@@ -228,6 +242,22 @@ def silent(yes: bool = True) -> Iterator[None]:
         yield
     finally:
         _shown.silent = before
+
+
+@contextmanager
+def before_imports(title: str) -> Iterator[None]:
+    """Show a stage within the block as soon as a package of :data:`HEAVY` is looked for, unless another came first."""
+    count = _shown.count
+    with ExitStack() as stack:
+        class Finder:
+            @staticmethod
+            def find_spec(name: str, path: object = None, target: object = None) -> None:
+                if name in HEAVY and _shown.count == count:
+                    stack.enter_context(Stage(title, gives_way=True))
+
+        sys.meta_path.insert(0, finder := Finder())
+        stack.callback(sys.meta_path.remove, finder)
+        yield
 
 
 def say(text: str, warning: bool = False) -> None:

@@ -153,3 +153,21 @@ def test_ctrl_c_is_seen_in_a_thread_for_which_the_main_one_waits():
         threading.Thread(target=bake).start()
         hashlib.pbkdf2_hmac("sha256", b"a second in C", b"", 2_000_000)
     assert seen == ["stopped while baking; nothing was written"]
+
+
+def test_a_stage_that_gives_way_is_shown_until_the_next_one(capsys):
+    with progress.Stage("starting", gives_way=True) as start:
+        with progress.Stage("baking", inner=True):  # no work that it could be a part of
+            assert start.visible
+        with progress.Stage("reading") as reading:
+            assert reading.line() == "reading" and not start.visible
+        with pytest.raises(KeyboardInterrupt, match=r"^stopped while starting; nothing was written$"), \
+                progress.Stage("starting", gives_way=True):
+            raise KeyboardInterrupt
+    assert capsys.readouterr().err == "starting\nreading\nstarting\n"
+
+
+def test_ctrl_c_has_no_sentence_of_a_stage_that_gave_way():
+    with pytest.raises(KeyboardInterrupt, match=r"^$"), progress.Stage("starting", gives_way=True):
+        progress.give_way()
+        raise KeyboardInterrupt
