@@ -24,10 +24,12 @@ from .transmittance_targets import TransmittanceTargets
 
 BOUNCE_TIMES = (0.3, 0.45, 0.6, 0.75)
 """Times, as fractions of the run, at which bounced light is computed: the skin has formed, and albedo follows."""
-BOUNCE_SECONDS = 20.0
-"""Seconds of a run for each of these rounds, which take a few each; the shortest runs do without."""
+BOUNCE_SHARE = 0.2
+"""Largest fraction of a run in minutes that its rounds of bounced light may take."""
 BOUNCE_COST = 2.0
 """Expected time of the first round, relative to that of shaping the visual hull; later ones take that of the last."""
+HULL_SHARE = 0.2
+"""Largest fraction of a run in minutes in which the visual hull is shaped."""
 ESTIMATE_TIMES = (0.1, 0.2, 0.3, 0.4, 0.55)
 """Times at which the position of the flash is estimated, if it is unknown. Position and shape improve in turns."""
 NOTICED = 6.0
@@ -53,6 +55,7 @@ class Course:
     samples_per_ray: float = 30.0
     meeting: float = 0.5  # Fraction of the sampled pixels whose rays meet the hull
     bounce: float = 0.0  # Time that a round of bounced light takes, as a fraction of the run; 0 in runs given in steps
+    bounced: float = 0.0  # Time that all rounds so far have taken, as a fraction of the run
 
 
 class Fast:
@@ -181,6 +184,9 @@ class Fast:
         self.clock.count()
         before = self.clock.progress
         for step in range(steps):
+            self.clock.count()
+            if self.clock.timed and self.clock.progress - before > HULL_SHARE:
+                break
             inside = occupancy.index[torch.randint(len(occupancy.index), (points,), generator=generator)]
             x = torch.cat([occupancy.positions(inside, generator), occupancy.must_be_empty(points, generator)])
             raw = self.networks.log_density(x)
@@ -220,14 +226,17 @@ class Fast:
                 self.estimate_flash()
             clock.count()
         due = sum(time <= clock.progress for time in BOUNCE_TIMES)
-        # Runs given in steps do not depend on the time that they take.
-        due = 0 if clock.timed and clock.spent < BOUNCE_SECONDS * (course.rounds + 1) else due
         before = clock.progress
-        if course.rounds < due and before + course.bounce < self.field_until:
+        # Runs given in steps do not depend on the time that they take.
+        affordable = not clock.timed or (course.bounced + course.bounce < BOUNCE_SHARE
+                                         and before + course.bounce < self.field_until)
+        if course.rounds < due and affordable:
             course.rounds = due - 1
             self.update_bounced()
             clock.count()
-            course.bounce = clock.progress - before
+            if clock.timed:
+                course.bounce = clock.progress - before
+                course.bounced += course.bounce
 
     def estimate_flash(self) -> None:
         """Estimate the position of the flash relative to the lens. Use it, or warn if it is assumed at the lens."""

@@ -54,15 +54,19 @@ def test_pixels_fit_into_the_time_that_is_left(photographs):
     assert pace.Pace(Clock(steps=10), data).detail(math.inf, 0.0) == 1.0
 
 
-@pytest.mark.parametrize(("spent", "bounce", "done"), [
-    (5.0, 0.0, []), (25.0, 0.0, ["flash", "bounce"]), (50.0, 0.0, ["flash", "bounce"]), (50.0, 0.2, ["flash"])])
-def test_slow_runs_find_the_light_once_and_only_if_there_is_time(photographs, spent, bounce, done, monkeypatch):
-    """Several rounds are due at once where a step takes long; a round that does not fit any more is left out."""
+@pytest.mark.parametrize(("spent", "bounce", "earlier", "done"), [
+    (5.0, 0.0, 0.0, []), (25.0, 0.0, 0.0, ["flash", "bounce"]), (50.0, 0.0, 0.0, ["flash", "bounce"]),
+    (25.0, 0.15, 0.0, ["flash", "bounce"]), (25.0, 0.15, 0.1, ["flash"]), (50.0, 0.15, 0.0, ["flash"])])
+def test_slow_runs_find_the_light_once_and_only_if_there_is_time(photographs, spent, bounce, earlier, done, monkeypatch):
+    """Several rounds are due at once where a step takes long.
+
+    A round is left out if it does not fit any more, or if it and the `earlier` ones take too much of the run.
+    """
     clock = Clock(minutes=1.0, spent=spent)
     run = Run(TrainingData.load(photographs, Notes(False), {}), clock, Learner(clock), Notes(False),
               torch.Generator().manual_seed(0))
     recipe, work = fast.Fast(FastConfig(), run, estimate=True), []
-    clock.spent, clock.last, recipe.course.bounce = spent, time.monotonic(), bounce
+    clock.spent, clock.last, recipe.course.bounce, recipe.course.bounced = spent, time.monotonic(), bounce, earlier
 
     def stand_in(name, counter):
         def function():
@@ -75,6 +79,25 @@ def test_slow_runs_find_the_light_once_and_only_if_there_is_time(photographs, sp
     for _ in range(3):
         recipe.find_light()
     assert work == done
+
+
+def test_a_slow_machine_shapes_a_part_of_the_hull(photographs, monkeypatch):
+    """On a machine that takes a second for each step, the hull gets its part of the minute and no more."""
+    now = time.monotonic()
+    clock = Clock(minutes=1.0, last=now)
+    run = Run(TrainingData.load(photographs, Notes(False), {}), clock, Learner(clock), Notes(False),
+              torch.Generator().manual_seed(0))
+    recipe, steps = fast.Fast(FastConfig(), run), []
+
+    def stand_in(*args: object) -> float:
+        steps.append(args)
+        clock.last -= 1.0
+        return 0.0
+
+    monkeypatch.setattr(run.learner, "descend", stand_in)
+    clock.spent, clock.last = 0.0, time.monotonic()
+    recipe.carve()
+    assert len(steps) <= 60 * fast.HULL_SHARE + 1 and recipe.course.bounce >= fast.BOUNCE_COST * fast.HULL_SHARE
 
 
 @pytest.mark.slow
