@@ -172,6 +172,23 @@ def test_command(folder, process, words):
         assert words[1] != "info" or '<point name="center"' in printed
 
 
+@pytest.mark.parametrize("name", ["README.md", "docs/start.md"])
+def test_programs_of_the_environment_come_after_its_activation(name):
+    """Commands of a page are on the path once `. .venv/bin/activate` was run, and those before say how long they take.
+    """
+    lines = [line.strip() for line in (ROOT / name).read_text(encoding="utf-8").splitlines() if line.startswith("    ")]
+    shown = [line for line in lines if re.match(r"(mi-ntf|mitsuba|python|make|pip|\. \.venv)", line)]
+    activation = [line.startswith(". .venv/bin/activate") for line in shown].index(True)
+    before = shown[:activation]
+    assert before and all(re.match(r"make \w+.* # \d+ (s|min).*download", line) for line in before)
+
+
+def test_long_commands_of_the_readme_say_how_long_they_take():
+    lines = re.findall(r"^    ((?:mi-ntf|mitsuba|make) .*)$", (ROOT / "README.md").read_text(encoding="utf-8"), re.M)
+    assert len(lines) > 6
+    assert all(re.search(r"# .*\d+ (s|min)|--minutes \d+", line) for line in lines)
+
+
 def test_every_command_is_shown():
     shown = {words[1] for words in COMMANDS if words[0] == "mi-ntf"}
     assert shown == set(cli.COMMANDS)

@@ -68,6 +68,7 @@ def main(extras: list[str]) -> None:
     run(str(PYTHON), "-m", "mi_ntf", "bridge")
     run(str(PYTHON), "-m", "mi_ntf", "doctor")
     STAMP.write_text(json.dumps({"key": key, "extras": wanted}))
+    say("done; `. .venv/bin/activate` puts mitsuba and mi-ntf on the path")
 
 
 def fingerprint() -> str:

@@ -6,6 +6,7 @@ import pytest
 from helpers import scenes
 
 from mi_ntf.infer.visibility import transmittance_atlas
+from mi_ntf.render import log
 from mi_ntf.render.scene.settings import Limits
 from mi_ntf.render.transport import choosing, pilot
 
@@ -201,3 +202,19 @@ def test_auto_counts_rays(blobs, light, size, spp, frames, visibility):
     lights = 32 if light == "env" else 1
     assert (size * size * spp * lights * frames > transmittance_atlas.RAYS) == (visibility != "raymarch")
     assert chooser.choose()[0].effects.visibility == visibility
+
+
+def test_the_log_of_a_limited_render_is_one_line_and_its_trials_are_at_level_debug(blobs, monkeypatch):
+    """The line has no number that was not measured."""
+    lines: dict[str, list[str]] = {"info": [], "debug": []}
+    for level, texts in lines.items():
+        monkeypatch.setattr(log, level, texts.append)
+    loaded = scenes.scene(blobs, nrf(max_error=0.1, max_noise=0.5), {"light": scenes.light("env")}, size=32, spp=2)
+    mi.render(loaded)
+    [outcome] = [text for text in lines["info"] if "ended by" in text]
+    assert len(outcome) < 160 and "error below" in outcome and "noise" in outcome
+    assert not any("nan" in text for text in lines["info"])
+    trials = loaded.integrator().achieved["trials"]
+    assert len(trials) > 1 and not any(trial["name"] in text for trial in trials if not trial["taken"]
+                                       for text in lines["info"])
+    assert len([text for text in lines["debug"] if "nrf integrator" in text]) >= len(trials)
