@@ -85,6 +85,8 @@ def print_table(report: Report) -> None:
     for check in report.checks:
         if check.remedy:  # never wrapped, so that commands can be copied
             console.print(f"{check.name}: {check.remedy}", soft_wrap=True, markup=False, highlight=False)
+    console.print("verdict: scenes can be rendered" if report.ok else
+                  "verdict: no scene can be rendered; mend what is marked ✘", soft_wrap=True, highlight=False)
 
 
 def check_python() -> Check:

@@ -39,4 +39,5 @@ def test_doctor_prints_a_remedy_on_one_line(capsys):
     remedy = "a command " + "that is long " * 20 + "and whole"
     check = doctor.Check("thing", False, True, "broken", remedy)
     doctor.print_table(doctor.Report(False, "1", [check]))
-    assert f"thing: {remedy}" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert f"thing: {remedy}" in printed and printed.endswith("no scene can be rendered; mend what is marked ✘\n")
