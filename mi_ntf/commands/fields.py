@@ -26,7 +26,7 @@ class Capture:
     folder: options.DataSet
     """Folder of the data set. An interrupted capture continues in it."""
     views: options.Count = 100
-    """Number of photographs for training and validation."""
+    """Number of photographs for training. A twentieth as many, at least 4, are added for validation."""
     size: options.Count = 128
     """Width and height in pixels."""
     test_views: options.Count = 20

@@ -209,7 +209,8 @@ def test_the_log_of_a_limited_render_is_one_line_and_its_trials_are_at_level_deb
     lines: dict[str, list[str]] = {"info": [], "debug": []}
     for level, texts in lines.items():
         monkeypatch.setattr(log, level, texts.append)
-    loaded = scenes.scene(blobs, nrf(max_error=0.1, noise_threshold=0.5), {"light": scenes.light("env")}, size=32, spp=2)
+    integrator = nrf(max_error=0.1, noise_threshold=0.5)
+    loaded = scenes.scene(blobs, integrator, {"light": scenes.light("env")}, size=32, spp=2)
     mi.render(loaded)
     [outcome] = [text for text in lines["info"] if "ended by" in text]
     assert len(outcome) < 160 and "error below" in outcome and "noise" in outcome

@@ -57,7 +57,8 @@ def test_pixels_fit_into_the_time_that_is_left(photographs):
 @pytest.mark.parametrize(("spent", "bounce", "earlier", "done"), [
     (5.0, 0.0, 0.0, []), (25.0, 0.0, 0.0, ["flash", "bounce"]), (50.0, 0.0, 0.0, ["flash", "bounce"]),
     (25.0, 0.15, 0.0, ["flash", "bounce"]), (25.0, 0.15, 0.1, ["flash"]), (50.0, 0.15, 0.0, ["flash"])])
-def test_slow_runs_find_the_light_once_and_only_if_there_is_time(photographs, spent, bounce, earlier, done, monkeypatch):
+def test_slow_runs_find_the_light_once_and_only_if_there_is_time(photographs, spent, bounce, earlier, done,
+                                                                 monkeypatch):
     """Several rounds are due at once where a step takes long.
 
     A round is left out if it does not fit any more, or if it and the `earlier` ones take too much of the run.
