@@ -98,11 +98,13 @@ class VoxelVolume:
         (k, 3) points whose convex hull holds all matter.
     dj
         Dr.Jit module of the back end.
+    constant
+        Extinction, 1/(unit-sphere radius), if it is the same throughout a convex body, whose extent is exact.
     """
 
     def __init__(self, arrays: dict[str, np.ndarray], header: Voxels, low: np.ndarray, high: np.ndarray, body: Convex,
-                 hull: np.ndarray, dj: ModuleType):
-        self.body, self.hull, self._dj = body, hull, dj
+                 hull: np.ndarray, dj: ModuleType, constant: float | None = None):
+        self.body, self.hull, self._dj, self.constant = body, hull, dj, constant
         density = bricks_of(arrays, "density", dj)
         self._density = Placed(density, np.array(header.counts), low, high, dj)
         self._albedo = tuple(dr.opaque(dj.Float, value) for value in header.albedo)

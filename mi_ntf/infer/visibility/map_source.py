@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import drjit as dr
 
@@ -13,7 +14,7 @@ from ..grid import Density
 from ..network import NetworkField
 from ..profile import DepthProfile
 from ..types import Float, Vector
-from . import two_logistics
+from . import depth_table, two_logistics
 
 CLEAR = -100.0
 """b of a ray that meets no matter: S(1·(t + 100)) = 1 in float32 for every t of the sphere."""
@@ -21,14 +22,24 @@ DEEP = 8.0
 """Argument below whose negative S(z) is e^z within e^−8 = 3e-4."""
 
 
+def mixture_tau(t: Float, mixture: Mixture) -> Float:
+    """Return τ(t), clipped as :func:`mi_ntf.core.logistic.sigmoid` is, which weights may be divided by."""
+    return sum(w * dr.rcp(1 + dr.exp(dr.clip(a * (b - t), -20, 80))) for w, a, b in mixture)
+
+
 @dataclass(frozen=True)
 class Source:
-    """Source of mixtures of `components` logistics; `weights`: False for one logistic of weight 1."""
+    """Source of mixtures of `components` logistics; `weights`: False for one logistic of weight 1.
+
+    A source may fill the same numbers with something else, whose transmittance is `tau`.
+    """
 
     fit: Callable[[Vector, Vector, Float], Mixture]
     """``(o, d, end)`` → mixtures of the rays through `o` along `d` towards a light at t' = `end`, maybe infinity."""
     components: int
     weights: bool
+    tau: Callable[[Float, Mixture], Float] = mixture_tau
+    """``(t, mixture)`` → τ at the place t' = `t`."""
 
 
 def network_source(field: NetworkField, profile: DepthProfile, inside: bool = True) -> Source:
@@ -68,6 +79,11 @@ def _relative_to(light: Float, mix: Mixture) -> Mixture:
         (part / (total * logistic.sigmoid(ops, a * (light - b))), a, b)
         for part, b, (_, a, _b) in zip(parts, near, mix, strict=True)
     )
+
+
+def table_source(profile: DepthProfile) -> Source:
+    """Return the source of tables of depth, in place of two logistics."""
+    return Source(partial(depth_table.fit, profile), 2, True, depth_table.tau)
 
 
 LEVELS = (1e-3, math.log(4 / 3), math.log(2), math.log(4))

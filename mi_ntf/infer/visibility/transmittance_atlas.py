@@ -8,6 +8,10 @@ on the line along its direction d_k that crosses the ray at the pivot x + c ω, 
 
 One of the four nearest directions and one of the four nearest texels is sampled by its bilinear weight: the mean is the
 interpolated τ, and the many points of a pixel average.
+
+In smoke the depths of neighbours differ by much of a mean free path, and the mean of τ is then brighter than the τ of
+the mean depth. Two samples are read there. With depths A and B, e^(−(A + B)/2 − (A − B)²/8) has the expectation e^−E[A]
+to third order in their standard deviation.
 """
 
 from collections.abc import Callable, Sequence
@@ -33,6 +37,10 @@ RAYS = tuning.ATLAS_SIDE**2 * tuning.ATLAS_RESOLUTION**2
 """Number of texels of all maps."""
 DARK = 3e-4
 """Transmittance of the map below which the sum close to x is skipped, and counts as clear."""
+FAINT = 1e-30
+"""Least transmittance whose logarithm is taken."""
+KEYS = ((0x5BD1E995, 0x297A2D39), (0x68E31DA4, 0xB5297A4D), (0x1B56C4E9, 0x9E3779B1), (0x7FEB352D, 0x846CA68B))
+"""Keys and factors of the words of random numbers after the first."""
 OUTSIDE = 0.98
 """Squared distance from the origin, field units, beyond which points lie in no skin: maps are read from the sphere
 on."""
@@ -94,10 +102,11 @@ class TransmittanceAtlas:
 
     def _product(self, x: Vector, wi: Vector, here: Float) -> Float:
         outside = dr.squared_norm(self.dj.Array3f(*x)) > OUTSIDE
-        *u, v = _uniforms(self.dj, self.stream, x, wi)
-        far = self._far(x, wi, here, outside, u)
+        *u, v = _uniforms(self.dj, self.stream, x, wi, 5 if self._skin else 9)
         if not self._skin:
-            return far
+            one, other = (-dr.log(dr.maximum(self._far(x, wi, here, outside, part), FAINT)) for part in (u[:4], u[4:]))
+            return dr.exp(-0.5 * (one + other) - (one - other) ** 2 / 8)
+        far = self._far(x, wi, here, outside, u)
 
         def near(far: Float, x: Vector, wi: Vector, v: Float) -> Float:
             return far * close_by(self.density, x, wi, v)
@@ -135,8 +144,8 @@ def close_by(density: Callable[[Vector], Float], x: Vector, wi: Vector, v: Float
     return dr.exp((-2 * tuning.REACH / tuning.STRATA) * depth)
 
 
-def _uniforms(dj: ModuleType, stream: UInt32, x: Vector, wi: Vector) -> list[Float]:
-    """Return five numbers in [0, 1), a function of the seed `stream` and the bits of a ray."""
+def _uniforms(dj: ModuleType, stream: UInt32, x: Vector, wi: Vector, count: int) -> list[Float]:
+    """Return `count` numbers in [0, 1), a function of the seed `stream` and the bits of a ray."""
     state = dj.UInt32(stream)
     for c, factor in zip((*x, *wi), (0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D, 0x27D4EB2F, 0x165667B1, 0xD3A2646D),
                          strict=True):
@@ -144,11 +153,11 @@ def _uniforms(dj: ModuleType, stream: UInt32, x: Vector, wi: Vector) -> list[Flo
         state = (state ^ (word * factor)) * 0x2C1B3C6D
         state ^= state >> 15
     words = [state]
-    for key, factor in ((0x5BD1E995, 0x297A2D39), (0x68E31DA4, 0xB5297A4D)):
+    for key, factor in KEYS[:(count - 1) // 2]:
         word = (words[-1] ^ key) * factor
         words.append(word ^ (word >> 15))
     halves = [half for word in words for half in (word & 0xFFFF, word >> 16)]
-    return [dj.Float(half) * 2.0**-16 for half in halves[:5]]
+    return [dj.Float(half) * 2.0**-16 for half in halves[:count]]
 
 
 def table(dj: ModuleType) -> LightTable:
@@ -165,13 +174,13 @@ def build(medium: Medium, lights: LightTable | None, options: Options, dj: Modul
     """Build the method, see :class:`mi_ntf.infer.visibility.method.Method`."""
     network = options.map_source == "network"
     step = options.step * tuning.ATLAS_STEP * (tuning.NETWORK_STEP if network else tuning.MAP_STEP)
-    begin, effort = tuning.BEGIN, two_logistics.ROUGH
-    if not medium.field.softness.opaque:
-        # Smoke has no skin: the maps begin at x, without a sum close to it.
-        step, begin, effort = max(step, tuning.SMOKE_STEP), 0.0, two_logistics.SMOKE
+    smoke = not medium.field.softness.opaque
+    if smoke and not network:
+        step = tuning.SMOKE_STEP
     profile = DepthProfile(medium.source, dr.opaque(dj.Float, step))
     source = (map_source.network_source(medium.field.network, profile, False) if network
-              else map_source.field_source(medium.source, profile, LOGISTICS, effort))
+              else map_source.table_source(profile) if smoke
+              else map_source.field_source(medium.source, profile, LOGISTICS, two_logistics.ROUGH))
     directions = table(dj)
     options = replace(options, map_resolution=tuning.ATLAS_RESOLUTION, map_components=LOGISTICS, half=True)
 
@@ -182,7 +191,7 @@ def build(medium: Medium, lights: LightTable | None, options: Options, dj: Modul
                 options=options)
     march = raymarch.build(medium, lights, options, dj, keep)
     # The voxels' density serves the sum also where the medium is its networks.
-    return TransmittanceAtlas(medium.field.grid.density, maps, begin, march, options, dj)
+    return TransmittanceAtlas(medium.field.grid.density, maps, 0.0 if smoke else tuning.BEGIN, march, options, dj)
 
 
 def numbers(medium: Medium, lights: LightTable | None, options: Options) -> int:

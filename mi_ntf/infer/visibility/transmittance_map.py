@@ -56,7 +56,7 @@ class TransmittanceMap:
                  values: np.ndarray | None = None, half: bool = False):
         self.dj, self.lights, self.count = dj, lights, lights.count
         self.rays = LightRays(lights, hull, resolution, dj)
-        self.width = channels(source.components, source.weights)
+        self.width, self._tau = channels(source.components, source.weights), source.tau
         count = lights.count * resolution**2
         self.texels = Texels(self._fit(source, count) if values is None else values, count, self.width, dj, half)
 
@@ -96,7 +96,7 @@ class TransmittanceMap:
         The ray is sampled by its bilinear weight with the uniform numbers `u` (2); τ is 1 where light meets nothing.
         """
         inside, texel = self.rays.one(index, x, u)
-        return dr.select(inside, dr.minimum(_tau(t, self._fetch(texel, inside)), 1), 1)
+        return dr.select(inside, dr.minimum(self._tau(t, self._fetch(texel, inside)), 1), 1)
 
     def _fetch(self, texel: UInt32, active: Mask) -> Mixture:
         row = self.texels.row(texel, active)
@@ -105,15 +105,10 @@ class TransmittanceMap:
         return tuple((row[k], row[k + 1], row[k + 2]) for k in range(0, self.width, 4))
 
 
-def _tau(t: Float, mixture: Mixture) -> Float:
-    """Return τ(t), clipped as :func:`mi_ntf.core.logistic.sigmoid` is, which weights may be divided by."""
-    return sum(w * dr.rcp(1 + dr.exp(dr.clip(a * (b - t), -20, 80))) for w, a, b in mixture)
-
-
 def _root(t: Float, mixture: Mixture) -> Float:
     """Return √τ(t)."""
     if len(mixture) > 1:
-        return dr.sqrt(_tau(t, mixture))
+        return dr.sqrt(map_source.mixture_tau(t, mixture))
     w, a, b = mixture[0]
     return dr.sqrt(w) * dr.rsqrt(1 + dr.exp(dr.clip(a * (b - t), -20, 80)))
 

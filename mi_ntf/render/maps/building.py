@@ -19,6 +19,7 @@ from ...infer.texels import DTYPES
 from ...infer.tuning import ATLAS_RESOLUTION
 from ...infer.types import Visibility
 from ...infer.visibility import REGISTRY
+from ...infer.visibility.closed_form import ClosedForm
 from ...infer.visibility.marched_begin import MarchedBegin
 from ...infer.visibility.marched_suns import MarchedSuns
 from ...infer.visibility.method import Options
@@ -90,7 +91,7 @@ def build(name: str, medium: NRFMedium, table: LightTable | None, options: Optio
     """Build the visibility method `name`, which is not ``auto``, for `medium`, in its field coordinates.
 
     `table`: lights in the same coordinates, for which the method stores tables; None for sampled lights. The result is
-    None for ``none``.
+    None for ``none``. A homogeneous medium in a convex body has a closed form, which takes the place of any method.
     """
 
     def keep(make: Callable[..., TransmittanceMap], *, channels: int, step: float,
@@ -114,6 +115,9 @@ def build(name: str, medium: NRFMedium, table: LightTable | None, options: Optio
             make_part=make_part, dtype=np.dtype(DTYPES[options.half]), placed=directions is None)
 
     method = REGISTRY[name]
+    constant = getattr(medium.source, "constant", None)
+    if constant is not None and name != "none" and not options.map_file:
+        return ClosedForm(medium.source, constant, module_of(mi.Float))
     if not method.numbers:
         return method.build(medium, table, options, module_of(mi.Float), keep)
     size = "" if method.per_field or table is None else f", {table.count} × {options.map_resolution}² texels"

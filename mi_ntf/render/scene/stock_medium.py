@@ -120,7 +120,10 @@ def _sampled(shape: mi.Shape, medium: mi.Medium, volume_box: np.ndarray, name: s
                 else _mesh_body(shape, frame, ends, name))
     hull = fibonacci(400) / MARGIN * 1.01 if ball else _corners(*ends)
     header = Voxels(tuple(low), tuple(high), values.shape[::-1])
-    return VoxelVolume(dense(values * np.float32(frame.length)), header, *ends, body, hull, module_of(mi.Float)), frame
+    values = values * np.float32(frame.length)
+    even = np.ptp(values) == 0 and not isinstance(body, Solid)
+    return VoxelVolume(dense(values), header, *ends, body, hull, module_of(mi.Float),
+                       float(values.flat[0]) if even else None), frame
 
 
 def _corners(low: np.ndarray, high: np.ndarray) -> np.ndarray:
