@@ -15,8 +15,8 @@ import sys
 from . import record, tables
 
 SCRIPTS: dict[str, list[str]] = {"demo": ["--results"], "speed": [], "loops": [], "fields": [], "sequence": [],
-                                 "dial": [], "reproduce": []}
-"""Name of each script → its arguments."""
+                                 "dial": [], "reproduce": [], "smoke": []}
+"""Name of each script → its arguments. `media` is left out, since it needs Mitsuba's scenes."""
 
 
 def current(name: str) -> bool:

@@ -1,7 +1,7 @@
 """Mitsuba's own scenes of participating media: ``nrf`` in place of ``volpath``, ``results/media.json``.
 
     git clone https://github.com/mitsuba-renderer/mitsuba-data
-    python -m benchmarks.media mitsuba-data [--scenes test_homo_null_envmap_volpath …] [--size 64] [--parts 16]
+    python -m benchmarks.media [--data mitsuba-data] [--scenes test_homo_null_envmap_volpath …] [--size 64] [--parts 16]
 
 The scenes stand in ``tests/scenes/participating_media`` of Mitsuba's test data. Each is rendered at its own depth and
 with single scattering, by `volpath` and by each visibility method, in independent pictures that allow for a z-test. A
@@ -22,10 +22,15 @@ from mi_ntf.core.errors import MiNtfError
 from mi_ntf.render import user_cache
 
 from . import record
-from .scenes import integrator, picture
+from .dial import Options
+from .scenes import picture
 
 FOLDER = Path("tests", "scenes", "participating_media")
-METHODS = ("auto", "raymarch", "transmittance_atlas")
+CHOICES: dict[str, Options] = {
+    "auto": {}, "raymarch": {"visibility": "raymarch", "light_samples": 4},
+    "transmittance_atlas": {"visibility": "transmittance_atlas", "light_samples": 4}}
+"""Choices of the integrator; those with sampled lights have the noise of `volpath` and no error of an environment's
+cells."""
 STOCK_SAMPLES, SAMPLES, BLOCK = 1024, 32, 8
 """Samples a pixel of all pictures of `volpath` together, and of `nrf`; pixels along a block."""
 SIGNIFICANCE, PASSING = 0.01, 0.9975
@@ -105,7 +110,7 @@ def compared(ours: np.ndarray, theirs: np.ndarray, size: int = BLOCK) -> dict[st
 
 
 def rows(path: Path, size: int, parts: int, samples: int, stock_samples: int,
-         methods: tuple[str, ...] = METHODS) -> list[dict[str, Any]]:
+         methods: tuple[str, ...] = tuple(CHOICES)) -> list[dict[str, Any]]:
     """Return a row for each depth and method of a scene; one with the sentence where it is refused."""
     result: list[dict[str, Any]] = []
     own = depth_of(scene(path, size))
@@ -113,7 +118,7 @@ def rows(path: Path, size: int, parts: int, samples: int, stock_samples: int,
         theirs: np.ndarray | None = None
         for method in methods:
             loaded = scene(path, size)
-            nrf = integrator(visibility=method, max_depth=depth, hide_emitters=False)
+            nrf = mi.load_dict({"type": "nrf", "max_depth": depth, **CHOICES[method]})
             try:
                 picture(loaded, nrf, 9, 1)
             except (MiNtfError, RuntimeError) as error:
@@ -123,7 +128,7 @@ def rows(path: Path, size: int, parts: int, samples: int, stock_samples: int,
             theirs = reference(path, size, depth, parts, stock_samples) if theirs is None else theirs
             start = time.perf_counter()
             row = compared(pictures(loaded, nrf, parts, samples), theirs, min(BLOCK, size // 4))
-            result.append({"scene": path.stem, "depth": depth, "method": method, **row,
+            result.append({"scene": path.stem, "depth": depth, "options": CHOICES[method], **row,
                            "seconds": time.perf_counter() - start})
             verdict = "passes" if row["passes"] else "FAILS"
             print(f"{path.stem} depth {depth} {method}: {row['ratio']:.4f} ± {row['standard_error']:.4f}, worst block "
@@ -133,10 +138,10 @@ def rows(path: Path, size: int, parts: int, samples: int, stock_samples: int,
 
 def main() -> None:
     """Measure and write the results."""
-    options = record.options(__doc__, ("data", {"type": Path, "help": "checkout of mitsuba-data"}),
+    options = record.options(__doc__, ("--data", {"type": Path, "default": Path("mitsuba-data")}),
                              ("--scenes", {"nargs": "+", "default": []}), ("--size", {"type": int, "default": 64}),
                              ("--parts", {"type": int, "default": 16}),
-                             ("--methods", {"nargs": "+", "default": list(METHODS)}))
+                             ("--methods", {"nargs": "+", "default": list(CHOICES), "choices": CHOICES}))
     size, parts, samples, stock = ((16, 4, 4, 16) if options.quick
                                    else (options.size, options.parts, SAMPLES, STOCK_SAMPLES))
     record.prepare("memory")

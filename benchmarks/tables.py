@@ -239,6 +239,28 @@ def sequence(values: Values) -> str:
     return table(["what", "measured"], rows)
 
 
+def _choice(options: Values) -> str:
+    """Return the properties of an integrator as text."""
+    return ", ".join(f"`{v}`" if k == "visibility" else f"`{k}` {v}" for k, v in options.items())
+
+
+def smoke(values: Values) -> str:
+    """Return the seconds of stock smoke to 2 % of error beside `volpath`."""
+    return table(["light", "choice", "samples", "error", "seconds", "`volpath`, s", "ratio"], [
+        [row["light"], _choice(row["options"]), str(row["spp"]), percent(row["error"]),
+         spread(row["seconds"], form=_seconds), spread(row["volpath_seconds"], form=_seconds),
+         spread(row["ratio"], "×") if row["reached"] else "2 % not reached"] for row in values["rows"]], 2)
+
+
+def media(values: Values) -> str:
+    """Return the agreement with `volpath` in Mitsuba's own scenes of media."""
+    return table(["scene", "depth", "choice", "mean over `volpath`", "standard error", "largest block", "z-test"], [
+        [row["scene"].removeprefix("test_"), "", "refused by a sentence", "", "", "", ""] if "refused" in row else
+        [row["scene"].removeprefix("test_"), str(row["depth"]), _choice(row["options"]) or "`auto`",
+         f"{row['ratio']:.4f}", percent(row["standard_error"], ".2f"), percent(row["worst_block"]),
+         "passes" if row["passes"] else "fails"] for row in values["rows"]], 3)
+
+
 def _reproduce(name: str) -> Callable[[Values], str]:
     return lambda values: str(getattr(paper, name)(values))
 
@@ -257,6 +279,8 @@ TABLES: dict[str, tuple[str, Callable[[Values], str]]] = {
     "photographs": ("fields", photographs),
     "transmittance": ("fields", transmittance),
     "sequence": ("sequence", sequence),
+    "smoke": ("smoke", smoke),
+    "media": ("media", media),
     "paper-times": ("speed", _reproduce("times_table")),
     "paper-complexity": ("speed", _reproduce("complexity_table")),
     "paper-accuracy": ("reproduce", _reproduce("accuracy_table")),

@@ -10,6 +10,7 @@ import drjit as dr
 from . import ops, tuning
 from .bundle import Bundle, Cell, Strand, onward
 from .samples import Samples
+from .skin import Smoke, Softness
 from .types import Array, Float, Mask, UInt32
 
 GOLDEN = 0.618034
@@ -21,9 +22,13 @@ MIN_TRANSMITTANCE = 1e-3
 State: TypeAlias = tuple[Array, ...]
 
 
-def sample_fraction(opaque: bool) -> float:
-    """Return the fraction of a ray's light that one sample stands for; `opaque`: the field has opaque skins."""
-    return tuning.SAMPLE_FRACTION if opaque else tuning.SMOKE_SAMPLE_FRACTION
+def sample_fraction(softness: Softness | Smoke) -> float:
+    """Return the fraction of a ray's light that one sample stands for.
+
+    It is small only where rays meet many normals. A phase function varies as little along a ray as an opaque skin.
+    """
+    many_normals = not softness.opaque and not isinstance(softness, Smoke)
+    return tuning.SMOKE_SAMPLE_FRACTION if many_normals else tuning.SAMPLE_FRACTION
 
 
 def camera_samples(strands: Sequence[Strand], maxt: Float, offset: Float, depth: Float, shade: bool = True,

@@ -10,7 +10,8 @@ SAMPLE_FRACTION = 1 / 8
 """Fraction of a ray's light that one sample stands for, where the field has opaque skins. Tuned on time to equal noise:
 `statue`, `knot`, `skull`."""
 SMOKE_SAMPLE_FRACTION = 1 / 64
-"""The same for smoke, whose rays meet many normals. Tuned on time to equal noise: `cloud` under 1, 8 and 128 lights."""
+"""The same for fields without opaque skins whose rays meet many normals. Tuned on time to equal noise: `cloud` under 1,
+8 and 128 lights."""
 PIECES = 3
 """Pieces of a cell, each with exponential density. Tuned on brightness against 16 pieces: the four opaque fields."""
 

@@ -144,7 +144,7 @@ def close_by(density: Callable[[Vector], Float], x: Vector, wi: Vector, v: Float
     return dr.exp((-2 * tuning.REACH / tuning.STRATA) * depth)
 
 
-def _uniforms(dj: ModuleType, stream: UInt32, x: Vector, wi: Vector, count: int) -> list[Float]:
+def _uniforms(dj: ModuleType, stream: UInt32, x: Vector, wi: Vector, count: int = 5) -> list[Float]:
     """Return `count` numbers in [0, 1), a function of the seed `stream` and the bits of a ray."""
     state = dj.UInt32(stream)
     for c, factor in zip((*x, *wi), (0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D, 0x27D4EB2F, 0x165667B1, 0xD3A2646D),

@@ -160,7 +160,7 @@ class _CameraLight:
         if samples is None:
             samples = march.camera_samples(
                 strands, maxt, *self.quadrature, shade=options[0], view=options[1],
-                fractions=tuple(march.sample_fraction(p.medium.field.softness.opaque) for p in parts))
+                fractions=tuple(march.sample_fraction(p.medium.field.softness) for p in parts))
             if self.cache:
                 self.cache.samples[options] = samples
         self.field_samples = _FieldSamples(samples, unit)
