@@ -41,17 +41,17 @@ REFUSED = re.compile(r"another sigma_t|no nrf medium")
 
 def names(folder: Path) -> list[str]:
     """Return the names of the scenes in `folder`. Raises MiNtfError if there are none."""
-    found = sorted(path.stem for path in folder.glob("test_*.xml"))
-    if not found:
+    scenes = sorted(path.stem for path in folder.glob("test_*.xml"))
+    if not scenes:
         raise MiNtfError(f"{folder} holds no scenes; clone https://github.com/mitsuba-renderer/mitsuba-data and name "
                          "its folder")
-    return found
+    return scenes
 
 
 def depth_of(loaded: Any) -> int:
     """Return `max_depth` of the integrator of a scene; -1: none."""
-    found = re.search(r"max_depth = (-?\d+)", str(loaded.integrator()))
-    return int(found[1]) if found else -1
+    match = re.search(r"max_depth = (-?\d+)", str(loaded.integrator()))
+    return int(match[1]) if match else -1
 
 
 def pictures(loaded: Any, nrf: Any, parts: int, samples: int) -> np.ndarray:
@@ -147,9 +147,9 @@ def main() -> None:
     record.prepare("memory")
     start = time.perf_counter()
     folder = options.data / FOLDER
-    found = [row for name in options.scenes or names(folder)
+    results = [row for name in options.scenes or names(folder)
              for row in rows(folder / f"{name}.xml", size, parts, samples, stock, tuple(options.methods))]
-    record.write("media", {"size": size, "rows": found}, start, options.out)
+    record.write("media", {"size": size, "rows": results}, start, options.out)
 
 
 if __name__ == "__main__":

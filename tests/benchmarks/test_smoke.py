@@ -15,7 +15,8 @@ SCENE = """<scene version="3.0.0"><default name="res" value="8"/><default name="
 <integrator type="moment"><integrator type="$integrator"><integer name="max_depth" value="2"/></integrator></integrator>
 <sensor type="perspective"><transform name="to_world"><lookat origin="0,0,4" target="0,0,0" up="0,1,0"/></transform>
 <film type="hdrfilm"><integer name="width" value="$res"/><integer name="height" value="$res"/>
-<rfilter type="box"/></film></sensor><emitter type="constant"/>
+<rfilter type="box"/></film><sampler type="independent"><integer name="sample_count" value="$spp"/></sampler></sensor>
+<emitter type="constant"/>
 <shape type="sphere"><bsdf type="null"/><medium type="homogeneous" name="interior"><float name="scale" value="1"/>
 </medium></shape></scene>"""
 
