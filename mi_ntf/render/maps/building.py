@@ -32,6 +32,8 @@ from . import map_cache
 
 DENSE_TEXELS = 2
 """Length, in texels, of the marched part of a ray through dense smoke, whose mean free path is shorter than a texel."""
+UNTRAINED = ("raymarch", "transmittance_map", "transmittance_volume", "transmittance_atlas")
+"""Methods that need no trained network, which a closed form may replace."""
 
 
 def resolved(settings: Settings, lights: int, media: Sequence[NRFMedium]) -> Settings:
@@ -116,7 +118,7 @@ def build(name: str, medium: NRFMedium, table: LightTable | None, options: Optio
 
     method = REGISTRY[name]
     constant = getattr(medium.source, "constant", None)
-    if constant is not None and name != "none" and not options.map_file:
+    if constant is not None and name in UNTRAINED and options.map_source == "field" and not options.map_file:
         return ClosedForm(medium.source, constant, module_of(mi.Float))
     if not method.numbers:
         return method.build(medium, table, options, module_of(mi.Float), keep)
