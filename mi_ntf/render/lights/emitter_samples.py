@@ -127,7 +127,7 @@ class EmitterSamples:
             _, d, irradiance, distance, sun = self._candidate(index, number, it, active)
         irradiance = irradiance * weight
         wi = self.frame.direction_to_field(d)
-        return LightSample(wi, tuple(irradiance), distance / self.frame.length, mi.Bool(sun))
+        return LightSample(wi, tuple(irradiance), distance / self.frame.unit, mi.Bool(sun))
 
     def _resample(self, index: UInt32, it: mi.Interaction3f, active: Mask) -> tuple[Candidate, Float]:
         """Return the candidate selected for light `index`, and the weight of its irradiance in the estimate."""

@@ -119,7 +119,14 @@ def emitter_class() -> type:
                                  "which know nothing of the field's shadow; give it a weight above 0")
             self._fully_sampled = fully_sampled(self.inner)
             self._method = _visibility(self.visibility, self.inner, self.medium)
+            if hasattr(self.medium, "followers"):
+                self.medium.followers.add(self)
             self._march = building.march(self.medium, None, Options(STEP))
+
+        def follow(self) -> None:
+            """Make the map of the light anew, if there is one, since the medium has moved."""
+            if REGISTRY[_method_name(self.visibility, self.inner)].sampled:
+                self._prepare()
 
         def sample_direction(self, it: mi.Interaction3f, sample: mi.Point2f, active: Mask = True
                              ) -> tuple[mi.DirectionSample3f, Color3]:
@@ -131,7 +138,7 @@ def emitter_class() -> type:
             if _is_far(inner):
                 # The nested light does not know the scene's size. It would end shadow rays at a unit sphere.
                 frame = self.medium.frame
-                reach = dr.norm(it.p - mi.Point3f(frame.origin.tolist())) + frame.length
+                reach = dr.norm(it.p - frame.point_to_world((0.0, 0.0, 0.0))) + frame.unit
                 ds.dist = dr.maximum(ds.dist, 1000 * reach)
                 ds.p = it.p + ds.d * ds.dist
             ds.emitter = mi.EmitterPtr(self)
@@ -144,7 +151,7 @@ def emitter_class() -> type:
             if self._method is None:
                 return mi.Float(1)
             frame = self.medium.frame
-            distance: Float = mi.Float(dr.inf) if _is_far(self.inner) else ds.dist / frame.length
+            distance: Float = mi.Float(dr.inf) if _is_far(self.inner) else ds.dist / frame.unit
             x, d = frame.point_to_field(it.p), frame.direction_to_field(ds.d)
             sun = ds.pdf > SHARP
             # Maps and networks belong to fixed places, so rays with gradients are marched.
@@ -196,10 +203,7 @@ def emitter_class() -> type:
 
 def _visibility(name: str, inner: mi.Emitter, medium: NRFMedium) -> Visibility | None:
     """Return the visibility method `name` for the light `inner` behind `medium`; None for ``none``."""
-    one, table = _is_one(inner), None
-    # A light of one place has a sharp shadow, for which its own map is best.
-    auto = "transmittance_map" if one else "transmittance_atlas"
-    method = auto if name == "auto" else name
+    one, table, method = _is_one(inner), None, _method_name(name, inner)
     if REGISTRY[method].sampled:
         kind = scene_lights.kind(inner)
         if not one:
@@ -214,6 +218,13 @@ def _visibility(name: str, inner: mi.Emitter, medium: NRFMedium) -> Visibility |
     if visibility and REGISTRY[method].per_field and not one:
         return building.with_suns(visibility, None, medium, table, options)
     return visibility
+
+
+def _method_name(name: str, inner: mi.Emitter) -> str:
+    """Return the visibility method `name` for the light `inner`, by name also where it is ``auto``."""
+    # A light of one place has a sharp shadow, for which its own map is best.
+    auto = "transmittance_map" if _is_one(inner) else "transmittance_atlas"
+    return auto if name == "auto" else name
 
 
 def _is_one(inner: mi.Emitter) -> bool:

@@ -12,7 +12,8 @@ resolution      integer   by field 16 to 1024    voxels per side of the baked gr
 sample_emitters boolean   true                   as for any medium; for stock volumetric integrators
 =============== ========= ======== ============= =======================================================================
 
-No parameter is exposed to ``mi.traverse``.
+``mi.traverse`` exposes `to_world`, with the flags of a shape's. An update moves the field. It bakes nothing again and
+keeps its atlas, and compiles no kernel. The bounding shape has a `to_world` of its own, which has to move with it.
 
 The medium fills the sphere around the captured object, whose centre and radius in capture units are in the file. It
 belongs inside one bounding shape with a ``null`` BSDF that encloses the object. Extinction is in inverse scene units.
@@ -49,10 +50,13 @@ Source: neural reflectance fields, Bi et al. 2020.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Protocol
+from weakref import WeakSet
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ...core.architecture import MAX_LOG_DENSITY
 from ...core.errors import MiNtfError
@@ -69,6 +73,13 @@ from ..scene.frame import SCALES, Frame
 from . import properties
 
 REPRESENTATIONS = ("grid", "network")
+
+
+class Follower(Protocol):
+    """Object that depends on the place of a medium."""
+
+    def follow(self) -> None:
+        """Adapt to the new place."""
 
 
 def _reflectance(source: Density, softness: Softness | Smoke, retro: float | None, phase: float | None, emissive: bool
@@ -109,7 +120,7 @@ def medium_class(phase_class: type) -> type:
                 )
             path = name if loaded.is_in_memory(name) else log.resolve(name)
             to_world = read.placement("to_world")
-            scale = read.number("scale", 1.0, *SCALES)
+            self._scale = read.number("scale", 1.0, *SCALES)
             self.representation = read.choice("representation", "grid", REPRESENTATIONS)
             resolution = read.whole("resolution", 0, 16, 1024) or None
             read.flag("sample_emitters", True)
@@ -125,20 +136,36 @@ def medium_class(phase_class: type) -> type:
                     grid if self.representation == "grid" else NetworkVolume(self.field.network, grid, bound))
             self.reflectance = _reflectance(self.source, self.field.softness, self.field.retro, self.field.phase,
                                             self.field.emissive)
-            self.frame = Frame(self.field.similarity, to_world, scale)
+            self.to_world = mi.Transform4f(mi.ScalarTransform4f(to_world))
             self.path = path
             phase = phase_class(mi.Properties("nrf"))
-            phase.attach(self.frame, self.reflectance)
             props["phase"] = phase
             mi.Medium.__init__(self, props)
             self.phase = phase
             self.m_is_homogeneous = False
             self.m_has_spectral_extinction = False
-            self._density_unit = dr.opaque(mi.Float, 1 / self.frame.length)
-            self._majorant = dr.opaque(mi.Float, max(self.source.majorant, 1e-3) / self.frame.length)
+            self.followers: WeakSet[Follower] = WeakSet()
+            self._place(to_world)
             low, high = self.source.bounds
             self._low, self._high = (mi.Vector3f(*map(float, side)) for side in (low, high))
             dr.make_opaque(self._low, self._high)
+
+        def _place(self, to_world: np.ndarray) -> None:
+            """Move the field to `to_world`, a (4, 4) matrix."""
+            self.frame = Frame(self.field.similarity, to_world, self._scale)
+            self.phase.attach(self.frame, self.reflectance)
+            self._density_unit = dr.opaque(mi.Float, 1 / self.frame.length)
+            self._majorant = dr.opaque(mi.Float, max(self.source.majorant, 1e-3) / self.frame.length)
+
+        def traverse(self, callback: mi.TraversalCallback) -> None:
+            mi.Medium.traverse(self, callback)
+            callback.put("to_world", self.to_world, mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous)
+
+        def parameters_changed(self, keys: Sequence[str] = ()) -> None:
+            if not keys or "to_world" in keys:
+                self._place(np.array(dr.detach(self.to_world).matrix, np.float64).reshape(4, 4))
+                for emitter in self.followers:
+                    emitter.follow()
 
         def extinction(self, p: Vector3) -> Float:
             """Return σ_t at the scene points `p`, in 1/scene unit."""
@@ -146,7 +173,7 @@ def medium_class(phase_class: type) -> type:
 
         def intersect_aabb(self, ray: Ray) -> tuple[Mask, Float, Float]:
             o: Vector3 = mi.Vector3f(*self.frame.point_to_field(ray.o))
-            inverse: Vector3 = dr.rcp(mi.Vector3f(*self.frame.direction_to_field(ray.d))) * self.frame.length
+            inverse: Vector3 = mi.Vector3f(self.frame.unit) / mi.Vector3f(*self.frame.direction_to_field(ray.d))
             t1, t2 = (self._low - o) * inverse, (self._high - o) * inverse
             near, far = dr.max(dr.minimum(t1, t2)), dr.min(dr.maximum(t1, t2))
             return (near <= far) & (far >= 0), near, far

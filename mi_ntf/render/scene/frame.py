@@ -20,6 +20,7 @@ class Frame:
     """Placement of a field in the scene: world = to_world · scale · (center + radius · field).
 
     length   scene units per field unit
+    unit     the same, for kernels
     origin   centre of the unit sphere in the scene
 
     Its numbers are opaque to kernels, so that another placement compiles nothing. Raises MiNtfError if `to_world` is no
@@ -47,8 +48,9 @@ class Frame:
         self._rotation = mi.Matrix3f(self._matrix.tolist())
         self._inverse_rotation = mi.Matrix3f(self._matrix.T.tolist())
         self._origin: Vector3 = mi.Point3f(self.origin.tolist())
+        self.unit = mi.Float(self.length)
         self._inverse_length = mi.Float(1 / self.length)
-        dr.make_opaque(self._rotation, self._inverse_rotation, self._origin, self._inverse_length)
+        dr.make_opaque(self._rotation, self._inverse_rotation, self._origin, self.unit, self._inverse_length)
 
     def point_to_field(self, p: Vector3) -> Vector:
         """Convert scene points to field coordinates."""
@@ -62,7 +64,7 @@ class Frame:
 
     def point_to_world(self, p: Vector | Vector3) -> Vector3:
         """Convert field points to scene coordinates."""
-        return mi.Point3f(self._rotation @ mi.Vector3f(*p) * self.length + self._origin)
+        return mi.Point3f(self._rotation @ mi.Vector3f(*p) * self.unit + self._origin)
 
     def direction_to_world(self, d: Vector | Vector3) -> Vector3:
         """Convert unit vectors of the field to unit vectors of the scene."""

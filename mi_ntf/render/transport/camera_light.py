@@ -45,7 +45,7 @@ class _FieldSamples(NamedTuple):
     """Samples in the fields along camera rays; `unit`: scene length of the unit of their t."""
 
     samples: Samples
-    unit: float
+    unit: Float
 
 
 def trace(composition: Composition, ray: Ray, quadrature: Quadrature, stream: UInt32, sums: Sums | None = None,

@@ -40,7 +40,7 @@ class SceneStrands(NamedTuple):
     """Strands of scene rays, one for each part; `unit`: scene length of the unit of their parameter t."""
 
     strands: list[Strand]
-    unit: float
+    unit: Float
 
 
 class Composition:
@@ -187,7 +187,7 @@ class Composition:
             )
             for p in parts
         ]
-        return SceneStrands(strands, unit)
+        return SceneStrands(strands, dr.opaque(mi.Float, unit))
 
     def free_flight(self, ray: Ray, maxt: Float, offset: Float, depths: Sequence[Float],
                     steps: int) -> tuple[Mask, Float, UInt32]:

@@ -73,7 +73,7 @@ class Shadow:
         frame, method = self.field
         tau = method.tau(x, wi, type(distance)(dr.inf) if self.far else distance, index, active, sun)
         p, d = frame.point_to_world(x), frame.direction_to_world(wi)
-        length = distance * frame.length
+        length = distance * frame.unit
         for other in self.other_fields:
             tau = tau * transmittance_between(other, p, d, length, index, active & (tau != 0), sun)
         if self.surfaces:
@@ -98,4 +98,4 @@ def transmittance_between(field: FieldVisibility, p: Vector3, d: Vector3, length
     """Return a field's transmittance from the scene points `p` along `d`, as far as `length` in scene units."""
     frame = field.frame
     x, wi = frame.point_to_field(p), frame.direction_to_field(d)
-    return outside.tau(field.method, x, wi, length / frame.length, index, active, sun)
+    return outside.tau(field.method, x, wi, length / frame.unit, index, active, sun)
