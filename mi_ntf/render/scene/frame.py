@@ -28,6 +28,7 @@ class Frame:
     """
 
     def __init__(self, similarity: Similarity, to_world: np.ndarray, scale: float) -> None:
+        self._arguments = similarity, np.asarray(to_world, np.float64), scale
         linear = np.asarray(to_world, np.float64)[:3, :3] * scale
         gram = linear.T @ linear
         size = np.sqrt(np.trace(gram) / 3)
@@ -51,6 +52,11 @@ class Frame:
         self.unit = mi.Float(self.length)
         self._inverse_length = mi.Float(1 / self.length)
         dr.make_opaque(self._rotation, self._inverse_rotation, self._origin, self.unit, self._inverse_length)
+
+    def moved(self, to_world: np.ndarray) -> Frame:
+        """Return the placement after a further transform, a (4, 4) matrix."""
+        similarity, before, scale = self._arguments
+        return Frame(similarity, to_world @ before, scale)
 
     def point_to_field(self, p: Vector3) -> Vector:
         """Convert scene points to field coordinates."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol, cast
 
 import mitsuba as mi
@@ -33,11 +35,43 @@ class NRFMedium(Protocol):
         """Return the reflectance at field points."""
 
 
-def find_media(scene: mi.Scene) -> list[NRFMedium]:
-    """Return the scene's ``nrf`` media, and then its media of Mitsuba.
+@dataclass(frozen=True, eq=False)
+class InstancedMedium:
+    """A field as an instance of a shape group places it; all but its `frame` is that of the `medium` in the group."""
 
-    A field in a shape group lies where its medium says, as under ``volpath``: instances do not move it. Raises
-    MiNtfError if there is no medium, or if a bounding shape is wrong.
+    medium: NRFMedium
+    frame: Frame
+
+    @property
+    def field(self) -> LoadedField | VolumeField:
+        """Field of the medium."""
+        return self.medium.field
+
+    @property
+    def source(self) -> Density:
+        """Density of the medium."""
+        return self.medium.source
+
+    @property
+    def representation(self) -> str:
+        """Representation of the medium."""
+        return self.medium.representation
+
+    @property
+    def path(self) -> str:
+        """Field file of the medium."""
+        return self.medium.path
+
+    def reflectance(self, x: Vector) -> Reflectance:
+        """Return the reflectance at field points."""
+        return self.medium.reflectance(x)
+
+
+def find_media(scene: mi.Scene) -> list[NRFMedium]:
+    """Return the scene's ``nrf`` media, those of instances, and then its media of Mitsuba.
+
+    Each instance of a shape group has the fields of its group. Raises MiNtfError if there is no medium, or if a
+    bounding shape is wrong.
     """
     media: list[NRFMedium] = []
     bounds: list[list[mi.Shape]] = []
@@ -54,11 +88,7 @@ def find_media(scene: mi.Scene) -> list[NRFMedium]:
         bounds[next(i for i, m in enumerate(media) if m is medium)].append(shape)
     for medium, shapes in zip(media, bounds, strict=True):
         _check_bounds(medium, shapes)
-    for shape in _grouped(scene):
-        medium = _nrf_medium(shape)
-        if medium is not None:
-            _check_group(scene, shape, medium, any(medium is m for m in media))
-            media.append(medium)
+    media += _instanced(scene)
     if not media and not stock:
         raise MiNtfError(
             'nrf integrator: the scene has no nrf medium and no other; put one inside a bounding shape: '
@@ -116,10 +146,14 @@ def _is_absent(shape: mi.Shape) -> bool:
     return simple and str(shape.bsdf().class_name()) == "Null"
 
 
+def _shapes_of(group: mi.Shape) -> list[mi.Shape]:
+    """Return the shapes inside a shape group."""
+    return [node for node in mi.traverse(group).hierarchy if isinstance(node, mi.Shape) and node is not group]
+
+
 def _grouped(scene: mi.Scene) -> list[mi.Shape]:
     """Return the shapes inside the shape groups of `scene`."""
-    return [node for group in shape_groups(scene) for node in mi.traverse(group).hierarchy if isinstance(node, mi.Shape)
-            and node is not group]
+    return [shape for group in shape_groups(scene) for shape in _shapes_of(group)]
 
 
 def _hold_fields_alone(scene: mi.Scene) -> bool:
@@ -152,19 +186,36 @@ def _check_bounds(medium: NRFMedium, shapes: Sequence[mi.Shape]) -> None:
         )
 
 
-def _check_group(scene: mi.Scene, shape: mi.Shape, medium: NRFMedium, is_bounded: bool) -> None:
-    """Raise MiNtfError unless a field that `shape` bounds in a group is one that could stand outside.
+def _instanced(scene: mi.Scene) -> list[NRFMedium]:
+    """Return the fields of all instances of shape groups. Raises MiNtfError if a group holds other shapes, too."""
+    fields = {group.id(): [shape for shape in _shapes_of(group) if _nrf_medium(shape)] for group in shape_groups(scene)}
+    result: list[NRFMedium] = []
+    for instance in scene.shapes() if any(fields.values()) else ():
+        if instance.class_name() != "Instance":
+            continue
+        shapes = fields[_group_name(instance)]
+        to_world = np.array(mi.traverse(instance)["to_world"].matrix, np.float64).reshape(4, 4)
+        for shape in shapes:
+            medium = cast(NRFMedium, _nrf_medium(shape))
+            _check_group(scene, shape, medium)
+            result.append(cast(NRFMedium, InstancedMedium(medium, medium.frame.moved(to_world))))
+    return result
 
-    An instance must enclose its object, groups must hold fields alone, and no other shape may bound `medium`.
-    """
-    _check_bsdf(shape)
-    instances = [other for other in scene.shapes() if other.class_name() == "Instance"]
-    if is_bounded or not _hold_fields_alone(scene) or not any(_encloses(other, medium) for other in instances):
+
+def _group_name(instance: mi.Shape) -> str:
+    """Return the id of the group of an instance, which Mitsuba shows in its text alone."""
+    name = re.search(r'name = "([^"]*)"', str(instance))
+    return name[1] if name else ""
+
+
+def _check_group(scene: mi.Scene, shape: mi.Shape, medium: NRFMedium) -> None:
+    """Raise MiNtfError unless `shape`, in a group, bounds a field as it could outside, and groups hold fields alone."""
+    if not _hold_fields_alone(scene):
         raise MiNtfError(
-            f"nrf integrator: {_label(shape)} bounds an nrf medium inside a shapegroup, but fields cannot be instanced "
-            f"(the object of {medium.path} is at {_text(medium.frame.origin)}); take the shape out of the group, and "
-            "give each other place a shape and a medium of its own"
+            f"nrf integrator: {_label(shape)} bounds an nrf medium in a shapegroup, beside other shapes; groups may "
+            "hold fields or other shapes, but not both: give the field a group and instances of its own"
         )
+    _check_bounds(medium, [shape])
 
 
 def _extent(medium: NRFMedium) -> tuple[np.ndarray, float, np.ndarray, np.ndarray]:
