@@ -76,6 +76,11 @@ class Frame:
         """Convert unit vectors of the field to unit vectors of the scene."""
         return mi.Vector3f(self._rotation @ mi.Vector3f(*d))
 
+    @property
+    def rotation(self) -> np.ndarray:
+        """Rotation (3, 3) from the field to the scene."""
+        return self._matrix
+
     def placement(self) -> tuple[bytes, bytes, float]:
         """Return a key that differs between different placements."""
         return self._matrix.tobytes(), self.origin.tobytes(), self.length

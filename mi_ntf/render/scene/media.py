@@ -221,9 +221,9 @@ def _check_group(scene: mi.Scene, shape: mi.Shape, medium: NRFMedium) -> None:
 def _extent(medium: NRFMedium) -> tuple[np.ndarray, float, np.ndarray, np.ndarray]:
     """Return the centre and radius of the field's sphere, and the corners of the box of its object, in the scene."""
     corners = np.stack(np.meshgrid(*zip(*medium.field.grid.bounds, strict=True), indexing="ij"), -1).reshape(-1, 3)
-    world = np.array(medium.frame.point_to_world(corners.T.astype(np.float32)), dtype=np.float64).T
     # All matter is in the unit sphere, from which the corners of the box may protrude.
     origin, radius = medium.frame.origin, medium.frame.length
+    world = origin + radius * corners @ medium.frame.rotation.T
     return origin, radius, np.maximum(world.min(0), origin - radius), np.minimum(world.max(0), origin + radius)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from ...infer.visibility import REGISTRY
 from ..maps import building
+from ..scene.many import Crowd
 from ..scene.settings import Settings
 from . import effects
 from .composition import Composition
@@ -21,7 +22,8 @@ from .composition import Composition
 def methods(march: Composition) -> list[tuple[Settings, int]]:
     """Return the settings of methods that may replace the `march`, and the number of rays that fill their tables.
 
-    Maps that do not fit into `map_memory` at once are left out, since every pass would build them anew.
+    Maps that do not fit into `map_memory` at once are left out, since every pass would build them anew. So are those of
+    many instances, each of which would need maps of its own.
     """
     media, table, candidates = march.media, march.lights.table(march.media[0].frame), []
     for method in (m for m in REGISTRY.values() if m.automatic and m.name != "raymarch"):
@@ -30,7 +32,8 @@ def methods(march: Composition) -> list[tuple[Settings, int]]:
             options = building.options(settings)
             size = table.count * sum(building.size_per_light(method.name, m, table, options) for m in media)
             rays = len(media) * method.rays(table.count, settings.map_resolution)
-            if method.per_field or 0 < size <= options.map_memory * 2**20:
+            fits = 0 < size <= options.map_memory * 2**20 and not any(isinstance(m, Crowd) for m in media)
+            if method.per_field or fits:
                 candidates.append((settings, rays if method.per_field else rays * components))
     return sorted(candidates, key=lambda candidate: candidate[1])
 
@@ -58,7 +61,7 @@ def _no_bounces(now: Composition) -> Settings | None:
 def _no_smallest_field(now: Composition) -> Settings | None:
     boxes = [effects.on_film(now.sensor, m.frame) for m in now.media]
     sizes = [np.inf if box is None else float(np.prod(box[1] - box[0])) for box in boxes]
-    if len(sizes) < 2 or min(sizes) == np.inf:
+    if len(sizes) < 2 or min(sizes) == np.inf or any(isinstance(m, Crowd) for m in now.media):
         return None
     absent = now.settings.without_media
     numbers = [i for i in range(len(sizes) + len(absent)) if i not in absent]

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import drjit as dr
 import mitsuba as mi
@@ -22,6 +22,7 @@ from ...infer.visibility.unbiased import Unbiased
 from .. import log, timing
 from ..lights import scene_lights
 from ..maps import building
+from ..scene import many
 from ..scene.media import NRFMedium, find_media, ordinary_shapes
 from ..scene.settings import Settings
 from . import effects
@@ -32,6 +33,8 @@ from .surfaces import Surfaces
 IN_SMOKE = 4
 """Factor by which fewer camera rays are in flight where they meet smoke, since each ray has more samples."""
 
+JOINABLE = ("auto", "raymarch", "transmittance_atlas", "none")
+"""Visibility methods that serve all instances of a field, since they store nothing for a single light."""
 Run = tuple[int, int] | None
 """Rows (first, end) of the light table whose maps are in memory at once; None: all rows."""
 
@@ -41,6 +44,17 @@ class SceneStrands(NamedTuple):
 
     strands: list[Strand]
     unit: Float
+
+
+def _may_join(scene: mi.Scene, settings: Settings) -> bool:
+    """Return True if many instances of a field may be one medium.
+
+    Derivatives need loops that are not nested. Patches of radiosity and corrections of an unbiased render belong to
+    single fields.
+    """
+    attached = any(dr.grad_enabled(value) for _, value in mi.traverse(scene))
+    return (settings.visibility in JOINABLE and not settings.unbiased and not settings.map_file and not attached
+            and settings.bounces != "radiosity")
 
 
 class Composition:
@@ -55,9 +69,10 @@ class Composition:
     def __init__(self, scene: mi.Scene, settings: Settings, sensor: mi.Sensor, spp: int,
                  patches: Patches | None = None) -> None:
         self.scene, self.sensor, self.patches = scene, sensor, patches
-        self.media = media = [m for i, m in enumerate(find_media(scene)) if i not in settings.without_media]
+        media = [m for i, m in enumerate(find_media(scene)) if i not in settings.without_media]
         self.lights = scene_lights.Lights(scene, media, settings.light_samples, settings.environment_lights,
                                           settings.brightest_lights, settings.only_emitters)
+        self.media = media = many.joined(media) if _may_join(scene, settings) else media
         settings = building.resolved(settings, len(self.lights.rows.power), media)
         self.effects = effects.describe(scene, settings, sensor, spp, media, self.lights)
         if settings.visibility == "auto" and self.effects.needs_visibility:
@@ -113,6 +128,13 @@ class Composition:
         self.in_view = [p for p in self.parts if p.medium in self._media_in_view]
 
     def _part(self, medium: NRFMedium) -> Part:
+        if not isinstance(medium, many.Crowd):
+            return self._part_of(medium)
+        part, table = self._part_of(medium.members[0]), self.lights.table(medium.frame)
+        return Part(cast(NRFMedium, medium), table, table,
+                    *map(medium.visibility, (part.for_run, part.for_sampled, part.for_all)))
+
+    def _part_of(self, medium: NRFMedium) -> Part:
         all_lights, run = self.lights.table(medium.frame), self.runs[self.run]
         if not self.effects.lit or not self.effects.needs_visibility:
             return Part(medium, all_lights, all_lights)
@@ -182,7 +204,7 @@ class Composition:
                 p.source,
                 p.frame.point_to_field(ray.o),
                 p.frame.direction_to_field(ray.d),
-                dr.opaque(mi.Float, 2 / (steps or self.settings.samples)),
+                dr.opaque(mi.Float, 2 * p.finest / (steps or self.settings.samples)),
                 dr.opaque(mi.Float, unit / p.frame.length) if several else None,
             )
             for p in parts

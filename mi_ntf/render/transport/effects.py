@@ -15,6 +15,7 @@ from ...infer.types import Float
 from ...infer.visibility import REGISTRY
 from ..lights.scene_lights import Lights
 from ..scene.frame import Frame
+from ..scene.many import Crowd
 from ..scene.media import NRFMedium, lets_light_through, ordinary_shapes
 from ..scene.settings import Settings
 
@@ -121,7 +122,8 @@ def describe(scene: mi.Scene, settings: Settings, sensor: mi.Sensor, spp: int, m
 def _bounces(settings: Settings, media: Sequence[NRFMedium], surfaces: bool, gradients: bool) -> str:
     """Return the method for multiple scattering; ``auto`` is radiosity if that covers the whole scene."""
     conditions = {
-        "surfaces": surfaces, "derivatives": gradients, "visibility=none": settings.visibility == "none",
+        "surfaces": surfaces, "many instances": any(isinstance(m, Crowd) for m in media), "derivatives": gradients,
+        "visibility=none": settings.visibility == "none",
         "smoke": any(not m.field.softness.opaque for m in media if m.field.grid.majorant > 0)}
     unsupported, name = [text for text, holds in conditions.items() if holds], settings.bounces
     if name == "radiosity" and unsupported:

@@ -41,6 +41,11 @@ class Part:
         return self.medium.frame
 
     @property
+    def finest(self) -> float:
+        """Radius of the smallest field, field units; 1 but for many instances."""
+        return float(getattr(self.medium, "finest", 1.0))
+
+    @property
     def source(self) -> Density:
         """Density of the medium."""
         return self.medium.source
