@@ -82,7 +82,9 @@ def test_instances_of_another_order_of_size_are_another_medium(blobs):
     media = find_media(scenes.scene(None, scenes.nrf(), {}, shapes=instances(blobs, places)))
     joined = many.joined(media)
     assert [len(medium.members) for medium in joined] == [5, 5]
-    assert all(medium.finest > 0.1 for medium in joined)
+    for medium in joined:
+        sizes = [member.frame.length for member in medium.members]
+        assert max(sizes) <= 2 * min(sizes) and medium.finest * medium.frame.length == pytest.approx(min(sizes))
 
 
 def test_density_and_clear_distance_of_copies(blobs):

@@ -11,7 +11,8 @@ import numpy as np
 
 from ...core import quantities
 from ...core.errors import MiNtfError
-from ...infer.types import Float
+from ...infer.backend import floats, module_of
+from ...infer.types import Float, Vector3
 from ...infer.visibility import REGISTRY
 from ..lights.scene_lights import Lights
 from ..scene.frame import Frame
@@ -180,7 +181,9 @@ def _in_view(sensor: mi.Sensor, media: Sequence[NRFMedium]) -> tuple[bool, ...]:
     margin = film.rfilter().radius() + 1 if film.sample_border() else 0
     (u0, u1), (v0, v1) = ((-margin / n, 1 + margin / n) for n in film.crop_size())
     zero: Float = 0.0
-    rays, _ = sensor.sample_ray(zero, zero, mi.Point2f([u0, u1, u1, u0], [v0, v0, v1, v1]), mi.Point2f(0.5))
+    places = (floats(np.array(c), module_of(mi.Float)) for c in ([u0, u1, u1, u0], [v0, v0, v1, v1]))
+    corner: Vector3 = mi.Point2f(*places)
+    rays, _ = sensor.sample_ray(zero, zero, corner, mi.Point2f(0.5))
     corners = np.array(rays.d, np.float64).T
     sides = np.cross(corners, np.roll(corners, -1, axis=0))
     sides *= np.sign(sides @ corners.sum(0))[:, None] / np.linalg.norm(sides, axis=1, keepdims=True)
