@@ -1,10 +1,10 @@
-"""Many copies of one field as one density, with their visibility, in the coordinates of a sphere around all of them.
+"""Many copies of fields as one density, with their visibility, in the coordinates of a sphere around all of them.
 
 Kernels do not grow with the number of copies. A grid of cells lists the copies near a point; a ray towards a light
 visits the copies whose spheres it meets.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import ModuleType
 
 import drjit as dr
@@ -26,7 +26,7 @@ CELLS = 8
 
 
 class Copies:
-    """Places of the copies of a field.
+    """Places of the copies of fields.
 
     Parameters
     ----------
@@ -36,12 +36,15 @@ class Copies:
         (n, 3, 3) from their field coordinates to the common ones.
     size
         (n,) radii of their unit spheres, common units.
+    which
+        (n,) the field of each.
     dj
         Dr.Jit module of the back end.
     """
 
-    def __init__(self, origin: np.ndarray, rotation: np.ndarray, size: np.ndarray, dj: ModuleType):
-        self.origin, self.rotation, self.size, self.dj = origin, rotation, size, dj
+    def __init__(self, origin: np.ndarray, rotation: np.ndarray, size: np.ndarray, which: np.ndarray, dj: ModuleType):
+        self.origin, self.rotation, self.size, self.which, self.dj = origin, rotation, size, which, dj
+        self._which = words(which, dj)
         self._spheres = floats(np.concatenate([origin, 1 / size[:, None]], 1), dj)
         columns = np.concatenate([np.swapaxes(rotation, 1, 2), np.zeros((len(size), 3, 1))], 2)
         self._columns = floats(columns, dj)
@@ -51,6 +54,12 @@ class Copies:
         """Return points relative to the centre of copy `i`, in its field's units, and the number of these units."""
         *origin, scale = dr.gather(self.dj.Array4f, self._spheres, i)
         return tuple((a - b) * scale for a, b in zip(p, origin, strict=True)), scale
+
+    def call(self, i: UInt32, functions: Sequence[Callable[..., Array]], *arguments: Array) -> Array:
+        """Return the result of the function of the field of copy `i`."""
+        if len(functions) == 1:
+            return functions[0](*arguments)
+        return dr.switch(dr.gather(self.dj.UInt32, self._which, i), list(functions), *arguments)
 
     def axes(self, i: UInt32) -> list[Vector]:
         """Return the axes of copy `i` in common coordinates."""
@@ -113,19 +122,31 @@ class _Grid:
         return dr.maximum(way, 0)
 
 
-class Instances:
-    """The sum of the densities of `copies` of `field`, a :class:`mi_ntf.infer.grid.Density`.
+def _log_density(field: Density) -> Callable[[Vector], Float]:
+    return lambda x: field.log_density(field.place(x))
 
-    `reflect`: reflectance of points of the field.
+
+def _clear_distance(field: Density) -> Callable[[Vector, Vector], Float]:
+    return lambda x, inverse: field.clear_distance(field.place(x), inverse)
+
+
+class Instances:
+    """The sum of the densities of `copies` of `fields`, a :class:`mi_ntf.infer.grid.Density`.
+
+    `reflect`: reflectance of points, one function for each field. Fields that differ must be surfaces of one kind.
+    `fresnel`: their specular weight grows towards grazing angles.
     """
 
-    def __init__(self, field: Density, copies: Copies, reflect: Callable[[Vector], Reflectance]):
-        self.field, self.copies, self._reflect, self._dj = field, copies, reflect, copies.dj
+    def __init__(self, fields: Sequence[Density], copies: Copies, reflect: Sequence[Callable[[Vector], Reflectance]],
+                 fresnel: bool = False):
+        self.copies, self._reflect, self._fresnel, self._dj = copies, reflect, fresnel, copies.dj
         self._grid = _Grid(copies)
-        self.resolution, self.bounds = field.resolution, (self._grid.low, self._grid.high)
-        self.majorant = field.majorant * float((1 / copies.size).sum())
-        self.hull = np.concatenate([o + s * field.hull @ r.T for o, r, s in zip(copies.origin, copies.rotation,
-                                                                               copies.size, strict=True)])
+        self.resolution, self.bounds = max(f.resolution for f in fields), (self._grid.low, self._grid.high)
+        self.majorant = float(sum(fields[k].majorant / s for k, s in zip(copies.which, copies.size, strict=True)))
+        self.hull = np.concatenate([o + s * fields[k].hull @ r.T for o, r, s, k in zip(
+            copies.origin, copies.rotation, copies.size, copies.which, strict=True)])
+        self._logs = [_log_density(f) for f in fields]
+        self._clear = [_clear_distance(f) for f in fields]
 
     def place(self, p: Vector) -> Place:
         """Return the points, their cells, and the begin and end of the cells' lists."""
@@ -138,7 +159,7 @@ class Instances:
 
         def look(q: Vector, scale: Float, i: UInt32) -> Float:
             x = into(self.copies.axes(i), q)
-            return density_of(self.field.log_density(self.field.place(x))) * scale
+            return density_of(self.copies.call(i, self._logs, x)) * scale
 
         return ops.if_stmt((q, scale, i), dot(q, q) < 1, look, lambda q, scale, i: type(scale)(0), label="copy")
 
@@ -165,8 +186,7 @@ class Instances:
 
         def clear(q: Vector, d: Vector, scale: Float, i: UInt32) -> Float:
             axes = self.copies.axes(i)
-            place = self.field.place(into(axes, q))
-            return self.field.clear_distance(place, safe_inverse(into(axes, d))) / scale
+            return self.copies.call(i, self._clear, into(axes, q), safe_inverse(into(axes, d))) / scale
 
         def enter(q: Vector, d: Vector, scale: Float, i: UInt32) -> Float:
             hit, _, h = spheres.chord(ops, q, d)
@@ -201,7 +221,13 @@ class Instances:
         i = self._choose(p)
         q, _ = self.copies.sphere(i, p)
         axes = self.copies.axes(i)
-        result = self._reflect(into(axes, q))
+        x = into(axes, q)
+        if len(self._reflect) == 1:
+            result = self._reflect[0](x)
+        else:
+            surfaces = [lambda x, reflect=reflect: tuple(reflect(x)[:5]) for reflect in self._reflect]
+            normal, albedo, roughness, specular, softness = self.copies.call(i, surfaces, x)
+            result = Reflectance(normal, albedo, roughness, specular, softness, self._fresnel)
         return result._replace(normal=out_of(axes, result.normal))
 
     def _choose(self, p: Vector) -> UInt32:
@@ -225,21 +251,23 @@ class Instances:
 
 
 class InstancedVisibility:
-    """The product of the transmittances of all copies, each by the visibility `method` of the field.
+    """The product of the transmittances of all copies, each by the visibility method of its field."""
 
-    ``looked_up``: the same method, for seeds of lookups.
-    """
-
-    def __init__(self, method: Visibility, copies: Copies):
-        self.looked_up, self.copies = method, copies
+    def __init__(self, methods: Sequence[Visibility], copies: Copies):
+        self.methods, self.copies = methods, copies
 
     def tau(self, x: Vector, wi: Vector, distance: Float, index: UInt32, active: Mask, sun: Mask = None) -> Float:
         """Return the product."""
         copies, dj = self.copies, self.copies.dj
 
+        def of(method: Visibility) -> Callable[..., Array]:
+            return lambda x, wi, distance: outside.tau(method, x, wi, distance, index, True, sun)
+
+        lookups = [of(method) for method in self.methods]
+
         def through(q: Vector, wi: Vector, distance: Float, i: UInt32, tau: Float) -> Float:
             axes = copies.axes(i)
-            return tau * outside.tau(self.looked_up, into(axes, q), into(axes, wi), distance, index, True, sun)
+            return tau * copies.call(i, lookups, into(axes, q), into(axes, wi), distance)
 
         def beside(q: Vector, wi: Vector, distance: Float, i: UInt32, tau: Float) -> Float:
             return tau

@@ -29,11 +29,11 @@ def instances(field, places, similarity=scenes.SIMILARITY, **medium) -> dict:
     return {"group": {"type": "shapegroup", "inner": scenes.ball(field, similarity, **medium)}, **at}
 
 
-def pictures(blobs, monkeypatch, options, *, size=16, spp=16, seeds=1, lights=("point",)):
-    """Return pictures of six instances as one medium, and as six of their own."""
+def pictures(blobs, monkeypatch, options, *, size=16, spp=16, seeds=1, lights=("point",), shapes=None):
+    """Return pictures of four fields as one medium, and as four of their own; `shapes`: by default instances."""
     lights = {name: scenes.light(name) for name in lights}
     loaded = scenes.scene(None, scenes.nrf(**options), lights, size=size,
-                          shapes=instances(blobs, [place(i) for i in range(6)]))
+                          shapes=shapes or instances(blobs, [place(i) for i in range(4)]))
     result = []
     for fewest in (4, 100):
         monkeypatch.setattr(many, "FEWEST", fewest)
@@ -46,6 +46,21 @@ def test_one_medium_shows_what_media_of_their_own_show(blobs, monkeypatch, visib
     together, apart = pictures(blobs, monkeypatch, {"visibility": visibility}, spp=32, seeds=4)
     assert not np.array_equal(together, apart)
     ztest.check(list(together[..., :3]), list(apart[..., :3]), visibility, block=4)
+    np.testing.assert_allclose(together.mean((0, 1, 2)), apart.mean((0, 1, 2)), rtol=0.01)
+
+
+def test_different_fields_are_one_medium_too(blobs, tmp_path, monkeypatch):
+    """Each has its own density, reflectance and atlas."""
+    shapes = {}
+    for i in range(4):
+        path = tmp_path / f"{i}.safetensors"
+        look = {"albedo": (0.2 + 0.2 * i, 0.5, 0.8 - 0.2 * i), "similarity": scenes.SIMILARITY}
+        field_file.save(path, *fields.blobs(scenes.CENTERS, [0.3 + 0.05 * i, 0.28, 0.2], **look), np.float32)
+        shapes[f"at_{i}"] = scenes.ball(path, to_world=place(i), resolution=64) | {"to_world": place(i)}
+    loaded = find_media(scenes.scene(None, scenes.nrf(), {}, shapes=shapes))
+    assert [len(medium.kinds) for medium in many.joined(loaded)] == [4]
+    together, apart = pictures(None, monkeypatch, {}, spp=32, seeds=4, shapes=shapes)
+    ztest.check(list(together[..., :3]), list(apart[..., :3]), "different fields", block=4)
     np.testing.assert_allclose(together.mean((0, 1, 2)), apart.mean((0, 1, 2)), rtol=0.01)
 
 

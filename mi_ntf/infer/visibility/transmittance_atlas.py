@@ -24,6 +24,7 @@ import numpy as np
 from ...core import spheres
 from ...core.ops import dot
 from .. import octahedral, ops, tuning
+from ..backend import floats
 from ..lights import LightTable
 from ..profile import DepthProfile
 from ..types import Array, Float, Mask, UInt32, Vector
@@ -164,7 +165,7 @@ def table(dj: ModuleType) -> LightTable:
     """Return the directions as a table of lights."""
     side = tuning.ATLAS_SIDE
     v, u = np.divmod(np.arange(side**2), side)
-    d = np.stack(octahedral.direction(dj.Float(u.astype(np.float32)), dj.Float(v.astype(np.float32)), dj.Float(side)))
+    d = np.stack(octahedral.direction(floats(u, dj), floats(v, dj), dj.Float(side)))
     where = np.array(d, np.float64).T
     return LightTable(where, np.ones((side**2, 3)), np.zeros(side**2, bool), 1.0, dj)
 

@@ -1,4 +1,4 @@
-"""Many instances of one field as one medium, whose kernels do not grow with their number."""
+"""Many fields as one medium, whose kernels do not grow with their number."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from ...core.architecture import Similarity
 from ...infer.backend import module_of
-from ...infer.grid import Density
+from ...infer.grid import Density, GridField
 from ...infer.instances import Copies, InstancedVisibility, Instances
 from ...infer.shade import Reflectance
 from ...infer.types import Vector, Visibility
@@ -18,8 +18,11 @@ from .frame import Frame
 from .loaded import LoadedField, VolumeField
 from .media import NRFMedium
 
+MIN_GLOSS = 0.01
+"""Least weight of a specular lobe that is evaluated, relative to a white diffuse surface
+(:class:`mi_ntf.infer.grid.GridField`, `gloss`)."""
 FEWEST = 4
-"""Least number of instances that are one medium. Fewer are media of their own, whose densities each kernel contains."""
+"""Least number of fields that are one medium. Fewer are media of their own, whose densities each kernel contains."""
 WIDEST = 2.0
 """Largest ratio of sizes in one medium, since cells of a march are as long as the smallest field needs."""
 MARGIN = 1.002
@@ -27,9 +30,10 @@ MARGIN = 1.002
 
 
 class Crowd:
-    """The `members`, instances of one field of about the same size, as one medium.
+    """The `members`, of about the same size, as one medium. They are of one field or of surfaces of one kind.
 
-    `frame`: of a sphere around all; `finest`: radius of the smallest one, in radii of this sphere.
+    `frame`: of a sphere around all; `finest`: radius of the smallest one, in radii of this sphere; `kinds`: one member
+    of each field.
     """
 
     def __init__(self, members: Sequence[NRFMedium]) -> None:
@@ -43,26 +47,39 @@ class Crowd:
         radius = MARGIN * float((np.linalg.norm(origin - centre, axis=1) + length).max())
         self.frame = Frame(Similarity(tuple(centre), radius), np.eye(4), 1.0)
         rotation = np.array([m.frame.rotation for m in members])
-        self.copies = Copies((origin - centre) / radius, rotation, length / radius, module_of(mi.Float))
+        sources = list({id(m.source): m for m in members})
+        self.kinds = list({id(m.source): m for m in members}.values())
+        which = np.array([sources.index(id(m.source)) for m in members])
+        self.copies = Copies((origin - centre) / radius, rotation, length / radius, which, module_of(mi.Float))
         self.finest = float(length.min()) / radius
-        self._instances = Instances(first.source, self.copies, first.reflectance)
+        self._instances = Instances([m.source for m in self.kinds], self.copies, [m.reflectance for m in self.kinds],
+                                    self.field.fresnel)
         self.source: Density = self._instances
 
     def reflectance(self, x: Vector) -> Reflectance:
         """Return the reflectance at field points."""
         return self._instances.reflect(x)
 
-    def visibility(self, method: Visibility | None) -> Visibility | None:
-        """Return the visibility of all members by the visibility `method` of their field."""
-        return None if method is None else InstancedVisibility(method, self.copies)
+    def visibility(self, methods: Sequence[Visibility | None]) -> Visibility | None:
+        """Return the visibility of all members by the methods of their fields, `kinds`."""
+        present = [method for method in methods if method is not None]
+        return InstancedVisibility(present, self.copies) if present else None
+
+
+def _kind(medium: NRFMedium) -> tuple[int, ...]:
+    """Return numbers that are the same for media that may be one: those of one field, and all opaque baked surfaces."""
+    field = medium.field
+    if isinstance(medium.source, GridField) and field.softness.opaque and field.phase is None:
+        return 0, int(field.fresnel), int(field.grid.gloss > MIN_GLOSS)
+    return 1, id(medium.source)
 
 
 def joined(media: Sequence[NRFMedium]) -> list[NRFMedium]:
-    """Return `media` with those of one field and similar size as a :class:`Crowd` where they are many."""
+    """Return `media` with those of one kind and similar size as a :class:`Crowd` where they are many."""
     groups: list[list[NRFMedium]] = []
-    for medium in sorted(media, key=lambda m: (id(m.source), m.frame.length)):
+    for medium in sorted(media, key=lambda m: (_kind(m), m.frame.length)):
         last = groups[-1][0] if groups else None
-        if last and last.source is medium.source and medium.frame.length <= WIDEST * last.frame.length:
+        if last and _kind(last) == _kind(medium) and medium.frame.length <= WIDEST * last.frame.length:
             groups[-1].append(medium)
         else:
             groups.append([medium])

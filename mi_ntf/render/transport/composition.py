@@ -82,6 +82,7 @@ class Composition:
         self._media_in_view = [m for m, visible in zip(media, self.effects.in_view, strict=True) if visible]
         self.smoke = not all(m.field.softness.opaque for m in self._media_in_view)
         self.parts: list[Part] = []
+        self._seeded: list[Part] = []  # of single fields of many, whose lookups take random numbers
         self.in_view: list[Part] = []
         self.runs, self.run = self._runs(), -1  # none yet
         self.select(0)
@@ -123,16 +124,18 @@ class Composition:
         """
         if run == self.run:
             return
-        self.run, self.parts, self.in_view = run, [], []  # frees the old maps before new ones are built
+        # Frees the old maps before new ones are built.
+        self.run, self.parts, self.in_view, self._seeded = run, [], [], []
         self.parts = [self._part(m) for m in self._media_with_matter]
         self.in_view = [p for p in self.parts if p.medium in self._media_in_view]
 
     def _part(self, medium: NRFMedium) -> Part:
         if not isinstance(medium, many.Crowd):
             return self._part_of(medium)
-        part, table = self._part_of(medium.members[0]), self.lights.table(medium.frame)
-        return Part(cast(NRFMedium, medium), table, table,
-                    *map(medium.visibility, (part.for_run, part.for_sampled, part.for_all)))
+        parts, table = [self._part_of(m) for m in medium.kinds], self.lights.table(medium.frame)
+        self._seeded += parts
+        return Part(cast(NRFMedium, medium), table, table, medium.visibility([p.for_run for p in parts]),
+                    medium.visibility([p.for_sampled for p in parts]), medium.visibility([p.for_all for p in parts]))
 
     def _part_of(self, medium: NRFMedium) -> Part:
         all_lights, run = self.lights.table(medium.frame), self.runs[self.run]
@@ -162,7 +165,7 @@ class Composition:
 
     def seed_lookups(self, stream: UInt32) -> None:
         """Set the opaque seed of visibility methods whose lookups take random numbers."""
-        for part in self.parts:
+        for part in self.parts + self._seeded:
             for method in (part.for_run, part.for_sampled):
                 while method:
                     if hasattr(method, "stream"):

@@ -16,15 +16,12 @@ from ...infer.types import Float, Vector3
 from ...infer.visibility import REGISTRY
 from ..lights.scene_lights import Lights
 from ..scene.frame import Frame
-from ..scene.many import Crowd
+from ..scene.many import MIN_GLOSS, Crowd
 from ..scene.media import NRFMedium, lets_light_through, ordinary_shapes
 from ..scene.settings import Settings
 
 PINHOLES = ("PerspectiveCamera",)
 """Cameras whose rays all start at one point; light from there has the transmittance of the view."""
-MIN_GLOSS = 0.01
-"""Least weight of a specular lobe that is evaluated, relative to a white diffuse surface
-(:class:`mi_ntf.infer.grid.GridField`, `gloss`)."""
 NEAR = 1e-3
 """Largest distance of a light at the camera, relative to the distance of the nearest field's sphere."""
 POWERS = {
