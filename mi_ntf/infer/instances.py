@@ -36,15 +36,16 @@ class Copies:
         (n, 3, 3) from their field coordinates to the common ones.
     size
         (n,) radii of their unit spheres, common units.
-    which
+    field_index
         (n,) the field of each.
     dj
         Dr.Jit module of the back end.
     """
 
-    def __init__(self, origin: np.ndarray, rotation: np.ndarray, size: np.ndarray, which: np.ndarray, dj: ModuleType):
-        self.origin, self.rotation, self.size, self.which, self.dj = origin, rotation, size, which, dj
-        self._which = words(which, dj)
+    def __init__(self, origin: np.ndarray, rotation: np.ndarray, size: np.ndarray, field_index: np.ndarray,
+                 dj: ModuleType):
+        self.origin, self.rotation, self.size, self.field_index, self.dj = origin, rotation, size, field_index, dj
+        self._field_index = words(field_index, dj)
         self._spheres = floats(np.concatenate([origin, 1 / size[:, None]], 1), dj)
         columns = np.concatenate([np.swapaxes(rotation, 1, 2), np.zeros((len(size), 3, 1))], 2)
         self._columns = floats(columns, dj)
@@ -59,7 +60,7 @@ class Copies:
         """Return the result of the function of the field of copy `i`."""
         if len(functions) == 1:
             return functions[0](*arguments)
-        return dr.switch(dr.gather(self.dj.UInt32, self._which, i), list(functions), *arguments)
+        return dr.switch(dr.gather(self.dj.UInt32, self._field_index, i), list(functions), *arguments)
 
     def axes(self, i: UInt32) -> list[Vector]:
         """Return the axes of copy `i` in common coordinates."""
@@ -142,9 +143,9 @@ class Instances:
         self.copies, self._reflect, self._fresnel, self._dj = copies, reflect, fresnel, copies.dj
         self._grid = _Grid(copies)
         self.resolution, self.bounds = max(f.resolution for f in fields), (self._grid.low, self._grid.high)
-        self.majorant = float(sum(fields[k].majorant / s for k, s in zip(copies.which, copies.size, strict=True)))
+        self.majorant = float(sum(fields[k].majorant / s for k, s in zip(copies.field_index, copies.size, strict=True)))
         self.hull = np.concatenate([o + s * fields[k].hull @ r.T for o, r, s, k in zip(
-            copies.origin, copies.rotation, copies.size, copies.which, strict=True)])
+            copies.origin, copies.rotation, copies.size, copies.field_index, strict=True)])
         self._logs = [_log_density(f) for f in fields]
         self._clear = [_clear_distance(f) for f in fields]
 

@@ -64,6 +64,23 @@ def test_a_small_field_inside_a_large_fog(tmp_path):
     np.testing.assert_allclose(brightness, before, rtol=0.04)
 
 
+@pytest.mark.parametrize("count", [1, 5])
+def test_transmittance_of_uniform_balls_of_sizes_1_to_1000(tmp_path, count):
+    """Optical depths of chords add where small balls lie inside one a thousand times larger; five are one medium."""
+    path = save(tmp_path, "ball", *fields.uniform(0.5, similarity=Similarity((0.0, 0.0, 0.0), 1.0)))
+    move = mi.ScalarTransform4f().translate
+    places = {"large": move([0, 0, 0]).scale(100)}
+    places |= {f"small_{i}": move([0, 0, 20 - 0.05 * i]).scale(0.1) for i in range(count)}
+    shapes = {name: scenes.ball(path, Similarity(), resolution=96, to_world=to_world) | {"to_world": to_world}
+              for name, to_world in places.items()}
+    alpha = view(shapes, HEAD_ON, {}, size=16, spp=256, width=0.15, centre=(0, 0, 20))[..., 3]
+    c = (np.arange(128) + 0.5) / 128 * 0.3 - 0.15
+    chord = np.sqrt(np.maximum(0.01 - c**2 - c[:, None] ** 2, 0))
+    expected = 1 - np.exp(-1.0 - count * chord * 10).reshape(16, 8, 16, 8).mean((1, 3))
+    np.testing.assert_allclose(alpha, expected, atol=0.03)  # voxels of 1/48 at the rims
+    assert abs((alpha - expected).mean()) < 0.004
+
+
 @pytest.mark.parametrize(
     "options",
     [

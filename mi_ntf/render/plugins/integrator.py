@@ -73,6 +73,13 @@ medium at a time and is no reference there. Light crosses surfaces whose BSDF ha
 ``thindielectric``), as under ``volpath``. Shadow rays of surfaces are marched if `visibility` is a method of maps or
 volumes. Under ``none`` fields neither cast nor receive shadows, and light that one scatters meets no other field.
 
+An ``instance`` of a ``shapegroup`` places the fields of the group, which share their voxels and their atlas; stock
+``volpath`` does not move media. Four or more fields that are opaque surfaces, or of one file, are one medium of the
+kernels if their sizes differ by a factor of two at most. Kernels then do not grow with their number. This holds under
+``raymarch``, ``transmittance_atlas``, ``none`` and ``auto``. It does not hold for derivatives, `unbiased`, `map_file`
+and ``bounces=radiosity``, which treat each field by itself. Light of further bounces is then that of ``paths``. Each
+different field has an atlas of its own, 51 MiB, and `map_memory` has to hold all of them.
+
 The picture is differentiable with respect to the power of lights, an environment's texels, and the reflectance of
 diffuse surfaces. With at most 32 lights it is differentiable with respect to their position and direction as well;
 their shadows are marched then. Other parameters with gradients are refused, and so are places of lights beside surfaces
@@ -86,9 +93,9 @@ volumes and atlases follow smoke. Where two of their texels are thicker than a m
 marched.
 
 Does not support: media with another extinction in each colour or, as by ``sggx``, in each direction; exterior media,
-media in a ``shapegroup``; instances that move a field of their ``shapegroup``; a place inside another integrator, such
-as ``aov`` or ``moment`` (use `aovs`); spectral and polarised variants; derivatives with respect to fields and turning
-environments; ``timed_sunsky``; environments whose `to_world` shears or, among surfaces, scales.
+media in a ``shapegroup`` other than ``nrf``; a ``shapegroup`` of fields and other shapes; a place inside another
+integrator, such as ``aov`` or ``moment`` (use `aovs`); spectral and polarised variants; derivatives with respect to
+fields and turning environments; ``timed_sunsky``; environments whose `to_world` shears or, among surfaces, scales.
 
 .. code-block:: xml
 

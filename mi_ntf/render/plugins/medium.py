@@ -23,6 +23,8 @@ Every collision scatters (the single-scattering albedo is 1), with the field's r
 the phase function of Henyey and Greenstein in place of a surface's reflectance. Media may overlap: the ``nrf``
 integrator adds their densities. Stock volumetric integrators know one medium at a time and are no reference there.
 
+A medium in a ``shapegroup`` lies where each ``instance`` places it, under the ``nrf`` integrator alone.
+
 Does not support: several bounding shapes for one medium; shearing or non-uniform transforms; spectral extinction.
 Source: neural reflectance fields, Bi et al. 2020.
 

@@ -49,8 +49,8 @@ class Crowd:
         rotation = np.array([m.frame.rotation for m in members])
         sources = list({id(m.source): m for m in members})
         self.kinds = list({id(m.source): m for m in members}.values())
-        which = np.array([sources.index(id(m.source)) for m in members])
-        self.copies = Copies((origin - centre) / radius, rotation, length / radius, which, module_of(mi.Float))
+        field_index = np.array([sources.index(id(m.source)) for m in members])
+        self.copies = Copies((origin - centre) / radius, rotation, length / radius, field_index, module_of(mi.Float))
         self.finest = float(length.min()) / radius
         self._instances = Instances([m.source for m in self.kinds], self.copies, [m.reflectance for m in self.kinds],
                                     self.field.fresnel)
