@@ -20,8 +20,10 @@ PART = 4096
 """Number of bricks that are packed together."""
 FARTHEST = 15
 """Largest distance to the next brick that the index holds, in bricks."""
-_OCTANTS, _DISTANCE = 20, 28
+OCTANTS, _DISTANCE = 20, 28
 """First bits of an index entry's octants and distance; the bits below hold the number of the brick."""
+NUMBER = (1 << OCTANTS) - 1
+"""Bits of an index entry that hold the number of the brick."""
 
 
 def bricks_per_side(resolution: int) -> int:
@@ -53,25 +55,25 @@ class Bricks:
         check(arrays)
         self._dj, self.resolution = dj, int(arrays["resolution"][0])
         self.channels, self.side = arrays["range"].shape[1], bricks_per_side(self.resolution)
-        self._index, self._words = (words(arrays[name], dj) for name in ("index", "words"))
+        self.index, self.words = (words(arrays[name], dj) for name in ("index", "words"))
         n = self.resolution
         last = np.nextafter(np.float32(n - 1), np.float32(0))  # of the last cell, whose next voxel is there
         self._half, self._first, self._last, self._voxel = (
             dr.opaque(dj.Float, v) for v in (n / 2, n / 2 - 0.5, last, 2 / n))
         self._bricks, self._size = (dr.opaque(dj.UInt32, v) for v in (self.side, self.channels * WORDS))
-        self._low, self._step = ([dr.opaque(dj.Float, float(v)) for v in row] for row in arrays["range"])
+        self.low, self.step = ([dr.opaque(dj.Float, float(v)) for v in row] for row in arrays["range"])
 
     @property
     def nbytes(self) -> int:
         """Size in bytes."""
-        return 4 * (dr.width(self._words) + dr.width(self._index))
+        return 4 * (dr.width(self.words) + dr.width(self.index))
 
     def place(self, p: Vector) -> Place:
         """Return the places of `p`: by axis in voxels from the first centre, and their entries in the index."""
         # NaN must not become an index.
         place = [ops.fmin(ops.fmax(dr.fma(self._half, c, self._first), 0), self._last) for c in p]
         x, y, z = (self._dj.UInt32(f) >> 3 for f in place)
-        return *place, dr.gather(self._dj.UInt32, self._index, (z * self._bricks + y) * self._bricks + x)
+        return *place, dr.gather(self._dj.UInt32, self.index, (z * self._bricks + y) * self._bricks + x)
 
     def at(self, place: Place) -> list[Float]:
         """Return the channels at a :meth:`place`."""
@@ -79,10 +81,10 @@ class Bricks:
         corner = [self._dj.UInt32(f) for f in cell]
         fx, fy, fz = (f - self._dj.Float(i) for f, i in zip(cell, corner, strict=True))
         x, y, z = (c & (SIDE - 1) for c in corner)
-        first = (entry & ((1 << _OCTANTS) - 1)) * self._size + z * LAYER + y * LINE + x
+        first = (entry & NUMBER) * self._size + z * LAYER + y * LINE + x
 
         def along_x(index: UInt32) -> Float:
-            word = dr.gather(self._dj.UInt32, self._words, index)
+            word = dr.gather(self._dj.UInt32, self.words, index)
             low = self._dj.Float(word & 0xFFFF)
             return low + fx * (self._dj.Float(word >> 16) - low)
 
@@ -91,7 +93,7 @@ class Bricks:
             return low + fy * (along_x(index + LINE) - low)
 
         result = []
-        for channel, (low, step) in enumerate(zip(self._low, self._step, strict=True)):
+        for channel, (low, step) in enumerate(zip(self.low, self.step, strict=True)):
             near = along_y(first + channel * WORDS)
             result.append(low + step * (near + fz * (along_y(first + (channel * WORDS + LAYER)) - near)))
         return result
@@ -106,7 +108,7 @@ class Bricks:
         n = entry >> _DISTANCE
         half = [self._dj.UInt32(f) >> 2 for f in cell]  # in halves of bricks
         x, y, z = (h & 1 for h in half)
-        empty = ((entry >> (_OCTANTS + x + 2 * y + 4 * z)) & 1) == 0
+        empty = ((entry >> (OCTANTS + x + 2 * y + 4 * z)) & 1) == 0
         whole, distance = n > 0, dr.inf
         ahead = self._dj.Float(dr.select(whole, 2 * n, 1))
         behind = self._dj.Float(dr.select(whole, 2, 1)) - ahead
@@ -118,11 +120,11 @@ class Bricks:
 
     def occupied(self, place: Place) -> Mask:
         """Return True where a :meth:`place` lies in a brick that holds matter."""
-        return (place[-1] & ((1 << _OCTANTS) - 1)) > 0
+        return (place[-1] & NUMBER) > 0
 
     def distances(self) -> np.ndarray:
         """Return the Chebyshev distance of each brick (z, y, x) to the next one that holds matter, in bricks."""
-        distances: np.ndarray = (self._index.numpy() >> _DISTANCE).reshape((self.side,) * 3)
+        distances: np.ndarray = (self.index.numpy() >> _DISTANCE).reshape((self.side,) * 3)
         return distances
 
 
@@ -148,13 +150,13 @@ def pack(values: np.ndarray, places: np.ndarray, octants: np.ndarray, resolution
     MiNtfError
         There are more bricks than the index can number.
     """
-    if len(values) >= 1 << _OCTANTS:
+    if len(values) >= 1 << OCTANTS:
         raise MiNtfError(f"a field of {resolution}³ voxels takes {len(values)} bricks, more than the "
-                         f"{(1 << _OCTANTS) - 1} that can be numbered; give the nrf medium a lower resolution")
+                         f"{(1 << OCTANTS) - 1} that can be numbered; give the nrf medium a lower resolution")
     side, count, channels = bricks_per_side(resolution), *values.shape[:2]
     index = np.zeros((side,) * 3, np.uint32)
     bits = octants.reshape(-1, 8).astype(np.uint32) @ (1 << np.arange(8, dtype=np.uint32))
-    index[tuple(places.T)] = np.arange(1, count + 1) | bits << _OCTANTS
+    index[tuple(places.T)] = np.arange(1, count + 1) | bits << OCTANTS
     index |= chebyshev_distance(index > 0).astype(np.uint32) << _DISTANCE
     low, high = (np.full(channels, empty, np.float32) for _ in range(2))
     if count:
@@ -177,7 +179,7 @@ def check(arrays: dict[str, np.ndarray]) -> None:
     side = bricks_per_side(int(resolution[0])) if resolution.size == 1 else 0
     fits = (stored.ndim == 5 and stored.shape[2:] == (SIDE + 1, SIDE + 1, SIDE) and ranges.shape == (2, stored.shape[1])
             and index.shape == (side,) * 3 and index.dtype == stored.dtype == np.uint32)
-    if not fits or not np.isfinite(ranges).all() or (index & ((1 << _OCTANTS) - 1)).max() >= len(stored):
+    if not fits or not np.isfinite(ranges).all() or (index & NUMBER).max() >= len(stored):
         raise ValueError("these are no bricks")
 
 
@@ -197,7 +199,7 @@ def of_dense(values: np.ndarray, mask: np.ndarray) -> dict[str, np.ndarray]:
 
 def to_dense(arrays: dict[str, np.ndarray], counts: Sequence[int]) -> np.ndarray:
     """Return the first channel (z, y, x) of the arrays of a :class:`Bricks`; `counts`: voxels along x, y and z."""
-    number = arrays["index"] & np.uint32((1 << _OCTANTS) - 1)
+    number = arrays["index"] & np.uint32(NUMBER)
     low, step = arrays["range"][:, 0]
     result = np.zeros((SIDE * number.shape[0] + 1,) * 3, np.float32)
     for z, y, x in np.argwhere(number > 0):
@@ -211,8 +213,8 @@ def to_dense(arrays: dict[str, np.ndarray], counts: Sequence[int]) -> np.ndarray
 def octants_with_matter(index: np.ndarray) -> np.ndarray:
     """Return a mask (z, y, x) of the octants of all bricks that hold matter, by the `index` of a :func:`pack`."""
     side = index.shape[0]
-    bits = index[:, None, :, None, :, None] >> (_OCTANTS + np.arange(8, dtype=np.uint32)).reshape(1, 2, 1, 2, 1, 2)
-    number = index & np.uint32((1 << _OCTANTS) - 1)
+    bits = index[:, None, :, None, :, None] >> (OCTANTS + np.arange(8, dtype=np.uint32)).reshape(1, 2, 1, 2, 1, 2)
+    number = index & np.uint32(NUMBER)
     result: np.ndarray = ((bits & 1) == 1) & (number > 0)[:, None, :, None, :, None]
     return result.reshape(2 * side, 2 * side, 2 * side)
 

@@ -1,7 +1,8 @@
 """Densities that marches read: a field baked into bricks, or its networks with the bricks' empty space."""
 
+import copy
 from types import ModuleType
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import drjit as dr
 import numpy as np
@@ -49,6 +50,15 @@ class Density(Protocol):
         """Return begin and end, t', of the part of the chord m + t' d, |t'| ≤ h, that may hold density."""
 
 
+class PlacedVoxels(NamedTuple):
+    """Bricks whose voxels, `counts` along x, y and z, fill the box from `low` to `high`, field coordinates."""
+
+    content: Bricks
+    counts: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+
 class InSphere:
     """A density that fills the unit sphere."""
 
@@ -87,6 +97,24 @@ class GridField(InSphere):
         """Size in bytes."""
         return self.bricks.nbytes + (self._reflectance.nbytes if self._reflectance else 0)
 
+    @property
+    def density_voxels(self) -> PlacedVoxels:
+        """Voxels of ln σ."""
+        return _in_cube(self.bricks)
+
+    @property
+    def reflectance_voxels(self) -> PlacedVoxels | None:
+        """Voxels of the reflectance; None if the networks give it."""
+        return _in_cube(self._reflectance) if self._reflectance else None
+
+    def with_density(self, content: Bricks, majorant: float, hull: np.ndarray) -> "GridField":
+        """Return a copy with other bricks of ln σ."""
+        result = copy.copy(self)
+        result.bricks, result.majorant, result.hull = content, majorant, hull
+        result.bounds = hull.min(0), hull.max(0)
+        result.place, result.clear_distance = content.place, content.clear_distance
+        return result
+
     def density(self, p: Vector) -> Float:
         """Return σ at `p`, 1/(unit-sphere radius)."""
         return density_of(inside(self.log_density(self.place(p)), p))
@@ -123,6 +151,11 @@ class NetworkVolume(InSphere):
     def clear_distance(self, place: Place, inverse_d: Vector) -> Float:
         """Return the distance that a ray runs through empty bricks."""
         return self._bricks.clear_distance(place[1], inverse_d)
+
+
+def _in_cube(content: Bricks) -> PlacedVoxels:
+    """Return bricks of as many voxels along each axis, which fill the cube around the unit sphere."""
+    return PlacedVoxels(content, np.full(3, content.resolution), np.full(3, -1.0), np.ones(3))
 
 
 def bricks_of(arrays: dict[str, np.ndarray], name: str, dj: ModuleType) -> Bricks:

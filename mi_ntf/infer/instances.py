@@ -131,16 +131,24 @@ def _clear_distance(field: Density) -> Callable[[Vector, Vector], Float]:
     return lambda x, inverse: field.clear_distance(field.place(x), inverse)
 
 
+def _wide(reflect: Callable[[Vector], Reflectance]) -> Callable[[Vector], tuple[Vector | Float | None, ...]]:
+    """Return `reflect` of surfaces as a function of tuples, with a retro-reflection for each point if there is any."""
+
+    def values(x: Vector) -> tuple[Vector | Float | None, ...]:
+        r = reflect(x)
+        return *r[:5], None if r.retro is None else r.retro + 0 * r.roughness
+
+    return values
+
+
 class Instances:
     """The sum of the densities of `copies` of `fields`, a :class:`mi_ntf.infer.grid.Density`.
 
     `reflect`: reflectance of points, one function for each field. Fields that differ must be surfaces of one kind.
-    `fresnel`: their specular weight grows towards grazing angles.
     """
 
-    def __init__(self, fields: Sequence[Density], copies: Copies, reflect: Sequence[Callable[[Vector], Reflectance]],
-                 fresnel: bool = False):
-        self.copies, self._reflect, self._fresnel, self._dj = copies, reflect, fresnel, copies.dj
+    def __init__(self, fields: Sequence[Density], copies: Copies, reflect: Sequence[Callable[[Vector], Reflectance]]):
+        self.copies, self._reflect, self._dj = copies, reflect, copies.dj
         self._grid = _Grid(copies)
         self.resolution, self.bounds = max(f.resolution for f in fields), (self._grid.low, self._grid.high)
         self.majorant = float(sum(fields[k].majorant / s for k, s in zip(copies.field_index, copies.size, strict=True)))
@@ -226,9 +234,7 @@ class Instances:
         if len(self._reflect) == 1:
             result = self._reflect[0](x)
         else:
-            surfaces = [lambda x, reflect=reflect: tuple(reflect(x)[:5]) for reflect in self._reflect]
-            normal, albedo, roughness, specular, softness = self.copies.call(i, surfaces, x)
-            result = Reflectance(normal, albedo, roughness, specular, softness, self._fresnel)
+            result = Reflectance(*self.copies.call(i, [_wide(reflect) for reflect in self._reflect], x))
         return result._replace(normal=out_of(axes, result.normal))
 
     def _choose(self, p: Vector) -> UInt32:

@@ -73,6 +73,15 @@ class NetworkField:
         self.quick = arch.reflectance.encoding.kind == "planes"
         """True if a reflectance costs no more than a few fetches."""
 
+    def tensors(self) -> dict[str, Array]:
+        """Return the planes and the packed weights of the density and reflectance networks, by name."""
+        result: dict[str, Array] = {}
+        for name, network in (("density", self._density), ("reflectance", self._reflectance)):
+            for level, planes in enumerate(network.planes):
+                result |= {f"{name}.planes.{level}.{i}": plane.tensor() for i, plane in enumerate(planes)}
+            result |= {f"{name}.{key}": tensor for key, tensor in network.layer_tensors.items()}
+        return result
+
     def log_density(self, p: Vector) -> Float:
         """Return ln σ at `p`, clipped to the legal range, without the cuts of :meth:`density`."""
         (raw,) = self._density.layers(self._density.encode(p))
@@ -157,6 +166,7 @@ class _Network:
         layers = []
         for i, (n_out, n_in) in enumerate(shapes):
             layers += [nn.Linear(n_in, n_out)] + ([nn.ReLU()] if i + 1 < count else [])
+        self.layer_tensors: dict[str, Array] = {}
         net = nn.Sequential(*layers).alloc(tensor, size=shapes[0][1])
         for i in range(count):
             for ours, theirs in (("weight", "weights"), ("bias", "bias")):
@@ -164,7 +174,7 @@ class _Network:
                 if half:
                     end = np.finfo(np.float16).max
                     value = np.clip(value, -end, end).astype(np.float16)
-                net[f"layers.{2 * i}.{theirs}"] = tensor(value)
+                self.layer_tensors[f"layers.{i}.{ours}"] = net[f"layers.{2 * i}.{theirs}"] = tensor(value)
         self.packed: Array = nn.pack(net, layout="inference")
 
     def encode(self, p: Vector) -> list[Float]:

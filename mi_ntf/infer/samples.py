@@ -1,6 +1,7 @@
 """Shading points along camera rays (:mod:`mi_ntf.infer.march`)."""
 
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import drjit as dr
 
@@ -45,6 +46,46 @@ class Samples:
         """Return the points at `t` of the rays `ray`, and the rays' directions, in the coordinates of field `i`."""
         line = self.line(i, ray)
         return self.along(i, line, t), line[1]
+
+    def attached(self, log_densities: Sequence[Callable[[Vector], Float] | None]) -> "Samples":
+        """Return the samples with weights and transmittances that carry the gradients of densities.
+
+        Parameters
+        ----------
+        log_densities
+            For each field a function of its points to ln σ, attached; None for fields without gradients.
+
+        Notes
+        -----
+        The light L = ∫ T σ h dt of a ray changes by dL = ∫ T σ (h(t) − R(t)/T(t)) d(ln σ)(t) dt, where R(t) is the
+        light from behind t. Sums over the samples estimate both integrals. A sample stands for its portion of lost
+        light; of this portion, the part behind the sample itself is as bright as the sample. Places and radiance of
+        the samples are fixed.
+        """
+        assert self.view is not None
+        uint, zero = type(self.ray), dr.zeros(type(self.t), dr.width(self.t))
+        slopes, weight = [], sum(self.weights, zero)
+        for i, log_density in enumerate(log_densities):
+            value = None if log_density is None else log_density(self.place(i, self.ray, self.t)[0])
+            slopes.append(zero if value is None else value - dr.detach(value))
+        each = sum((w * s for w, s in zip(self.weights, slopes, strict=True)), zero)
+        absorbed = each * dr.rcp(dr.maximum(self.view, 1e-6))  # change of the optical depth by each portion
+        index = dr.arange(uint, dr.width(self.t))
+        ordinal = index - dr.gather(uint, self.first, self.ray)
+
+        def body(k: UInt32, lost: Float, depth: Float) -> tuple[Array, ...]:
+            before = k <= ordinal
+            return (k + 1, lost + dr.gather(type(lost), weight, index - k, before),
+                    depth + dr.gather(type(depth), absorbed, index - k, before))
+
+        _, lost, depth = ops.while_loop(
+            state=(dr.ones(uint, dr.width(self.t)), zero, zero), cond=lambda k, lost, depth: k <= ordinal, body=body,
+            label="samples before", max_iterations=-1)
+        behind = dr.clip(dr.detach(lost) + weight - (1 - self.view), 0, weight) * dr.rcp(dr.maximum(weight, 1e-30))
+        weights = tuple(w * (1 + s - depth - absorbed * behind)
+                        for w, s in zip(self.weights, slopes, strict=True))
+        (total,) = self.totals([absorbed], True)
+        return replace(self, weights=weights, transmittance=self.transmittance * (1 - total))
 
     def totals(self, values: list[Float], gradients: bool = False) -> list[Float]:
         """Return the sum of each of `values` over each ray's points, always in the same order, unlike atomic sums.

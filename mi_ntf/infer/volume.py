@@ -1,5 +1,6 @@
 """Density of a participating medium: trilinear voxels of extinction, as in ``gridvolume``, in a body."""
 
+import copy
 import hashlib
 from types import ModuleType
 
@@ -12,7 +13,7 @@ from ..core.spheres import fibonacci
 from ..core.voxels import ARRAYS, Voxels
 from . import bricks, ops
 from .convex import Convex, box
-from .grid import bricks_of
+from .grid import PlacedVoxels, bricks_of
 from .network import NOTHING, coloured, density_of
 from .types import Float, Place, Reflected, Vector
 
@@ -32,6 +33,7 @@ class Placed:
 
     def __init__(self, content: bricks.Bricks, counts: np.ndarray, low: np.ndarray, high: np.ndarray, dj: ModuleType):
         self.bricks, self.counts = content, np.asarray(counts, np.float64)
+        self.low, self.high = np.asarray(low, np.float64), np.asarray(high, np.float64)
         size = np.asarray(high, np.float64) - low
         self.resolution = int(np.ceil((2 * self.counts / size).max()))
         scale = 2 * self.counts / (content.resolution * size)
@@ -48,6 +50,11 @@ class Placed:
         """Return the distance that a ray runs through empty bricks."""
         return self.bricks.clear_distance(place, tuple(
             i * s for i, s in zip(inverse_d, self._inverse, strict=True)))
+
+    @property
+    def voxels(self) -> PlacedVoxels:
+        """The bricks and their place."""
+        return PlacedVoxels(self.bricks, self.counts.astype(int), self.low, self.high)
 
 
 class Solid(Convex):
@@ -127,6 +134,24 @@ class VoxelVolume:
         reflectance = self._reflectance.bricks.nbytes if self._reflectance else 0
         return self._density.bricks.nbytes + reflectance + self.body.nbytes
 
+    @property
+    def density_voxels(self) -> PlacedVoxels:
+        """Voxels of extinction."""
+        return self._density.voxels
+
+    @property
+    def reflectance_voxels(self) -> PlacedVoxels | None:
+        """Voxels of the reflectance; None if it is an albedo that is the same everywhere."""
+        return self._reflectance.voxels if self._reflectance else None
+
+    def with_density(self, content: bricks.Bricks, majorant: float, hull: np.ndarray) -> "VoxelVolume":
+        """Return a copy with other bricks of extinction."""
+        result = copy.copy(self)
+        result._density = copy.copy(self._density)
+        result._density.bricks = content
+        result.majorant, result.hull, result.bounds = majorant, hull, (hull.min(0), hull.max(0))
+        return result
+
     def density(self, p: Vector) -> Float:
         """Return σ at `p`, 1/(unit-sphere radius)."""
         return density_of(self.log_density(self.place(p)))
@@ -170,7 +195,7 @@ def of_file(header: Voxels, arrays: dict[str, np.ndarray], dj: ModuleType) -> Vo
     sphere = header.similarity
     low, high = ((np.array(corner) - sphere.center) / sphere.radius for corner in (header.low, header.high))
     scaled = arrays | {"density.range": (arrays["density.range"] * sphere.radius).astype(np.float32)}
-    hull = _hull(arrays["density.index"], np.array(header.counts), low, high)
+    hull = hull_of(arrays["density.index"], np.array(header.counts), low, high)
     return VoxelVolume(scaled, header, low, high, Convex(box(low, high), None, dj), hull, dj)
 
 
@@ -200,7 +225,7 @@ def _channel(arrays: dict[str, np.ndarray], channel: int) -> np.ndarray:
     return values
 
 
-def _hull(index: np.ndarray, counts: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+def hull_of(index: np.ndarray, counts: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """Return the furthest corners (k, 3), x first, of the octants that hold matter, along many directions."""
     octants = bricks.octants_with_matter(index)
     first, end = octants.argmax(2), octants.shape[2] - octants[:, :, ::-1].argmax(2)  # of each line along x

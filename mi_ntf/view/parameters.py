@@ -9,6 +9,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..render.scene.traversal import traverse
+
 Value: TypeAlias = Any
 """A parameter's value: a number, vector, colour or transform of the current variant."""
 
@@ -17,7 +19,7 @@ class Parameters:
     """The traversed parameters of `scene`."""
 
     def __init__(self, scene: mi.Scene) -> None:
-        self._all = mi.traverse(scene)
+        self._all = traverse(scene)
         self._changed = False
 
     def get(self, node: mi.Object, name: str) -> Value:

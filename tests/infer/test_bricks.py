@@ -51,7 +51,7 @@ def test_no_brick_and_all_bricks(rng):
 
 def test_more_bricks_than_the_index_numbers(monkeypatch):
     """A field full of fog at the finest resolution is refused: brick numbers would overflow into the octants' bits."""
-    monkeypatch.setattr(bricks, "_OCTANTS", 3)
+    monkeypatch.setattr(bricks, "OCTANTS", 3)
     fog = np.ones((24, 24, 24, 1), np.float32)
     with pytest.raises(MiNtfError, match=r"of 24³ voxels takes 27 bricks, more than the 7 .* a lower resolution"):
         bricks.of_dense(fog, fog[..., 0] > 0)

@@ -5,6 +5,7 @@ import drjit as dr
 from ...core import spheres
 from .. import ops
 from ..types import Float, Mask, UInt32, Vector, Visibility
+from .attached_shadow import AttachedShadow
 
 
 def tau(method: Visibility, x: Vector, wi: Vector, distance: Float, index: UInt32, active: Mask,
@@ -14,6 +15,9 @@ def tau(method: Visibility, x: Vector, wi: Vector, distance: Float, index: UInt3
     Arguments as in :class:`mi_ntf.infer.types.Visibility`. Methods know their rays inside the sphere alone: beyond it,
     a logistic that fits smoke would fall to 0. Rays that miss the sphere evaluate no method.
     """
+    if isinstance(method, AttachedShadow):  # Dr.Jit loses the gradients of a field within a branch
+        through_field = tau(method.looked_up, x, wi, distance, index, active, sun)
+        return method.attach(through_field, x, wi, distance, active)
     hit, m, h = spheres.chord(ops, x, wi)
     here = spheres.coordinate(x, wi)
     way = dr.select(hit, dr.maximum(-h - here, 0), 0)

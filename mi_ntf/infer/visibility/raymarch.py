@@ -1,5 +1,6 @@
 """``raymarch``: one march per point and light, the reference (method.md, section 7)."""
 
+from collections.abc import Callable
 from types import ModuleType
 from typing import TypeAlias
 
@@ -11,12 +12,13 @@ from .. import ops, tuning
 from ..bundle import density_where, safe_inverse, slope_where
 from ..grid import Density
 from ..lights import LightTable
-from ..types import Array, Float, Mask, UInt32, Vector
+from ..types import Array, Float, Mask, Place, UInt32, Vector
 from .method import Keep, Medium, Method, Options
 
 MAX_OPTICAL_DEPTH = 12.0
 """Optical depth at which light rays end and count as blocked. A strong lamp inside an opaque lantern must not shine
 through at τ = 6e-6."""
+State: TypeAlias = tuple[Array, ...]
 Steps: TypeAlias = tuple[Float, Float, Float]
 """Shortest and longest step, field units, and growth: the step at distance t is growth · t between the two bounds."""
 
@@ -56,42 +58,85 @@ def optical_depth(volume: Density, x: Vector, d: Vector, length: Float, steps: S
     from outside a loop within a branch or loop.
     """
     attached = dr.grad_enabled(x, d, length)
-    still, along, far = dr.detach(x), dr.detach(d), dr.detach(length)
-    # Places are t' of the chord, small numbers also where `x` lies far outside.
-    hit, m, h = spheres.chord(ops, still, along)
-    here = spheres.coordinate(still, along)
-    first, last_place = volume.extent(m, along, h)
-    begin, end = dr.maximum(first, here), dr.minimum(here + far, last_place)
-    shortest, longest, growth = steps
-    inverse = safe_inverse(along)
+    ray = _Ray(volume, dr.detach(x), dr.detach(d), dr.detach(length))
 
-    def at(t: Float) -> tuple[Float, ...]:
-        return tuple(mi + t * di for mi, di in zip(m, along, strict=True))
-
-    def body(t: Float, sums: tuple[Float, ...], active: Mask) -> tuple[Array, ...]:
-        step = dr.minimum(dr.clip(growth * (t - here), shortest, longest), end - t)
-        node = t + tuning.NODE * step
-        q = at(node)
-        place = volume.place(q)
-        skip = volume.clear_distance(place, inverse)
-        empty = skip > 0
-        new: tuple[Float, ...]
+    def add(sums: State, node: Float, q: Vector, place: Place, step: Float, matter: Mask) -> State:
+        new: State
         if attached:
-            sigma, *slope = slope_where(active & ~empty, volume.density, q)
-            new = (sigma, *slope, *((node - here) * s for s in slope))
+            sigma, *slope = slope_where(matter, volume.density, q)
+            new = (sigma, *slope, *((node - ray.here) * s for s in slope))
         else:
-            new = (density_where(active & ~empty, volume, place),)
-        sums = tuple(a + b * step for a, b in zip(sums, new, strict=True))
-        t = dr.select(empty, dr.maximum(node + skip + 1e-4, t + step), t + step)
-        return t, sums, active & (t < end - 1e-5) & (sums[0] < MAX_OPTICAL_DEPTH)
+            new = (density_where(matter, volume, place),)
+        return tuple(a + b * step for a, b in zip(sums, new, strict=True))
 
-    zero = dr.zeros(type(begin), dr.width(begin))
-    start = (begin, (zero,) * (7 if attached else 1), active & hit & (end > begin))
-    depth, *slopes = ops.while_loop(state=start, cond=lambda t, sums, active: active, body=body, label="light march")[1]
+    zero = dr.zeros(type(ray.begin), dr.width(ray.begin))
+    depth, *slopes = ray.march((zero,) * (7 if attached else 1), add, steps, active)
     if not attached:
         return depth
-    last = density_where(active & hit & (end > begin) & (end < last_place), volume, volume.place(at(end)))
+    last = density_where(active & ray.crosses & (ray.end < ray.last), volume, volume.place(ray.at(ray.end)))
     return ops.replace_grad(depth, dot(slopes[:3], x) + dot(slopes[3:], d) + last * length)
+
+
+def drawn_depth(volume: Density, x: Vector, d: Vector, length: Float, steps: Steps, active: Mask
+                ) -> tuple[Float, Float]:
+    """Return :func:`optical_depth`, detached, and a t on the ray that is drawn in proportion to σ.
+
+    The random numbers follow from the bits of `x` and `d`.
+    """
+    ray = _Ray(volume, x, d, length)
+    uint = dr.uint32_array_t(type(ray.begin))
+    seed = uint(0)
+    for c in (*x, *d):
+        seed = (seed ^ dr.reinterpret_array(uint, type(ray.begin)(c))) * 0x9E3779B1
+        seed = seed ^ (seed >> 15)
+
+    def add(sums: State, node: Float, q: Vector, place: Place, step: Float, matter: Mask) -> State:
+        depth, t, random = sums
+        new = density_where(matter, volume, place) * step
+        depth, random = depth + new, random * 1664525 + 1013904223
+        uniform = type(depth)(random >> 8) * 2**-24
+        return depth, dr.select(uniform * depth < new, node - ray.here, t), random
+
+    zero = dr.zeros(type(ray.begin), dr.width(ray.begin))
+    depth, t, _ = ray.march((zero, zero, seed + dr.zeros(uint, dr.width(zero))), add, steps, active)
+    return depth, t
+
+
+class _Ray:
+    """A ray of a light march. Places are t' of the chord, small numbers also where `x` lies far outside."""
+
+    def __init__(self, volume: Density, x: Vector, d: Vector, length: Float) -> None:
+        self._volume, self._d = volume, d
+        self._hit, self._m, h = spheres.chord(ops, x, d)
+        self.here = spheres.coordinate(x, d)
+        first, self.last = volume.extent(self._m, d, h)
+        self.begin, self.end = dr.maximum(first, self.here), dr.minimum(self.here + length, self.last)
+        self.crosses = self._hit & (self.end > self.begin)
+
+    def at(self, t: Float) -> Vector:
+        """Return the points at `t`."""
+        return tuple(mi + t * di for mi, di in zip(self._m, self._d, strict=True))
+
+    def march(self, sums: State, add: Callable[..., State], steps: Steps, active: Mask) -> State:
+        """Return the `sums` after all steps, the first of which is the optical depth."""
+        shortest, longest, growth = steps
+        inverse, volume, here, end = safe_inverse(self._d), self._volume, self.here, self.end
+
+        def body(t: Float, sums: State, active: Mask) -> State:
+            step = dr.minimum(dr.clip(growth * (t - here), shortest, longest), end - t)
+            node = t + tuning.NODE * step
+            q = self.at(node)
+            place = volume.place(q)
+            skip = volume.clear_distance(place, inverse)
+            empty = skip > 0
+            sums = add(sums, node, q, place, step, active & ~empty)
+            t = dr.select(empty, dr.maximum(node + skip + 1e-4, t + step), t + step)
+            return t, sums, active & (t < end - 1e-5) & (sums[0] < MAX_OPTICAL_DEPTH)
+
+        start = (self.begin, sums, active & self.crosses)
+        result: State = ops.while_loop(
+            state=start, cond=lambda t, sums, active: active, body=body, label="light march")[1]
+        return result
 
 
 def build(medium: Medium, table: LightTable | None, options: Options, dj: ModuleType, keep: Keep) -> RayMarch:

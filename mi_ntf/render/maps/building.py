@@ -25,7 +25,8 @@ from ...infer.visibility.marched_suns import MarchedSuns
 from ...infer.visibility.method import Options
 from ...infer.visibility.raymarch import RayMarch
 from ...infer.visibility.transmittance_map import TransmittanceMap
-from .. import log, timing
+from .. import log, timing, user_cache
+from ..scene.loaded import ChangedField
 from ..scene.media import NRFMedium
 from ..scene.settings import Settings
 from . import map_cache
@@ -107,6 +108,11 @@ def build(name: str, medium: NRFMedium, table: LightTable | None, options: Optio
             return make(map_file.read(Path(log.resolve(options.map_file)), medium, lights, options, channels))
         if not options.cache:
             return make()
+        if isinstance(medium.field, ChangedField) and user_cache.mode() == "on":
+            # A density that was set in the scene has a name in this process alone.
+            with user_cache.switched("memory"):
+                return keep(make, channels=channels, step=step, directions=directions, options=options,
+                            make_part=make_part)
         # A run of several gets all of the memory, and its maps are not needed again in this picture.
         limit = options.map_memory * 2**20 if lights.count == lights.total else 0
         split = make_part is not None and limit and lights.count > 1

@@ -130,6 +130,9 @@ def emitter_class() -> type:
 
         def sample_direction(self, it: mi.Interaction3f, sample: mi.Point2f, active: Mask = True
                              ) -> tuple[mi.DirectionSample3f, Color3]:
+            if self.medium.attached_log_density is not None:
+                raise MiNtfError("ntf emitter: gradients by the density of its medium: not supported, its shadow would "
+                                 "leave them out; detach it, or render with the nrf integrator")
             inner = self.attached()
             self._sampled_at_rest = not _attached_place(inner)
             ds: Array

@@ -40,6 +40,9 @@ bounces            string  auto    see meaning    method for light of `max_depth
 unbiased           boolean false                  march a sixteenth of the pairs of point and light, chosen at random,
                                                   to correct the error of maps and atlases. Their error becomes noise,
                                                   and the expected picture is that of ``raymarch``.
+shadow_gradients   string  exact   exact, none    ``exact``: derivatives by a density include its shadows, whose
+                                                  derivative is marched, whatever `visibility` says; ``none``: these
+                                                  derivatives hold shadows fixed
 aovs               string  none    see meaning    comma-separated further outputs: ``depth``, ``normal``, ``albedo``,
                                                   ``roughness``, ``opacity``, ``visibility``, ``visibility_lights``
                                                   (:mod:`mi_ntf.render.transport.aovs`)
@@ -82,8 +85,10 @@ different field has an atlas of its own, 51 MiB, and `map_memory` has to hold al
 
 The picture is differentiable with respect to the power of lights, an environment's texels, and the reflectance of
 diffuse surfaces. With at most 32 lights it is differentiable with respect to their position and direction as well;
-their shadows are marched then. Other parameters with gradients are refused, and so are places of lights beside surfaces
-that let light through.
+their shadows are marched then. At `max_depth` 2 it is differentiable with respect to density, albedo, emission,
+roughness and specular weight of fields, and to ``sigma_t``, ``scale`` and ``albedo`` of Mitsuba's own media. Other
+parameters with gradients are refused. So are places of lights beside surfaces that let light through, and parameters of
+fields with `aovs` or `unbiased`.
 
 Mitsuba's ``homogeneous`` and ``heterogeneous`` media are lit in the same way, inside spheres, meshes and other closed
 shapes, with any phase function: under single scattering and more, the picture is that of ``volpath``. A shape whose
@@ -95,7 +100,8 @@ marched.
 Does not support: media with another extinction in each colour or, as by ``sggx``, in each direction; exterior media,
 media in a ``shapegroup`` other than ``nrf``; a ``shapegroup`` of fields and other shapes; a place inside another
 integrator, such as ``aov`` or ``moment`` (use `aovs`); spectral and polarised variants; derivatives with respect to
-fields and turning environments; ``timed_sunsky``; environments whose `to_world` shears or, among surfaces, scales.
+normals and places of fields, phase functions and turning environments; ``timed_sunsky``; environments whose `to_world`
+shears or, among surfaces, scales.
 
 .. code-block:: xml
 
@@ -113,6 +119,7 @@ from __future__ import annotations
 
 from typing import NoReturn
 
+import drjit as dr
 import mitsuba as mi
 
 from ...core.errors import MiNtfError, root
@@ -142,6 +149,17 @@ def integrator_class() -> type:
                 return rendering.render(self.context, scene, sensor, seed, spp, develop, self.should_stop)
             except RuntimeError as error:
                 raise root(error) from None
+
+        def render_backward(self, scene: mi.Scene, params: object, grad_in: Array, sensor: mi.Sensor | int = 0,
+                            seed: Array = 0, spp: int = 0) -> None:
+            image = self.render(scene, sensor, seed, spp)  # Mitsuba's own would run all loops step by step
+            dr.set_grad(image, grad_in)
+            dr.enqueue(dr.ADMode.Backward, image)
+            dr.traverse(dr.ADMode.Backward)
+
+        def render_forward(self, scene: mi.Scene, params: object, sensor: mi.Sensor | int = 0, seed: Array = 0,
+                           spp: int = 0) -> Array:
+            return dr.forward_to(self.render(scene, sensor, seed, spp))
 
         def sample(self, *_: object) -> NoReturn:
             raise MiNtfError("nrf integrator: it renders whole pictures and cannot stand inside another one, such "
@@ -187,6 +205,7 @@ def _context(read: properties.Reader) -> RenderContext:
         rr_depth=read.whole("rr_depth", 5, 1, 1 << 20),
         bounces=read.choice("bounces", "auto", ("auto", "paths", "radiosity")),
         unbiased=read.flag("unbiased", False),
+        shadow_gradients=read.choice("shadow_gradients", "exact", ("exact", "none")),
         hide_emitters=read.flag("hide_emitters", False),
         frames=read.whole("frames", 1, 1, 1 << 20),
     )

@@ -14,6 +14,28 @@ sample_emitters boolean   true                   as for any medium; for stock vo
 
 ``mi.traverse`` exposes `to_world`, with the flags of a shape's. An update moves the field. It bakes nothing again and
 keeps its atlas, and compiles no kernel. The bounding shape has a `to_world` of its own, which has to move with it.
+It also exposes the field at its voxels, in blocks of 8³:
+
+================== ===================== ===== ========================================================================
+name               shape                 flags meaning
+================== ===================== ===== ========================================================================
+log_density        blocks, 8, 8, 8       ∂     ln σ of a trained field, σ in 1/radius of its sphere; below ln 0.1 there
+                                               is no matter
+density            blocks, 8, 8, 8       ∂     σ of a field of voxels, 1/capture unit, in place of ``log_density``
+albedo             blocks, 8, 8, 8, 3    ∂     linear RGB; ``emission``, the radiance, of a field that emits light
+roughness          blocks, 8, 8, 8       ∂     of surfaces alone
+specular           blocks, 8, 8, 8, 3    ∂     specular weight, linear RGB, of surfaces alone
+normal             blocks, 8, 8, 8, 3    ∂, D  of surfaces alone, of any length; ``nrf`` has no derivative by it
+density_blocks     blocks, 3             R     places of the density's blocks, x first, in blocks
+reflectance_blocks blocks, 3             R     likewise of the reflectance
+================== ===================== ===== ========================================================================
+
+The voxels of a block have z first and x last. Density can be set where the field has bricks with matter. Reflectance
+that is set is added to the field's own as a difference, trilinear between voxels. The softness of skins stays that of
+the file. Derivatives by a density are those of the matter that is there: cells whose voxels are all empty have none,
+although matter that is set there would be seen. Visibility methods of trained networks refuse a density that was set.
+Maps and atlases of such a density are made anew. Values are computed when they are read, or by the first ``update()``.
+With ``representation`` ``network``, the tensors of the networks are shown, read-only.
 
 The medium fills the sphere around the captured object, whose centre and radius in capture units are in the file. It
 belongs inside one bounding shape with a ``null`` BSDF that encloses the object. Extinction is in inverse scene units.
@@ -67,11 +89,13 @@ from ...infer.grid import Density, NetworkVolume
 from ...infer.phase_function import HenyeyGreenstein, smoke
 from ...infer.shade import Reflectance
 from ...infer.skin import Smoke, Softness
-from ...infer.types import Color3, Float, Mask, Ray, Vector, Vector3
+from ...infer.types import Color3, Float, Mask, Ray, Reflected, Vector, Vector3
 from ...infer.volume import VoxelVolume
 from .. import log
-from ..scene import loaded
+from ..scene import loaded, traversal
+from ..scene.field_parameters import FieldParameters
 from ..scene.frame import SCALES, Frame
+from ..scene.loaded import ChangedField, LoadedField, VolumeField
 from . import properties
 
 REPRESENTATIONS = ("grid", "network")
@@ -84,7 +108,14 @@ class Follower(Protocol):
         """Adapt to the new place."""
 
 
-def _reflectance(source: Density, softness: Softness | Smoke, retro: float | None, phase: float | None, emissive: bool
+class Reflects(Protocol):
+    """Anything that has a reflectance at field points."""
+
+    def reflectance(self, p: Vector, /) -> Reflected:
+        """Return normal, albedo, roughness and specular weight."""
+
+
+def _reflectance(source: Reflects, softness: Softness | Smoke, retro: float | None, phase: float | None, emissive: bool
                  ) -> Callable[[Vector], Reflectance]:
     """Return the reflectance of field points as a function.
 
@@ -126,7 +157,9 @@ def medium_class(phase_class: type) -> type:
             self.representation = read.choice("representation", "grid", REPRESENTATIONS)
             resolution = read.whole("resolution", 0, 16, 1024) or None
             read.flag("sample_emitters", True)
-            self.field = loaded.load(path, resolution)
+            self._read = loaded.load(path, resolution)
+            self.field: LoadedField | VolumeField | ChangedField = self._read
+            self._parameters: FieldParameters | None = None
             grid, bound = self.field.grid, math.exp(MAX_LOG_DENSITY)  # clipping alone bounds the networks
             if isinstance(grid, VoxelVolume):
                 if self.representation != "grid":
@@ -148,6 +181,10 @@ def medium_class(phase_class: type) -> type:
             self.m_has_spectral_extinction = False
             self.followers: WeakSet[Follower] = WeakSet()
             self._place(to_world)
+
+        def _bound(self) -> None:
+            """Prepare the majorant, and the box outside of which there is no matter."""
+            self._majorant = dr.opaque(mi.Float, max(self.source.majorant, 1e-3) / self.frame.length)
             low, high = self.source.bounds
             self._low, self._high = (mi.Vector3f(*map(float, side)) for side in (low, high))
             dr.make_opaque(self._low, self._high)
@@ -157,21 +194,52 @@ def medium_class(phase_class: type) -> type:
             self.frame = Frame(self.field.similarity, to_world, self._scale)
             self.phase.attach(self.frame, self.reflectance)
             self._density_unit = dr.opaque(mi.Float, 1 / self.frame.length)
-            self._majorant = dr.opaque(mi.Float, max(self.source.majorant, 1e-3) / self.frame.length)
+            self._bound()
 
         def traverse(self, callback: mi.TraversalCallback) -> None:
             mi.Medium.traverse(self, callback)
             callback.put("to_world", self.to_world, mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous)
+            if self.representation == "network":
+                for name, tensor in self.field.network.tensors().items():
+                    callback.put(name, tensor, mi.ParamFlags.NonDifferentiable | mi.ParamFlags.ReadOnly)
+                return
+            if self._parameters is None and not traversal.is_quiet():
+                self._parameters = FieldParameters(self._read)
+            if self._parameters:
+                self._parameters.traverse(callback)
 
         def parameters_changed(self, keys: Sequence[str] = ()) -> None:
-            if not keys or "to_world" in keys:
+            mi.Medium.parameters_changed(self, keys)
+            parameters = self._parameters
+            changed = parameters is not None and parameters.changed(keys)
+            if parameters and changed:
+                self.field = parameters.field
+                self.source = self.field.grid
+                self.reflectance = _reflectance(parameters.reflectance(self.field.grid), self.field.softness,
+                                                self.field.retro, self.field.phase, self.field.emissive)
+            if changed or not keys or "to_world" in keys:
                 self._place(np.array(dr.detach(self.to_world).matrix, np.float64).reshape(4, 4))
                 for emitter in self.followers:
                     emitter.follow()
 
+        @property
+        def attached(self) -> Sequence[str]:
+            """Names of the field's parameters that carry gradients."""
+            return self._parameters.attached() if self._parameters else ()
+
+        @property
+        def attached_log_density(self) -> Callable[[Vector], Float] | None:
+            """Function of field points to ln σ with the gradients of the density; None if it has none."""
+            return self._parameters.log_density if self._parameters else None
+
         def extinction(self, p: Vector3) -> Float:
             """Return σ_t at the scene points `p`, in 1/scene unit."""
-            return self.source.density(self.frame.point_to_field(p)) * self._density_unit
+            x = self.frame.point_to_field(p)
+            sigma = self.source.density(x) * self._density_unit
+            if self.attached_log_density is None:
+                return sigma
+            log_density = self.attached_log_density(x)
+            return sigma * dr.exp(log_density - dr.detach(log_density))
 
         def intersect_aabb(self, ray: Ray) -> tuple[Mask, Float, Float]:
             o: Vector3 = mi.Vector3f(*self.frame.point_to_field(ray.o))

@@ -18,8 +18,8 @@ from ...core.errors import MiNtfError
 MEDIUM = ("filename", "to_world", "scale", "representation", "resolution", "sample_emitters")
 INTEGRATOR = (
     "visibility", "samples", "light_samples", "environment_lights", "map_resolution", "map_source", "map_components",
-    "map_memory", "map_file", "max_depth", "rr_depth", "bounces", "unbiased", "aovs", "hide_emitters",
-    "noise_threshold", "max_error", "time_budget", "frames", "timeout",
+    "map_memory", "map_file", "max_depth", "rr_depth", "bounces", "unbiased", "shadow_gradients", "aovs",
+    "hide_emitters", "noise_threshold", "max_error", "time_budget", "frames", "timeout",
 )
 EMITTER = ("visibility", "sampling_weight")
 """Names of the properties, including those that Mitsuba's base classes read."""

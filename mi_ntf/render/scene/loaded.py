@@ -92,6 +92,62 @@ class VolumeField:
     network = header
 
 
+@dataclass(frozen=True)
+class ChangedField:
+    """The field `original` with voxels that were set in the scene; `digest`: its hash, another one for each density."""
+
+    original: LoadedField | VolumeField
+    grid: GridField | VoxelVolume
+    digest: str
+
+    @property
+    def similarity(self) -> Similarity:
+        """Transform from the capture to the field."""
+        return self.original.similarity
+
+    @property
+    def phase(self) -> float | None:
+        """Asymmetry of the phase function, None for surfaces."""
+        return self.original.phase
+
+    @property
+    def softness(self) -> Softness | Smoke:
+        """Softness of the skins, that of the file."""
+        return self.original.softness
+
+    @property
+    def retro(self) -> float | None:
+        """Retro-reflection of :mod:`mi_ntf.core.fresnel`, None if the specular weight is the same at all angles."""
+        return self.original.retro
+
+    @property
+    def emissive(self) -> bool:
+        """True if the matter emits light."""
+        return self.original.emissive
+
+    @property
+    def trained(self) -> bool:
+        """True if the trained networks still know the density."""
+        return self.original.trained and self.digest == self.original.digest
+
+    @property
+    def header(self) -> Header:
+        """Header of the field file. Raises MiNtfError if its networks do not know the density."""
+        return self._original().header
+
+    @property
+    def network(self) -> NetworkField:
+        """Networks of the field file. Raises MiNtfError if they do not know the density."""
+        return self._original().network
+
+    def _original(self) -> LoadedField | VolumeField:
+        if self.digest != self.original.digest:
+            raise MiNtfError("nrf medium: its density was set in the scene, which its trained networks do not know; "
+                             "choose visibility=raymarch, transmittance_map, transmittance_volume or "
+                             "transmittance_atlas, and map_source=field")
+        return self.original
+
+
 class InMemory:
     """Header and arrays of a field of voxels without a file; media find it by its `name` as long as it exists."""
 

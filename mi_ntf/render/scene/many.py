@@ -15,7 +15,7 @@ from ...infer.instances import Copies, InstancedVisibility, Instances
 from ...infer.shade import Reflectance
 from ...infer.types import Vector, Visibility
 from .frame import Frame
-from .loaded import LoadedField, VolumeField
+from .loaded import ChangedField, LoadedField, VolumeField
 from .media import NRFMedium
 
 MIN_GLOSS = 0.01
@@ -33,13 +33,16 @@ class Crowd:
     """The `members`, of about the same size, as one medium. They are of one field or of surfaces of one kind.
 
     `frame`: of a sphere around all; `finest`: radius of the smallest one, in radii of this sphere; `kinds`: one member
-    of each field.
+    of each field. No parameter of a member carries gradients.
     """
+
+    attached: Sequence[str] = ()
+    attached_log_density = None
 
     def __init__(self, members: Sequence[NRFMedium]) -> None:
         self.members = members
         first = members[0]
-        self.field: LoadedField | VolumeField = first.field
+        self.field: LoadedField | VolumeField | ChangedField = first.field
         self.representation, self.path = first.representation, first.path
         origin = np.array([m.frame.origin for m in members])
         length = np.array([m.frame.length for m in members])
@@ -52,8 +55,7 @@ class Crowd:
         field_index = np.array([sources.index(id(m.source)) for m in members])
         self.copies = Copies((origin - centre) / radius, rotation, length / radius, field_index, module_of(mi.Float))
         self.finest = float(length.min()) / radius
-        self._instances = Instances([m.source for m in self.kinds], self.copies, [m.reflectance for m in self.kinds],
-                                    self.field.fresnel)
+        self._instances = Instances([m.source for m in self.kinds], self.copies, [m.reflectance for m in self.kinds])
         self.source: Density = self._instances
 
     def reflectance(self, x: Vector) -> Reflectance:
@@ -70,7 +72,7 @@ def _kind(medium: NRFMedium) -> tuple[int, ...]:
     """Return numbers that are the same for media that may be one: those of one field, and all opaque baked surfaces."""
     field = medium.field
     if isinstance(medium.source, GridField) and field.softness.opaque and field.phase is None:
-        return 0, int(field.fresnel), int(field.grid.gloss > MIN_GLOSS)
+        return 0, int(field.retro is None), int(field.grid.gloss > MIN_GLOSS)
     return 1, id(medium.source)
 
 

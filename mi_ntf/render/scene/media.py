@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol, cast
 
@@ -13,10 +13,11 @@ import numpy as np
 from ...core.errors import MiNtfError
 from ...infer.grid import Density
 from ...infer.shade import Reflectance
-from ...infer.types import Vector
+from ...infer.types import Float, Vector
 from .frame import Frame
-from .loaded import LoadedField, VolumeField
+from .loaded import ChangedField, LoadedField, VolumeField
 from .stock_medium import StockMedium
+from .traversal import traverse
 
 
 class NRFMedium(Protocol):
@@ -25,11 +26,19 @@ class NRFMedium(Protocol):
     `source`: density, of the baked voxels or of the networks, as `representation` says; `path`: the field file.
     """
 
-    field: LoadedField | VolumeField
+    field: LoadedField | VolumeField | ChangedField
     frame: Frame
     source: Density
     representation: str
     path: str
+
+    @property
+    def attached(self) -> Sequence[str]:
+        """Names of the medium's parameters that carry gradients."""
+
+    @property
+    def attached_log_density(self) -> Callable[[Vector], Float] | None:
+        """Function of field points to ln σ with the gradients of the density; None if it has none."""
 
     def reflectance(self, x: Vector) -> Reflectance:
         """Return the reflectance at field points."""
@@ -43,9 +52,19 @@ class InstancedMedium:
     frame: Frame
 
     @property
-    def field(self) -> LoadedField | VolumeField:
+    def field(self) -> LoadedField | VolumeField | ChangedField:
         """Field of the medium."""
         return self.medium.field
+
+    @property
+    def attached(self) -> Sequence[str]:
+        """Names of the medium's parameters that carry gradients."""
+        return self.medium.attached
+
+    @property
+    def attached_log_density(self) -> Callable[[Vector], Float] | None:
+        """Function of field points to ln σ with the gradients of the density; None if it has none."""
+        return self.medium.attached_log_density
 
     @property
     def source(self) -> Density:
@@ -130,14 +149,14 @@ def ordinary_shapes(scene: mi.Scene) -> list[mi.Shape]:
 
 def shape_groups(scene: mi.Scene) -> list[mi.Shape]:
     """Return the ``shapegroup`` objects of `scene`, which its list of shapes does not contain."""
-    return [node for node in mi.traverse(scene).hierarchy if node.class_name() == "ShapeGroupPlugin"]
+    return [node for node in traverse(scene).hierarchy if node.class_name() == "ShapeGroupPlugin"]
 
 
 def lets_light_through(scene: mi.Scene) -> bool:
     """Return True if an ordinary shape of `scene` has a BSDF with a null component, which light can cross."""
     groups = [] if _hold_fields_alone(scene) else shape_groups(scene)
     return any(isinstance(node, mi.BSDF) and mi.has_flag(node.flags(), mi.BSDFFlags.Null)
-               for shape in groups + ordinary_shapes(scene) for node in mi.traverse(shape).hierarchy)
+               for shape in groups + ordinary_shapes(scene) for node in traverse(shape).hierarchy)
 
 
 def _is_absent(shape: mi.Shape) -> bool:
@@ -148,7 +167,7 @@ def _is_absent(shape: mi.Shape) -> bool:
 
 def _shapes_of(group: mi.Shape) -> list[mi.Shape]:
     """Return the shapes inside a shape group."""
-    return [node for node in mi.traverse(group).hierarchy if isinstance(node, mi.Shape) and node is not group]
+    return [node for node in traverse(group).hierarchy if isinstance(node, mi.Shape) and node is not group]
 
 
 def _grouped(scene: mi.Scene) -> list[mi.Shape]:

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...infer.types import Array
+from .traversal import traverse
 
 SIZE = 8
 Result = TypeVar("Result")
@@ -44,7 +45,7 @@ class Version:
     """
 
     def __init__(self, *objects: mi.Object, owners: type = object) -> None:
-        values = [value for parameters in map(mi.traverse, objects) for name, value in parameters
+        values = [value for parameters in map(traverse, objects) for name, value in parameters
                   if isinstance(parameters.properties[name][2], owners)]
         self.attached = any(dr.grad_enabled(value) for value in values)
         # Copies, since an object's own array, held by reference, would be written to in place.

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 class Settings:
     """Properties of the ``nrf`` integrator, and omissions that make a render faster.
 
+    shadow_gradients  "exact", or "none" for shadows that derivatives by a density hold fixed
     specular          False leaves out the specular lobes
     brightest_lights  number of the light table's lights that shine, brightest first; 0: all
     without_media     numbers of the media that take no part
@@ -28,6 +29,7 @@ class Settings:
     frames: int
     hide_emitters: bool
     unbiased: bool = False
+    shadow_gradients: str = "exact"
     specular: bool = True
     brightest_lights: int = 0
     without_media: tuple[int, ...] = ()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import cast
 
 import drjit as dr
@@ -15,18 +16,22 @@ from ...core.spheres import fibonacci
 from ...core.voxels import MARGIN, Voxels
 from ...infer.backend import module_of
 from ...infer.convex import Convex, box, planes_of
+from ...infer.network import NOTHING
 from ...infer.phase_function import smoke
 from ...infer.shade import Reflectance
 from ...infer.types import Array, Float, Vector, Vector3
-from ...infer.volume import Solid, VoxelVolume, dense
+from ...infer.volume import FAINTEST, Solid, VoxelVolume, dense
 from .. import log
 from . import medium_voxels
 from .frame import Frame
 from .loaded import VolumeField
 from .recent import Recent, Version
+from .traversal import traverse
 
 BODY_VOXELS = 192
 """Voxels along the longest side of a mesh that is not convex or has many planes."""
+DENSITY = ("sigma_t", "scale")
+"""Parameters of a medium on which its extinction depends."""
 _volumes: Recent[tuple[VoxelVolume, Frame]] = Recent()
 
 
@@ -76,6 +81,24 @@ class StockMedium:
             _volumes, lambda: _sampled(shape, medium, volume_box, name), str(mi.variant()), medium.class_name(),
             volume_box.tobytes())
         self.field = VolumeField(self.source, name)
+
+    @property
+    def attached(self) -> list[str]:
+        """Names of the medium's parameters that carry gradients."""
+        return [key for key, value in traverse(self._medium) if dr.grad_enabled(value)]
+
+    @property
+    def attached_log_density(self) -> Callable[[Vector], Float] | None:
+        """Function of field points to ln σ with the gradients of the extinction; None if it has none."""
+        if not any(key.split(".")[0] in DENSITY for key in self.attached):
+            return None
+
+        def log_density(x: Vector) -> Float:
+            _, extinction = _coefficients(self._medium, self.frame.point_to_world(x))
+            extinction = extinction * self.frame.length
+            return dr.select(extinction > FAINTEST, dr.log(dr.maximum(extinction, FAINTEST)), NOTHING)
+
+        return log_density
 
     def reflectance(self, x: Vector) -> Reflectance:
         """Return albedo and phase function at field points."""

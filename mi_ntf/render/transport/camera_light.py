@@ -155,7 +155,9 @@ class _CameraLight:
         strands, unit = self.scene.strands(self.ray, parts)
         maxt = (dr.minimum(self.ray.maxt, self.hit.t) if self.hit is not None else self.ray.maxt) / unit
         shining = effects.lit or effects.emission
-        options = shining or bool(self.sums and self.sums.needs_points), effects.collocated
+        densities = [p.medium.attached_log_density for p in parts]
+        attached = any(densities)
+        options = shining or attached or bool(self.sums and self.sums.needs_points), effects.collocated or attached
         samples = self.cache.samples.get(options) if self.cache else None
         if samples is None:
             samples = march.camera_samples(
@@ -163,6 +165,8 @@ class _CameraLight:
                 fractions=tuple(march.sample_fraction(p.medium.field.softness) for p in parts))
             if self.cache:
                 self.cache.samples[options] = samples
+        if attached and dr.width(samples.t):
+            samples = samples.attached(densities)
         self.field_samples = _FieldSamples(samples, unit)
         light = [dr.zeros(mi.Float, dr.width(samples.t)) for _ in range(3)]
         for i, part in enumerate(parts):
@@ -209,7 +213,7 @@ class _CameraLight:
             if self.first_run:
                 self._add(light, emission, weight, index)
         elif self.effects.lit:
-            reflected = self.scene.reflect(part, points, self.stream, view)
+            reflected = self.scene.reflect(part, points, self.stream, view if self.effects.collocated else None)
             if self.scene.bounced and self.first_run:
                 bounced = self.scene.bounced.reflect(part, points)
                 reflected = [a + b for a, b in zip(reflected, bounced, strict=True)]

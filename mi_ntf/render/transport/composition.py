@@ -18,6 +18,8 @@ from ...infer import march, shade
 from ...infer.bundle import Strand
 from ...infer.types import Float, Mask, Ray, UInt32, Vector3, Visibility
 from ...infer.visibility import REGISTRY
+from ...infer.visibility.attached_shadow import AttachedShadow
+from ...infer.visibility.raymarch import RayMarch
 from ...infer.visibility.unbiased import Unbiased
 from .. import log, timing
 from ..lights import scene_lights
@@ -25,6 +27,7 @@ from ..maps import building
 from ..scene import many
 from ..scene.media import NRFMedium, find_media, ordinary_shapes
 from ..scene.settings import Settings
+from ..scene.traversal import traverse
 from . import effects
 from .bounced import Bounced, Patches
 from .shadow import FieldVisibility, KnownTransmittance, Part, Shadow, transmittance_between
@@ -52,7 +55,7 @@ def _may_join(scene: mi.Scene, settings: Settings) -> bool:
     Derivatives need loops that are not nested. Patches of radiosity and corrections of an unbiased render belong to
     single fields.
     """
-    attached = any(dr.grad_enabled(value) for _, value in mi.traverse(scene))
+    attached = any(dr.grad_enabled(value) for _, value in traverse(scene))
     return (settings.visibility in JOINABLE and not settings.unbiased and not settings.map_file and not attached
             and settings.bounces != "radiosity")
 
@@ -138,6 +141,20 @@ class Composition:
                     medium.visibility([p.for_sampled for p in parts]), medium.visibility([p.for_all for p in parts]))
 
     def _part_of(self, medium: NRFMedium) -> Part:
+        """Return the medium with the visibility of its lights, attached if its density is."""
+        part = self._detached_part(medium)
+        log_density = medium.attached_log_density
+        if log_density is None or self.settings.shadow_gradients == "none" or not part.for_run:
+            return part
+        march = cast(RayMarch, building.march(medium, part.table, building.options(self.settings)))
+
+        def attach(method: Visibility | None) -> Visibility | None:
+            return AttachedShadow(method, march, log_density) if method else None
+
+        return replace(part, for_run=attach(part.for_run), for_sampled=attach(part.for_sampled),
+                       for_all=attach(part.for_all))
+
+    def _detached_part(self, medium: NRFMedium) -> Part:
         all_lights, run = self.lights.table(medium.frame), self.runs[self.run]
         if not self.effects.lit or not self.effects.needs_visibility:
             return Part(medium, all_lights, all_lights)

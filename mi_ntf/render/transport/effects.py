@@ -19,6 +19,7 @@ from ..scene.frame import Frame
 from ..scene.many import MIN_GLOSS, Crowd
 from ..scene.media import NRFMedium, lets_light_through, ordinary_shapes
 from ..scene.settings import Settings
+from ..scene.traversal import traverse
 
 PINHOLES = ("PerspectiveCamera",)
 """Cameras whose rays all start at one point; light from there has the transmittance of the view."""
@@ -35,6 +36,10 @@ POWERS = {
     "SmoothDiffuse": ("reflectance",),
 }
 """Mitsuba's class name → parameters in which radiance is linear."""
+FIELD = ("log_density", "density", "albedo", "roughness", "specular", "emission")
+"""Parameters of a field by which there are derivatives."""
+STOCK = ("sigma_t", "scale", "albedo")
+"""Parameters of Mitsuba's own media by which there are derivatives."""
 PLACES = {"PointLight": ("position",), "SpotLight": ("to_world",), "DirectionalEmitter": ("to_world",)}
 """Mitsuba's class name → parameters that move a light of the table, and its shadows."""
 
@@ -86,7 +91,7 @@ def describe(scene: mi.Scene, settings: Settings, sensor: mi.Sensor, spp: int, m
     depth = settings.max_depth
     lit = bool(lights.rows.power.size or lights.sampled) and not 0 <= depth < 2
     exhaustive = settings.light_samples == 0
-    gradients = check_gradients(scene, lights)
+    gradients = check_gradients(scene, lights, media)
     surfaces = len(ordinary_shapes(scene)) > 0
     # Derivatives by a light's position need the light's own transmittance. A camera ray crosses a surface or ends there
     # at random, while a shadow ray is attenuated.
@@ -94,6 +99,7 @@ def describe(scene: mi.Scene, settings: Settings, sensor: mi.Sensor, spp: int, m
                   and not lets_light_through(scene))
     width, height = sensor.film().crop_size()
     bounces = _bounces(settings, media, surfaces, gradients) if lit and not 0 <= depth <= 2 else ""
+    _check_field_gradients(media, settings, bounces)
     method, reason = _method(settings, width * height * spp, lights)
     if collocated:
         reason += "; not needed where the camera's own transmittance is the light's"
@@ -213,18 +219,19 @@ def _eye(sensor: mi.Sensor) -> np.ndarray:
     return np.array(sensor.world_transform().translation(), np.float64).ravel()
 
 
-def check_gradients(scene: mi.Scene, lights: Lights) -> bool:
+def check_gradients(scene: mi.Scene, lights: Lights, media: Sequence[NRFMedium] = ()) -> bool:
     """Return True if a parameter of `scene` carries gradients.
 
     Raises MiNtfError if derivatives by this parameter are not supported.
     """
-    parameters = mi.traverse(scene)
+    parameters = traverse(scene)
     attached = [key for key, value in parameters if dr.grad_enabled(value)]
     for key in attached:
-        if not _supported(parameters, key, lights):
+        if not _supported(parameters, key, lights, media):
             raise MiNtfError(
                 f"gradients by {key}: not supported; detach it. Supported are what lights emit (intensity, irradiance, "
-                "radiance, texture of a spot, data and scale of an envmap), the reflectance of diffuse BSDFs and, of "
+                "radiance, texture of a spot, data and scale of an envmap), the reflectance of diffuse BSDFs, density, "
+                "albedo, roughness, specular and emission of a field, sigma_t, scale and albedo of a medium and, of "
                 "lights that are not drawn at random, the position of a point and the to_world of a spot or directional"
             )
         place = key.rpartition(".")[2] in ("position", "to_world")
@@ -234,8 +241,22 @@ def check_gradients(scene: mi.Scene, lights: Lights) -> bool:
     return bool(attached)
 
 
-def _supported(parameters: mi.SceneParameters, key: str, lights: Lights) -> bool:
+def _check_field_gradients(media: Sequence[NRFMedium], settings: Settings, bounces: str) -> None:
+    """Raise MiNtfError if a field carries gradients and the render has effects that would leave them out."""
+    names = [name for m in media for name in m.attached]
+    unsupported = {"max_depth above 2": bool(bounces), "unbiased": settings.unbiased}
+    present = [text for text, holds in unsupported.items() if holds]
+    if names and present:
+        raise MiNtfError(f"gradients by {names[0]} of a field: not supported with {' and '.join(present)}, which would "
+                         "leave parts of them out; detach it, or render with max_depth=2 and unbiased=false")
+
+
+def _supported(parameters: mi.SceneParameters, key: str, lights: Lights, media: Sequence[NRFMedium]) -> bool:
     node, words = parameters.properties[key][2], 1
+    if getattr(node, "is_nrf", False):
+        return key.rpartition(".")[2] in FIELD
+    if any(key.endswith(name) and name.split(".")[0] in STOCK for m in media for name in m.attached):
+        return True
     while node is not None:
         of_owner, kind = ".".join(key.split(".")[-words:]), node.class_name()
         if of_owner.startswith(POWERS.get(kind, ())):

@@ -16,6 +16,7 @@ from ...infer.types import Array, Float, UInt32
 from .. import log
 from ..scene.camera import Camera, Reconstruction
 from ..scene.settings import NO_LIMITS, Limits
+from ..scene.traversal import traverse
 from . import aovs, camera_light, passes
 from .choosing import Choice, Chooser
 from .composition import IN_SMOKE, Composition
@@ -63,6 +64,10 @@ def _render(context: RenderContext, scene: mi.Scene, sensor: mi.Sensor, seed: in
         previous=context.choice, complete=any(name in aovs.OF_LIGHTS for name in context.aovs)).choose()
     context.choice, context.patches = choice, composition.patches
     context.light_count = len(composition.lights.rows.power)
+    attached = [name for m in composition.media for name in m.attached]
+    if attached and context.aovs:
+        raise MiNtfError(f"gradients by {attached[0]} of a field: not supported with aovs, which would leave them out; "
+                         "detach it, or render without aovs")
     picture = aovs.Picture(camera, context.aovs, context.light_count) if context.aovs else None
     film.prepare(picture.names if picture else [])
     halves = _Halves(film, len(picture.names) if picture else 0)
@@ -190,7 +195,7 @@ def _zero_gradient(scene: mi.Scene) -> Float:
     """
     zero: Float = dr.opaque(mi.Float, 0)  # a literal one would detach
     total = zero
-    for _, value in mi.traverse(scene):
+    for _, value in traverse(scene):
         if dr.grad_enabled(value):
             flat: Array = dr.ravel(getattr(value, "matrix", value))
             total = total + zero * dr.sum(flat)

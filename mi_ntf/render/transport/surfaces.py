@@ -15,6 +15,7 @@ from ..lights import environment
 from ..lights.emitter_samples import sharp
 from ..scene.media import lets_light_through, shape_groups
 from ..scene.recent import Recent, Version
+from ..scene.traversal import traverse
 
 _scenes: WeakKeyDictionary[mi.Integrator, Recent[mi.Scene]] = WeakKeyDictionary()
 
@@ -184,7 +185,7 @@ def _mark_groups_changed(shapes: Sequence[mi.Shape]) -> None:
     (`scene_optix.inl`). A second scene of the same group would read outside of its memory.
     """
     for group in (s for s in shapes if s.class_name() == "ShapeGroupPlugin"):
-        for part in (node for node in mi.traverse(group).hierarchy if isinstance(node, mi.Shape) and node is not group):
+        for part in (node for node in traverse(group).hierarchy if isinstance(node, mi.Shape) and node is not group):
             # Normals are named as well, since a mesh would otherwise compute them anew.
             part.parameters_changed(["to_world", "vertex_positions", "vertex_normals", "positions", "normals"])
         group.parameters_changed([])
