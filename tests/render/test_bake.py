@@ -20,10 +20,12 @@ from mi_ntf.render.commands.bake import bake
 from mi_ntf.render.lights import scene_lights as lights_module
 from mi_ntf.render.maps import building, map_cache, map_file
 from mi_ntf.render.scene.media import find_media
+from mi_ntf.render.scene.settings import Settings
 
 WHERE = np.array([[0.48, 0.6, 0.64], [1.5, 1.0, 2.0], [0.1, 0.5, -0.1]])
 IS_POINT = np.array([False, True, True])
 OPTIONS = building.Options(2 / 128, 16)
+SETTINGS = Settings("auto", 128, 0, 512, 16, "field", 1, 1024.0, "", 2, 5, "auto", 1, False)
 
 
 @pytest.fixture(scope="module")
@@ -119,8 +121,8 @@ def test_lights_come_in_parts_that_fit(medium):
     lights = LightTable(np.tile(WHERE[:1], (10, 1)), np.ones((10, 3)), np.zeros(10, bool), 1.0, mi)
 
     def parts(kib, media=1, method="transmittance_map", **other):
-        options = dataclasses.replace(OPTIONS, map_memory=kib / 1024, **other)
-        return building.parts(method, [medium] * media, lights, options)
+        settings = dataclasses.replace(SETTINGS, map_memory=kib / 1024, **other)
+        return building.parts(method, [medium] * media, lights, settings)
 
     assert parts(1 << 20) == [(0, 10)]
     assert parts(8) == [(0, 4), (4, 8), (8, 10)]
@@ -268,7 +270,7 @@ def test_scene_names_its_map_file(path, tmp_path):
     plain = scene()
     (medium,) = find_media(plain)
     rows = lights_module.Lights(plain, [medium], 0, 512).table(medium.frame)
-    options = building.options(building.resolved(plain.integrator().context.settings, rows.count, [medium]))
+    options = building.options(building.resolved(plain.integrator().context.settings, rows.count, [medium]), medium)
     map_file.write(tmp_path / "maps.exr", medium, rows, options, [build(medium, rows, options)])
     np.testing.assert_array_equal(scenes.render(scene(map_file=str(tmp_path / "maps.exr"))), scenes.render(plain))
     lights["sun"]["direction"] = [0, -1, 0]

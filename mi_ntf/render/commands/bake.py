@@ -59,13 +59,14 @@ def _bake(output: Path, scene: mi.Scene, settings: Settings, media: list[NRFMedi
     (medium,) = media
     method = REGISTRY.get(settings.visibility)
     if method and method.per_field:
-        atlas = cast(TransmittanceAtlas, building.build(method.name, medium, None, _options(settings)))
+        atlas = cast(TransmittanceAtlas, building.build(method.name, medium, None, _options(settings, medium)))
         return _write(output, medium, atlas.maps.lights, atlas.options, [atlas.maps])
     table = scene_lights.Lights(scene, media, 0, settings.environment_lights).table(medium.frame)
     if not table.count:
         raise MiNtfError("the scene has no lights that maps can be made for (point, spot, directional, environment)")
-    options = _options(building.resolved(settings, table.count, media))
-    runs = [table.part(*run) for run in building.parts("transmittance_map", media, table, options)]
+    settings = building.resolved(settings, table.count, media)
+    options = _options(settings, medium)
+    runs = [table.part(*run) for run in building.parts("transmittance_map", media, table, settings)]
 
     def maps() -> Iterator[TransmittanceMap]:
         for number, run in enumerate(runs):
@@ -112,8 +113,8 @@ def bake_fields(path: Path, parameters: dict[str, str], environment: Environment
     return result
 
 
-def _options(settings: Settings) -> Options:
-    return dataclasses.replace(building.options(settings), map_file="", cache=False)
+def _options(settings: Settings, medium: NRFMedium) -> Options:
+    return dataclasses.replace(building.options(settings, medium), map_file="", cache=False)
 
 
 def _write(output: Path, medium: NRFMedium, table: LightTable, options: Options, maps: Iterable[TransmittanceMap]

@@ -113,10 +113,10 @@ def _memory_of_maps(composition: Composition) -> int:
     active, media = composition.effects, composition.media
     if not (active.lit and active.needs_visibility):
         return 0
-    table, options = composition.lights.table(media[0].frame), building.options(composition.settings)
-    first, end = building.parts(active.visibility, media, table, options)[0]
-    per_light = [building.size_per_light(active.visibility, medium, table, options) for medium in media]
-    per_field = [building.size_per_field(active.visibility, medium, table, options) for medium in media]
+    table, settings = composition.lights.table(media[0].frame), composition.settings
+    first, end = building.parts(active.visibility, media, table, settings)[0]
+    per_light = [building.size_per_light(active.visibility, medium, table, settings) for medium in media]
+    per_field = [building.size_per_field(active.visibility, medium, table, settings) for medium in media]
     return (end - first) * sum(per_light) + sum(per_field)
 
 

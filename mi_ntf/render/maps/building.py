@@ -31,6 +31,8 @@ from ..scene.media import NRFMedium
 from ..scene.settings import Settings
 from . import map_cache
 
+SAMPLES = 384
+"""Default steps across the diameter of the unit sphere, which resolve the skins of trained fields."""
 DENSE_TEXELS = 2
 """Length, in texels, of the marched part of a ray through dense smoke, whose mean free path is shorter than a texel."""
 UNTRAINED = ("raymarch", "transmittance_map", "transmittance_volume", "transmittance_atlas")
@@ -51,43 +53,61 @@ def resolved(settings: Settings, lights: int, media: Sequence[NRFMedium]) -> Set
     return replace(settings, map_resolution=method.resolution(lights, voxels))
 
 
-def options(settings: Settings) -> Options:
-    """Return the options of a visibility method under `settings`."""
-    return Options(2 / settings.samples, settings.map_resolution, settings.map_source, settings.map_components,
-                   map_memory=settings.map_memory, map_file=settings.map_file, cache=True)
+def samples(medium: NRFMedium) -> int:
+    """Return the default number of steps across the unit sphere of `medium`: at least one for each of its voxels.
+
+    The voxels of trained fields do not count, whose networks are smoother than they are.
+    """
+    return SAMPLES if medium.field.trained else max(SAMPLES, medium.field.grid.resolution)
 
 
-def parts(method: str, media: Sequence[NRFMedium], table: LightTable, options: Options) -> list[tuple[int, int]]:
+def fewer_samples(settings: Settings, medium: NRFMedium, most: int) -> int:
+    """Return the number of steps of a march that may be coarser than that of the camera.
+
+    `most`: number of steps where ``SAMPLES`` is the default; finer voxels take as many more. A lower number in
+    `settings` holds.
+    """
+    fewer = most * samples(medium) // SAMPLES
+    return min(fewer, settings.samples) if settings.samples else fewer
+
+
+def options(settings: Settings, medium: NRFMedium) -> Options:
+    """Return the options of a visibility method for `medium` under `settings`."""
+    return Options(2 / (settings.samples or samples(medium)), settings.map_resolution, settings.map_source,
+                   settings.map_components, map_memory=settings.map_memory, map_file=settings.map_file, cache=True)
+
+
+def parts(method: str, media: Sequence[NRFMedium], table: LightTable, settings: Settings) -> list[tuple[int, int]]:
     """Return ``(first, end)`` of each run of lights whose tables, for all `media`, fit into `map_memory`.
 
     It is one run for methods that store nothing per light. Raises MiNtfError if not even one light fits.
     """
-    size = max(size_per_light(method, medium, table, options) for medium in media)
+    size = max(size_per_light(method, medium, table, settings) for medium in media)
     if not size or not table.count:
         return [(0, table.count)]
     # Dr.Jit counts entries in 32 bits.
-    count = int(min(options.map_memory * 2**20 / (size * len(media)), (2**32 - 1) / (size / 4)))
+    count = int(min(settings.map_memory * 2**20 / (size * len(media)), (2**32 - 1) / (size / 4)))
     if count < 1:
         raise MiNtfError(
-            f"map_memory is {options.map_memory:.4g} MiB, but one light takes {size * len(media) / 2**20:.4g} MiB "
-            f"({method}, map_resolution {options.map_resolution}, {len(media)} media); raise map_memory or lower "
+            f"map_memory is {settings.map_memory:.4g} MiB, but one light takes {size * len(media) / 2**20:.4g} MiB "
+            f"({method}, map_resolution {settings.map_resolution}, {len(media)} media); raise map_memory or lower "
             "map_resolution"
         )
     return [(first, min(first + count, table.count)) for first in range(0, table.count, count)]
 
 
-def size_per_light(name: str, medium: NRFMedium, table: LightTable, options: Options) -> int:
+def size_per_light(name: str, medium: NRFMedium, table: LightTable, settings: Settings) -> int:
     """Return the bytes of one light's table under the method `name`; 0 if the method stores nothing per light."""
     method = REGISTRY[name]
     if not method.numbers or method.per_field:
         return 0
-    return 4 * method.numbers(medium, table, options) * options.map_resolution**2
+    return 4 * method.numbers(medium, table, options(settings, medium)) * settings.map_resolution**2
 
 
-def size_per_field(name: str, medium: NRFMedium, table: LightTable, options: Options) -> int:
+def size_per_field(name: str, medium: NRFMedium, table: LightTable, settings: Settings) -> int:
     """Return the bytes that the method `name` stores for a field, independently of the lights."""
     method = REGISTRY[name]
-    return 4 * method.numbers(medium, table, options) if method.numbers and method.per_field else 0
+    return 4 * method.numbers(medium, table, options(settings, medium)) if method.numbers and method.per_field else 0
 
 
 def build(name: str, medium: NRFMedium, table: LightTable | None, options: Options) -> Visibility | None:

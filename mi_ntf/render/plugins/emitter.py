@@ -77,7 +77,6 @@ from . import properties
 
 T = TypeVar("T")
 
-STEP = 2 / 384
 NEVER = 1e18
 """Density of every direction that emitter sampling reports, in 1/sr. The power heuristic then gives no weight to light
 on rays of BSDF samples. Its square is still a float32."""
@@ -121,7 +120,7 @@ def emitter_class() -> type:
             self._method = _visibility(self.visibility, self.inner, self.medium)
             if hasattr(self.medium, "followers"):
                 self.medium.followers.add(self)
-            self._march = building.march(self.medium, None, Options(STEP))
+            self._march = building.march(self.medium, None, Options(2 / building.samples(self.medium)))
 
         def follow(self) -> None:
             """Make the map of the light anew, if there is one, since the medium has moved."""
@@ -215,7 +214,7 @@ def _visibility(name: str, inner: mi.Emitter, medium: NRFMedium) -> Visibility |
                 "places; choose raymarch or transmittance_atlas"
             )
         table = scene_lights.rows([(inner, kind)], 1).table(medium.frame)
-    options = Options(STEP, resolution_for(1, medium.field.grid.resolution), cache=True,
+    options = Options(2 / building.samples(medium), resolution_for(1, medium.field.grid.resolution), cache=True,
                       map_components=1 if medium.field.softness.opaque else 2)
     visibility = building.build(method, medium, table, options)
     if visibility and REGISTRY[method].per_field and not one:

@@ -9,8 +9,9 @@ visibility         string  auto    see meaning    visibility method of shadow ra
                                                   ``auto`` takes ``transmittance_atlas`` if camera rays times lights per
                                                   point times `frames` exceed the 3.4 million rays that fill an atlas,
                                                   else ``raymarch``. Under `max_error` or `time_budget` a pilot decides.
-samples            integer 384     8 to 8192      steps across the diameter of the unit sphere. Paths of further bounces
-                                                  take 128 at most, light between patches 256.
+samples            integer 0       0, 8 to 8192   steps across the diameter of the unit sphere. 0: 384, and one for each
+                                                  voxel of fields without networks. Paths of further bounces take at
+                                                  most a third of this default, light between patches two thirds.
 light_samples      integer 0       0 to 65536     sampled lights per shading point, of all emitters together. 0: sum
                                                   over point, spot and directional lights and environment cells, and two
                                                   samples of each other emitter (one of a projector or textured spot).
@@ -194,7 +195,7 @@ def _context(read: properties.Reader) -> RenderContext:
     settings = Settings(
         visibility=read.choice("visibility", "auto", names()),
         map_source=read.choice("map_source", "field", ("field", "network")),
-        samples=read.whole("samples", 384, 8, 8192),
+        samples=read.whole("samples", 0, 8, 8192),
         light_samples=read.whole("light_samples", 0, 0, 65536),
         environment_lights=read.whole("environment_lights", 512, 1, 65536),
         map_resolution=read.whole("map_resolution", 0, 0, 4096),

@@ -66,10 +66,10 @@ class Reader:
         return self._value(name, default, ("Bool",), "a boolean, true or false")
 
     def whole(self, name: str, default: int, low: int, high: int) -> int:
-        """Return an integer in [`low`, `high`], or the default."""
-        expected = f"an integer, {low} to {high}"
+        """Return an integer in [`low`, `high`], or the default, which need not lie there."""
+        expected = "an integer, " + ("" if low <= default <= high else f"{default} or ") + f"{low} to {high}"
         value = self._value(name, default, ("Integer",), expected)
-        return value if name not in self._props or low <= value <= high else self._refuse(name, expected)
+        return value if value == default or low <= value <= high else self._refuse(name, expected)
 
     def number(self, name: str, default: float, low: float = -math.inf, high: float = math.inf) -> float:
         """Return a finite number in [`low`, `high`]."""

@@ -13,10 +13,10 @@ from ...core import microfacet, radiosity
 from ...infer import march, shade
 from ...infer.backend import floats, module_of, words
 from ...infer.bundle import Strand
-from ...infer.grid import Density
 from ...infer.irradiance import Irradiance
 from ...infer.types import Float, Mask, Ray, UInt32, Vector, Vector3
 from .. import log, user_cache
+from ..maps import building
 from ..scene.media import NRFMedium
 from ..scene.settings import Settings
 from .shadow import Part
@@ -112,10 +112,9 @@ class Patches:
         n, nothing = dr.width(o), _Hits(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, int))
         if not n:
             return [nothing] * len(self.skins)
-        steps = min(radiosity.STEPS, scene.settings.samples)
         hit, t, part = scene.free_flight(mi.Ray3f(mi.Point3f(o), d), dr.full(mi.Float, dr.inf, n),
                                          floats(rng.random(n), mi), [mi.Float(radiosity.DEPTH)] * len(self.skins),
-                                         steps)
+                                         radiosity.STEPS)
         dr.eval(hit, t, part)
         parts = np.where(hit.numpy(), part.numpy().astype(np.int64), -1)
         result = []
@@ -138,7 +137,7 @@ def _key(scene: FieldScene) -> tuple[object, ...]:
     media = [part.medium for part in scene.parts]
     fields = [(m.field.digest, m.representation, m.field.grid.resolution, len(media) > 1 and m.frame.placement())
               for m in media]
-    return mi.variant(), min(radiosity.STEPS, scene.settings.samples), tuple(fields)
+    return mi.variant(), min(radiosity.STEPS, scene.settings.samples or radiosity.STEPS), tuple(fields)
 
 
 class Bounced:
@@ -223,15 +222,16 @@ def _chords(medium: NRFMedium, rng: np.random.Generator) -> tuple[np.ndarray, np
     o = rng.normal(size=(radiosity.CHORDS, 3))
     o /= np.linalg.norm(o, axis=1, keepdims=True)
     d = -radiosity.directions(o, 1, rng)[:, 0]
-    hit, x = first_hits(medium.source, o - 0.1 * d, d, rng)
+    hit, x = first_hits(medium, o - 0.1 * d, d, rng)
     return x[hit], d[hit]
 
 
-def first_hits(density: Density, o: np.ndarray, d: np.ndarray, rng: np.random.Generator
+def first_hits(medium: NRFMedium, o: np.ndarray, d: np.ndarray, rng: np.random.Generator
                ) -> tuple[np.ndarray, np.ndarray]:
-    """Return a mask of the rays (n, 3), field coordinates, that hit the skin of `density`, and their first hits."""
+    """Return a mask of the rays (n, 3), field coordinates, that hit the skin of `medium`, and their first hits."""
     n, start, along = len(o), _vector(o), _vector(d)
-    strand = Strand(density, tuple(start), tuple(along), dr.opaque(mi.Float, 2 / radiosity.STEPS))
+    steps = radiosity.STEPS * building.samples(medium) // building.SAMPLES
+    strand = Strand(medium.source, tuple(start), tuple(along), dr.opaque(mi.Float, 2 / steps))
     hit, t, _ = march.free_flight([strand], dr.full(mi.Float, dr.inf, n), floats(rng.random(n), mi),
                                   [mi.Float(radiosity.DEPTH)])
     x = start + dr.select(hit, t, 0) * along

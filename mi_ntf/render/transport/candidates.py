@@ -29,10 +29,9 @@ def methods(march: Composition) -> list[tuple[Settings, int]]:
     for method in (m for m in REGISTRY.values() if m.automatic and m.name != "raymarch"):
         for components in (1, 2) if "map_components" in method.dials else (march.settings.map_components,):
             settings = replace(march.settings, visibility=method.name, map_components=components)
-            options = building.options(settings)
-            size = table.count * sum(building.size_per_light(method.name, m, table, options) for m in media)
+            size = table.count * sum(building.size_per_light(method.name, m, table, settings) for m in media)
             rays = len(media) * method.rays(table.count, settings.map_resolution)
-            fits = 0 < size <= options.map_memory * 2**20 and not any(isinstance(m, Crowd) for m in media)
+            fits = 0 < size <= settings.map_memory * 2**20 and not any(isinstance(m, Crowd) for m in media)
             if method.per_field or fits:
                 candidates.append((settings, rays if method.per_field else rays * components))
     return sorted(candidates, key=lambda candidate: candidate[1])

@@ -108,12 +108,11 @@ class Composition:
         if not media or not self.effects.lit or not self.effects.needs_visibility:
             return [None]
         table = self.lights.table(media[0].frame)
-        options = building.options(self.settings)
-        runs: list[Run] = [*building.parts(method, media, table, options)]
+        runs: list[Run] = [*building.parts(method, media, table, self.settings)]
         if self.effects.gradients and len(runs) > 1:
-            size = sum(building.size_per_light(method, m, table, options) for m in media)
+            size = sum(building.size_per_light(method, m, table, self.settings) for m in media)
             raise MiNtfError(
-                f"map_memory is {options.map_memory:.4g} MiB, but derivatives need the maps of all {table.count} "
+                f"map_memory is {self.settings.map_memory:.4g} MiB, but derivatives need the maps of all {table.count} "
                 f"lights at once, {size * table.count / 2**20:.4g} MiB ({method}); raise map_memory or "
                 "choose visibility=raymarch, which holds none"
             )
@@ -159,7 +158,7 @@ class Composition:
         if not self.effects.lit or not self.effects.needs_visibility:
             return Part(medium, all_lights, all_lights)
         table = all_lights.part(*run) if run and len(self.runs) > 1 else all_lights
-        options = building.options(self.settings)
+        options = building.options(self.settings, medium)
         for_sampled = REGISTRY[self.effects.visibility].for_sampled
         if table.moving and not REGISTRY[for_sampled].derivatives:
             for_sampled = "raymarch"
@@ -212,10 +211,10 @@ class Composition:
                 tau = tau * transmittance_between(field, p, d, distance, mi.UInt32(0), active, mi.Bool(sun))
         return tau
 
-    def strands(self, ray: Ray, parts: Sequence[Part], steps: int = 0) -> SceneStrands:
+    def strands(self, ray: Ray, parts: Sequence[Part], most: int = 0) -> SceneStrands:
         """Return the strands of scene rays through `parts`.
 
-        `steps`: cells across the diameter of a unit sphere; 0: as many as the settings have.
+        `most`: see :func:`mi_ntf.render.maps.building.fewer_samples`; 0: cells are as long as the settings say.
         """
         several = len(parts) > 1
         unit = min(p.frame.length for p in parts)
@@ -224,7 +223,8 @@ class Composition:
                 p.source,
                 p.frame.point_to_field(ray.o),
                 p.frame.direction_to_field(ray.d),
-                dr.opaque(mi.Float, 2 * p.finest / (steps or self.settings.samples)),
+                dr.opaque(mi.Float, p.finest * (2 / building.fewer_samples(self.settings, p.medium, most)
+                                                if most else building.options(self.settings, p.medium).step)),
                 dr.opaque(mi.Float, unit / p.frame.length) if several else None,
             )
             for p in parts
@@ -232,12 +232,12 @@ class Composition:
         return SceneStrands(strands, dr.opaque(mi.Float, unit))
 
     def free_flight(self, ray: Ray, maxt: Float, offset: Float, depths: Sequence[Float],
-                    steps: int) -> tuple[Mask, Float, UInt32]:
+                    most: int) -> tuple[Mask, Float, UInt32]:
         """Return ``(hit, t, part)`` of :func:`mi_ntf.infer.march.free_flight` through all fields, t in scene lengths.
 
-        `steps`: as for :meth:`strands`.
+        `most`: as for :meth:`strands`.
         """
-        strands, unit = self.strands(ray, self.parts, steps)
+        strands, unit = self.strands(ray, self.parts, most)
         hit, t, index = march.free_flight(strands, maxt / unit, offset, depths)
         return hit, t * unit, index
 

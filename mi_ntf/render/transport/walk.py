@@ -130,8 +130,7 @@ class Walk:
         hit, t, number = dr.zeros(mi.Bool, n), end, dr.zeros(mi.UInt32, n)
         if self.scene.parts:
             depths = [-dr.log(1 - paths.rng.next_float32()) for _ in self.scene.parts]
-            steps = min(STEPS, self.scene.settings.samples)
-            hit, t, number = self.scene.free_flight(paths.ray, t, paths.rng.next_float32(), depths, steps)
+            hit, t, number = self.scene.free_flight(paths.ray, t, paths.rng.next_float32(), depths, STEPS)
             if self.scene.effects.visibility == "none":
                 hit = hit & (paths.pdf != 0)  # light that leaves a field is neither attenuated nor scattered
         dr.eval(hit, t, number, paths.rng.state)
