@@ -13,8 +13,6 @@ import numpy as np
 from mi_ntf.core import files
 from mi_ntf.core.errors import MiNtfError, shown
 
-MODULES = ("openvdb", "pyopenvdb")
-"""Names of the module: newer packages and Debian's python3-openvdb have one or the other; `bpy` brings it, too."""
 PREFERRED = "density"
 """Name of the grid that is read if a file has several."""
 MOST_VOXELS = 1 << 30
@@ -22,18 +20,21 @@ MOST_VOXELS = 1 << 30
 
 
 def module() -> ModuleType:
-    """Return OpenVDB's module. Raises MiNtfError if there is none."""
-    for name in (*MODULES, "bpy"):
+    """Return OpenVDB's module. Raises MiNtfError if there is none, or one that was made for another NumPy."""
+    for name in ("openvdb", "pyopenvdb", "bpy"):
         try:
             vdb = importlib.import_module(name)
+            if name == "bpy":  # Blender puts the module on the path when it starts
+                vdb = importlib.import_module("openvdb")
         except ImportError:
             continue
-        if name != "bpy":
-            return vdb
-        try:  # Blender puts it on the path when it starts
-            return importlib.import_module(MODULES[0])
-        except ImportError:
-            continue
+        try:
+            vdb.FloatGrid().copyFromArray(np.zeros((1, 1, 1), np.float32))
+        except Exception as error:
+            raise MiNtfError(f"OpenVDB's module {vdb.__name__} cannot read arrays of NumPy {np.__version__} "
+                             f"({shown(error)}); install one that was made for this NumPy, or an older NumPy, or save "
+                             "the grid as .vol or .npz") from None
+        return vdb
     raise MiNtfError("a .vdb file needs OpenVDB's Python module, and there is none; install Debian's python3-openvdb "
                      "or `pip install bpy`, or save the grid as .vol or .npz")
 
@@ -43,15 +44,15 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray]:
     vdb = module()
     try:
         grids = {grid.name: grid for grid in vdb.readAllGridMetadata(str(path)) if grid.valueTypeName in (
-            "float", "half", "double")}
+            "float", "half", "double") and grid.gridClass != vdb.GridClass.LEVEL_SET}
         name = PREFERRED if PREFERRED in grids else next(iter(grids)) if len(grids) == 1 else None
         grid = None if name is None else vdb.read(str(path), name)
     except Exception as error:  # OpenVDB's errors have no type of their own
         raise MiNtfError(f"{path} is no OpenVDB file or is damaged ({' '.join(str(error).split())[:120]}); write it "
                          "anew") from None
     if grid is None:
-        raise MiNtfError(f"{path} has the grids of numbers {shown(', '.join(grids))}, none of which is called "
-                         f"{PREFERRED}; name one so")
+        raise MiNtfError(f"{path} has the grids of numbers {shown(', '.join(grids))} apart from level sets, none of "
+                         f"which is called {PREFERRED}; name one so, or convert a level set to a fog volume")
     return _values(grid, path)
 
 
@@ -85,7 +86,7 @@ def write(path: Path, density: np.ndarray, bounds: np.ndarray) -> None:
     grid = vdb.FloatGrid()
     grid.copyFromArray(np.ascontiguousarray(density.transpose(2, 1, 0)))
     grid.transform = vdb.createLinearTransform(voxelSize=float(size.mean()))
-    grid.transform.postTranslate(tuple((bounds[0] + size / 2).tolist()))
+    grid.transform.translate(tuple((bounds[0] + size / 2).tolist()))
     grid.name, grid.gridClass = PREFERRED, vdb.GridClass.FOG_VOLUME
     with files.replacing(path) as temporary:
         vdb.write(str(temporary), grids=[grid])

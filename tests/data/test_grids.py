@@ -1,6 +1,6 @@
 """Grids of other programs: every name and form arrives at its place, and other forms are one sentence."""
 
-import copy
+import importlib.util
 import sys
 from types import SimpleNamespace
 
@@ -116,7 +116,7 @@ def test_other_files_are_one_sentence(tmp_path, name, expected):
 
 def test_no_reader_of_openvdb_is_one_sentence(tmp_path, monkeypatch):
     """The sentence names the packages."""
-    for name in (*vdb.MODULES, "bpy"):
+    for name in ("openvdb", "pyopenvdb", "bpy"):
         monkeypatch.setitem(sys.modules, name, None)
     (tmp_path / "a.vdb").write_bytes(b"x")
     with pytest.raises(MiNtfError, match="install Debian's python3-openvdb"):
@@ -129,7 +129,7 @@ class Transform:
     def __init__(self, size):
         self.size, self.offset = size, np.zeros(3)
 
-    def postTranslate(self, offset):
+    def translate(self, offset):
         self.offset = self.offset + offset
 
     def indexToWorld(self, index):
@@ -139,7 +139,7 @@ class Transform:
 class FloatGrid:
     """The part of OpenVDB's grids that is used: dense values from the index (0, 0, 0)."""
 
-    valueTypeName = "float"
+    valueTypeName, gridClass = "float", "unknown"
 
     def copyFromArray(self, values):
         self.values = values.copy()
@@ -154,30 +154,65 @@ class FloatGrid:
             values[tuple(index - ijk)] = self.values[tuple(index)]
 
 
-@pytest.fixture
-def openvdb(monkeypatch):
-    """Put a stand-in of OpenVDB's Python module in its place: its documented functions, with one file in memory."""
+INSTALLED = [name for name in ("openvdb", "pyopenvdb") if importlib.util.find_spec(name)]
+"""OpenVDB's own module, where there is one. It was run beside its stand-in with Debian's OpenVDB 10."""
+
+
+@pytest.fixture(params=["stand-in", *INSTALLED])
+def openvdb(request, monkeypatch):
+    """Return OpenVDB's module, or a stand-in in its place: its documented functions, with one file in memory."""
+    if request.param in INSTALLED:
+        return importlib.import_module(request.param)
     store = {}
     module = SimpleNamespace(
-        FloatGrid=FloatGrid, GridClass=SimpleNamespace(FOG_VOLUME="fog volume"),
+        __name__="openvdb", FloatGrid=FloatGrid,
+        GridClass=SimpleNamespace(FOG_VOLUME="fog volume", LEVEL_SET="level set"),
         createLinearTransform=lambda voxelSize: Transform(voxelSize),
-        write=lambda path, grids: (open(path, "wb").close(), store.update({grid.name: grid for grid in grids})),
+        write=lambda path, grids: (open(path, "wb").close(), store.clear(), store.update({g.name: g for g in grids})),
         readAllGridMetadata=lambda path: list(store.values()), read=lambda path, name: store[name])
     monkeypatch.setitem(sys.modules, "openvdb", module)
-    return store
+    return module
 
 
 def test_openvdb_there_and_back(tmp_path, openvdb):
-    """A grid of cubes returns with its values, and its box grows by a voxel of background on each side."""
+    """A grid of cubes returns with its values. Its box grows by a voxel of background around the active voxels."""
     box = np.array([[1.0, 2.0, 3.0], [2.0, 3.5, 5.0]])
     vdb.write(tmp_path / "a.vdb", Z_FIRST, box)
     grid = grids.read(tmp_path / "a.vdb")
-    assert (grid.density[1:-1, 1:-1, 1:-1] == Z_FIRST).all() and grid.density.sum() == Z_FIRST.sum()
+    first = np.argwhere(Z_FIRST).min(0)
+    inside = tuple(slice(1 - a, 1 - a + n) for a, n in zip(first, Z_FIRST.shape, strict=True))
+    assert first.max() == 0 and (grid.density[inside] == Z_FIRST).all() and grid.density.sum() == Z_FIRST.sum()
     assert np.allclose(grid.bounds, box + np.array([[-0.5], [0.5]]))
-    density = openvdb.pop("density")
-    openvdb |= {name: copy.copy(density) for name in ("heat", "smoke")}
-    openvdb["heat"].name, openvdb["smoke"].name = "heat", "smoke"
-    with pytest.raises(MiNtfError, match="has the grids of numbers 'heat, smoke'"):
+
+
+@pytest.mark.parametrize(("names", "level_set", "said"), [
+    (("heat", "smoke"), False, "has the grids of numbers 'heat, smoke' apart from level sets, none of which"),
+    (("density",), True, "convert a level set to a fog volume"),
+])
+def test_openvdb_names_the_density(tmp_path, openvdb, names, level_set, said):
+    """Two grids of other names, and distances of a level set, are no density."""
+    found = []
+    for name in names:
+        grid = openvdb.FloatGrid()
+        grid.copyFromArray(np.ones((3, 3, 3), np.float32))
+        grid.name, grid.transform = name, openvdb.createLinearTransform(voxelSize=1.0)
+        if level_set:
+            grid.gridClass = openvdb.GridClass.LEVEL_SET
+        found.append(grid)
+    openvdb.write(str(tmp_path / "a.vdb"), grids=found)
+    with pytest.raises(MiNtfError, match=said):
+        grids.read(tmp_path / "a.vdb")
+
+
+def test_openvdb_of_another_numpy(tmp_path, monkeypatch):
+    """A module that cannot exchange arrays is named, and the file is not called damaged."""
+    def fail(self, values):
+        raise ImportError("numpy.core.multiarray failed to import")
+
+    monkeypatch.setattr(FloatGrid, "copyFromArray", fail)
+    monkeypatch.setitem(sys.modules, "openvdb", SimpleNamespace(__name__="openvdb", FloatGrid=FloatGrid))
+    (tmp_path / "a.vdb").write_bytes(b"x")
+    with pytest.raises(MiNtfError, match="OpenVDB's module openvdb cannot read arrays of NumPy"):
         grids.read(tmp_path / "a.vdb")
 
 
