@@ -3,7 +3,8 @@
     python -m benchmarks.splats [--counts 5000 100000 1000000]
 
 - ``import``: seconds and peak memory of `mi-ntf import`, a process of its own, and the size of the field
-- ``transmittance``: root mean square error of random rays against the sum of error functions
+- ``transmittance``: root mean square error of random rays against the sum of error functions, and of rays that graze
+  the splats; number of rays whose transmittance is from 1 to 99 %
 - ``shadow``: relative root mean square error of a floor in the shadow of the splats, against that of the mesh
 - ``lookup``: nanoseconds of the transmittance from a seen point in a random direction by the atlas, and by tracing the
   ellipsoids of the splats (Mitsuba's ``ellipsoids``) with each one's optical depth in closed form
@@ -23,6 +24,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import trimesh
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from mi_ntf.core.splats import Splats, optical_depth
 from mi_ntf.evaluate.metrics import relative_rmse
@@ -34,13 +37,15 @@ from mi_ntf.render.scene.media import find_media
 from . import record, timing
 
 sys.path.insert(0, str(record.ROOT / "tests"))
-from helpers.splats import on_mesh, write_ply
+from helpers.splats import write_ply
 
 MESH = record.ROOT / "scenes" / "animal" / "meshes" / "animal.ply"
 RAYS, LOOKUPS, TRACED, SIZE, SPP = 400, 1 << 16, 1 << 11, 96, 64
 """Numbers of rays of the error, of lookups, of traced rays; pixels along a side and samples of the floor."""
-STEPS = 1536
-"""Integrator's `samples`, enough for the finest voxels."""
+DENSER, NEIGHBOURS = 8, 4
+"""Points of the mesh for each splat, and areas of a splat that its own points are from."""
+OPACITY, FLATTEST = 0.9, 0.4
+"""Opacity of the splats, and least shortest axis over the longest."""
 EXTENT = 3.5
 """Standard deviations at which a traced ellipsoid ends."""
 MEASURE = """import resource, sys
@@ -62,16 +67,53 @@ def imported(file: Path, field: Path) -> dict[str, float]:
             "megabytes": field.stat().st_size / 1e6}
 
 
-def error(splats: Splats, field: Field) -> float:
-    """Return the root mean square error of the transmittance of random rays through the box of the matter."""
+def fitted(mesh: trimesh.Trimesh, count: int) -> Splats:
+    """Return `count` splats whose means and covariances are those of the surface around them, as training makes them.
+
+    Each has the moments of the points of the surface next to it, on ``NEIGHBOURS`` times its share of the area. It then
+    lies two standard deviations beneath them, so that a grazing ray meets an opaque layer. Discs of one size instead
+    protrude from thin limbs.
+    """
+    points, faces = trimesh.sample.sample_surface(mesh, count * DENSER, seed=0)
+    points = np.asarray(points)
+    near = points[cKDTree(points).query(points[:count], NEIGHBOURS * DENSER)[1]]
+    means = near.mean(1)
+    near -= means[:, None]
+    variances, axes = np.linalg.eigh(np.swapaxes(near, 1, 2) @ near / (NEIGHBOURS * DENSER))
+    axes[:, :, 2] *= np.linalg.det(axes)[:, None]
+    scales = np.sqrt(np.maximum(variances, FLATTEST**2 * variances[:, 2:]))
+    normals = axes[:, :, 0]
+    outward = np.sign(np.sum(normals * np.asarray(mesh.face_normals)[faces[:count]], 1, keepdims=True))
+    centres = means - 2 * scales[:, :1] * outward * normals
+    rotations = Rotation.from_matrix(axes).as_quat()[:, [3, 0, 1, 2]]
+    return Splats(centres, scales, rotations, np.full(count, OPACITY), np.tile([0.6, 0.5, 0.4], (count, 1)))
+
+
+def error(splats: Splats, field: Field) -> dict[str, float]:
+    """Return the root mean square error of the transmittance of random rays through the box of the matter.
+
+    The first half of the rays graze the splats. They pass a random one at a right angle to its shortest axis, one to
+    five standard deviations above its centre.
+    """
     rng = np.random.default_rng(0)
     out = rng.normal(size=(RAYS, 3))
     origins = field.center + 1.2 * field.radius * out / np.linalg.norm(out, axis=1, keepdims=True)
     low, high = splats.centres.min(0), splats.centres.max(0)
-    directions = rng.uniform(low, high, (RAYS, 3)) - origins
+    targets = rng.uniform(low, high, (RAYS, 3))
+    chosen = splats.take(rng.integers(0, len(splats), RAYS // 2))
+    normals = chosen.normals() * np.sign(np.sum(chosen.normals() * out[: RAYS // 2], 1, keepdims=True))
+    heights = rng.uniform(1, 5, (RAYS // 2, 1)) * chosen.scales.min(1)[:, None]
+    targets[: RAYS // 2] = chosen.centres + heights * normals
+    along = np.cross(normals, rng.normal(size=normals.shape))
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    origins[: RAYS // 2] = targets[: RAYS // 2] - 3 * field.radius * along
+    directions = targets - origins
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     truth = np.exp(-optical_depth(splats, origins, directions))
-    return float(np.sqrt(np.mean((field.transmittance(origins, directions) - truth) ** 2)))
+    squares = (field.transmittance(origins, directions) - truth) ** 2
+    grazing, others = np.sqrt(squares.reshape(2, -1).mean(1)).tolist()
+    return {"grazing": grazing, "random": others,
+            "partly_clear_rays": int(((truth > 0.01) & (truth < 0.99)).sum())}
 
 
 def floor(thing: dict[str, Any] | None, integrator: dict[str, Any]) -> np.ndarray:
@@ -91,7 +133,7 @@ def floor(thing: dict[str, Any] | None, integrator: dict[str, Any]) -> np.ndarra
 def shadow(field: Field) -> float:
     """Return the relative error of the shadow of a field to that of the mesh."""
     mesh = {"type": "ply", "filename": str(MESH)}
-    splats = floor(field.shape(), {"type": "nrf", "max_depth": 2, "samples": STEPS})
+    splats = floor(field.shape(), {"type": "nrf", "max_depth": 2})
     return relative_rmse(splats, floor(mesh, {"type": "direct"}))
 
 
@@ -154,7 +196,7 @@ def _traced(scene: mi.Scene, columns: list[Any], ray: Any) -> Any:
 
 def measured(count: int, folder: Path) -> dict[str, Any]:
     """Return all figures of `count` splats."""
-    splats = on_mesh(trimesh.load(MESH, process=False), count)
+    splats = fitted(trimesh.load(MESH, process=False), count)
     file, path = write_ply(folder / "splats.ply", splats), folder / f"{count}.safetensors"
     row: dict[str, Any] = {"import": imported(file, path)}
     print(count, row, file=sys.stderr)

@@ -4,6 +4,7 @@ Its grids have x first, and a voxel's centre has whole coordinates in the index 
 """
 
 import importlib
+import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -24,7 +25,9 @@ def module() -> ModuleType:
     for name in ("openvdb", "pyopenvdb", "bpy"):
         try:
             vdb = importlib.import_module(name)
-            if name == "bpy":  # Blender puts the module on the path when it starts
+            if name == "bpy":  # which brings a folder of other modules without adding it to the path
+                version = Path(str(vdb.__file__)).parents[3]
+                sys.path += map(str, version.glob("python/lib/python*/site-packages"))
                 vdb = importlib.import_module("openvdb")
         except ImportError:
             continue
@@ -86,7 +89,8 @@ def write(path: Path, density: np.ndarray, bounds: np.ndarray) -> None:
     grid = vdb.FloatGrid()
     grid.copyFromArray(np.ascontiguousarray(density.transpose(2, 1, 0)))
     grid.transform = vdb.createLinearTransform(voxelSize=float(size.mean()))
-    grid.transform.translate(tuple((bounds[0] + size / 2).tolist()))
+    move = getattr(grid.transform, "postTranslate", None) or grid.transform.translate  # older than OpenVDB 11
+    move(tuple((bounds[0] + size / 2).tolist()))
     grid.name, grid.gridClass = PREFERRED, vdb.GridClass.FOG_VOLUME
     with files.replacing(path) as temporary:
         vdb.write(str(temporary), grids=[grid])
