@@ -19,12 +19,13 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_ntf.core import extras, field_file, files, progress
+from mi_ntf.core import extras, field_file, files, progress, voxels
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.core.srgb import encode
 from mi_ntf.infer.backend import module
 from mi_ntf.infer.network import NetworkField
 from mi_ntf.infer.surface import RESOLUTIONS, Surface, surface
+from mi_ntf.infer.volume import of_file
 
 SUFFIXES = (".ply", ".obj", ".glb", ".stl")
 """Endings of files. OBJ and GLB have colours, STL has the shape alone."""
@@ -80,9 +81,10 @@ def export(field: Path, output: Path, resolution: int = 256, level: float | None
     extras.need("mesh", "a mesh")
     files.check(output, SUFFIXES)
     with progress.Stage(f"making {output}") as stage:
-        header, tensors = field_file.load(field)
-        dj = module("llvm_ad_rgb")
-        mesh = surface(NetworkField(header, tensors, dj), resolution, level, dj, stage.update)
+        header, dj = field_file.load_header(field), module("llvm_ad_rgb")
+        density = (of_file(header, voxels.load(field, header), dj) if isinstance(header, voxels.Voxels)
+                   else NetworkField(*field_file.load(field), dj))
+        mesh = surface(density, resolution, level, dj, stage.update)
         vertices = mesh.vertices * header.similarity.radius + np.array(header.similarity.center)
         files.write(output, _encoded(mesh, vertices, output.suffix.lower()))
     return MeshFile(str(output), len(vertices), len(mesh.faces), mesh.level, np.ptp(vertices, axis=0).round(6).tolist(),

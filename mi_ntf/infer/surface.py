@@ -13,10 +13,11 @@ import numpy as np
 
 from ..core.architecture import LOG_FLOOR, MAX_LOG_DENSITY
 from ..core.errors import MiNtfError
-from .bake import CHANNELS, Progress, flat, sampled_bricks
+from .bake import CHANNELS, Progress, at_voxels, flat, sampled_bricks
 from .bricks import SIDE
 from .network import NetworkField
 from .types import Array
+from .volume import VoxelVolume
 
 LEVEL = 10.0
 """σ of the surface, 1/(unit-sphere radius). Tuned on the mean distance to the photographed meshes of four objects:
@@ -50,7 +51,7 @@ class Surface:
     specular: np.ndarray
 
 
-def surface(field: NetworkField, resolution: int, level: float | None, dj: ModuleType,
+def surface(field: NetworkField | VoxelVolume, resolution: int, level: float | None, dj: ModuleType,
             progress: Progress = lambda done: None) -> Surface:
     """Return the surface of `field` at density `level`, from `resolution`³ voxels.
 
@@ -75,8 +76,12 @@ def surface(field: NetworkField, resolution: int, level: float | None, dj: Modul
                                                          lambda done: progress(0.7 + 0.3 * done)))
 
 
-def _log_density(field: NetworkField, n: int, dj: ModuleType, progress: Progress) -> np.ndarray:
+def _log_density(field: NetworkField | VoxelVolume, n: int, dj: ModuleType, progress: Progress) -> np.ndarray:
     """Return ln σ at the centres of n³ voxels (z, y, x), ``LOG_FLOOR`` at least and away from density."""
+    if isinstance(field, VoxelVolume):
+        logs = at_voxels(lambda p: [field.log_density(field.place(p))], 1, None, n, dj, progress)
+        cube: np.ndarray = np.maximum(logs.reshape(n, n, n), LOG_FLOOR)
+        return cube
     values = np.full((n, n, n), LOG_FLOOR, np.float32)
     for places, samples in sampled_bricks(field, n, (0, SIDE), dj, progress):
         for (z, y, x), brick in zip(SIDE * places, samples, strict=True):
@@ -117,8 +122,8 @@ def _from_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return unit
 
 
-def _reflectance(field: NetworkField, vertices: np.ndarray, normals: np.ndarray, dj: ModuleType, progress: Progress
-                 ) -> tuple[np.ndarray, ...]:
+def _reflectance(field: NetworkField | VoxelVolume, vertices: np.ndarray, normals: np.ndarray, dj: ModuleType,
+                 progress: Progress) -> tuple[np.ndarray, ...]:
     """Return normals, albedo, roughness and specular weight, as a camera that looks along each normal sees them.
 
     They are means weighted by opacity, as in rendering.

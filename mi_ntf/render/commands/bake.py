@@ -14,7 +14,9 @@ from ...core.errors import MiNtfError
 from ...core.quantities import size
 from ...core.variants import VARIANTS
 from ...infer.lights import LightTable
+from ...infer.types import Visibility
 from ...infer.visibility import REGISTRY
+from ...infer.visibility.marched_begin import MarchedBegin
 from ...infer.visibility.method import Options
 from ...infer.visibility.transmittance_atlas import TransmittanceAtlas
 from ...infer.visibility.transmittance_map import TransmittanceMap
@@ -59,7 +61,7 @@ def _bake(output: Path, scene: mi.Scene, settings: Settings, media: list[NRFMedi
     (medium,) = media
     method = REGISTRY.get(settings.visibility)
     if method and method.per_field:
-        atlas = cast(TransmittanceAtlas, building.build(method.name, medium, None, _options(settings, medium)))
+        atlas = cast(TransmittanceAtlas, _lookup(method.name, medium, None, _options(settings, medium)))
         return _write(output, medium, atlas.maps.lights, atlas.options, [atlas.maps])
     table = scene_lights.Lights(scene, media, 0, settings.environment_lights).table(medium.frame)
     if not table.count:
@@ -71,7 +73,7 @@ def _bake(output: Path, scene: mi.Scene, settings: Settings, media: list[NRFMedi
     def maps() -> Iterator[TransmittanceMap]:
         for number, run in enumerate(runs):
             stage.update(number / len(runs))
-            yield cast(TransmittanceMap, building.build("transmittance_map", medium, run, options))
+            yield cast(TransmittanceMap, _lookup("transmittance_map", medium, run, options))
 
     return _write(output, medium, table, options, maps())
 
@@ -100,7 +102,10 @@ def bake_fields(path: Path, parameters: dict[str, str], environment: Environment
     if path.suffix != ".safetensors":
         with progress.Stage(f"reading {path}"):
             media = find_media(load_scene(path, parameters, environment))
-        resolutions: dict[str, int | None] = {m.path: m.field.grid.resolution for m in media}
+        resolutions: dict[str, int | None] = {m.path: m.field.grid.resolution for m in media if m.field.trained}
+        if not resolutions:
+            raise MiNtfError(f"{path} holds no trained field, and voxels of other fields are read as they are; render "
+                             "it without baking")
     else:
         if mi.variant() is None:
             mi.set_variant(*VARIANTS)
@@ -111,6 +116,12 @@ def bake_fields(path: Path, parameters: dict[str, str], environment: Environment
             result[file] = loaded.add_baked(Path(file), resolution)
             stage.advance()
     return result
+
+
+def _lookup(method: str, medium: NRFMedium, table: LightTable | None, options: Options) -> Visibility | None:
+    """Return a visibility method without the marches that renders add to it."""
+    made = building.build(method, medium, table, options)
+    return made.looked_up if isinstance(made, MarchedBegin) else made
 
 
 def _options(settings: Settings, medium: NRFMedium) -> Options:
