@@ -15,7 +15,7 @@ import sys
 from . import record, tables
 
 SCRIPTS: dict[str, list[str]] = {"demo": ["--results"], "speed": [], "loops": [], "fields": [], "sequence": [],
-                                 "dial": [], "reproduce": [], "smoke": []}
+                                 "dial": [], "splats": [], "reproduce": [], "smoke": []}
 """Name of each script → its arguments. `media` is left out, since it needs Mitsuba's scenes."""
 
 

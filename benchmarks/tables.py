@@ -261,6 +261,17 @@ def media(values: Values) -> str:
          "passes" if row["passes"] else "fails"] for row in values["rows"]], 3)
 
 
+def splats(values: Values) -> str:
+    """Return the figures of Gaussian splats that were imported as voxels."""
+    header = ["splats", "import, GiB", "field, MB", "random rays, RMS error", "grazing rays, RMS error",
+              "shadow, rel. RMSE", "tracing over atlas, seconds"]
+    rows = [[f"{int(count):,}".replace(",", " "), f"{row['import']['gibibytes']:.2f}",
+             f"{row['import']['megabytes']:.0f}", f"{row['transmittance']['random']:.1e}",
+             f"{row['transmittance']['grazing']:.1e}", percent(row["shadow"]), f"{row['lookup']['ratio']['median']:.0f} ×"]
+            for count, row in values.items()]
+    return table(header, rows)
+
+
 def _reproduce(name: str) -> Callable[[Values], str]:
     return lambda values: str(getattr(paper, name)(values))
 
@@ -281,6 +292,7 @@ TABLES: dict[str, tuple[str, Callable[[Values], str]]] = {
     "sequence": ("sequence", sequence),
     "smoke": ("smoke", smoke),
     "media": ("media", media),
+    "splats": ("splats", splats),
     "paper-times": ("speed", _reproduce("times_table")),
     "paper-complexity": ("speed", _reproduce("complexity_table")),
     "paper-accuracy": ("reproduce", _reproduce("accuracy_table")),

@@ -145,7 +145,7 @@ class Composition:
         log_density = medium.attached_log_density
         if log_density is None or self.settings.shadow_gradients == "none" or not part.for_run:
             return part
-        march = cast(RayMarch, building.march(medium, part.table, building.options(self.settings)))
+        march = cast(RayMarch, building.march(medium, part.table, building.options(self.settings, medium)))
 
         def attach(method: Visibility | None) -> Visibility | None:
             return AttachedShadow(method, march, log_density) if method else None
