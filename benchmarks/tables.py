@@ -267,7 +267,8 @@ def splats(values: Values) -> str:
               "shadow, rel. RMSE", "tracing over atlas, seconds"]
     rows = [[f"{int(count):,}".replace(",", " "), f"{row['import']['gibibytes']:.2f}",
              f"{row['import']['megabytes']:.0f}", f"{row['transmittance']['random']:.1e}",
-             f"{row['transmittance']['grazing']:.1e}", percent(row["shadow"]), f"{row['lookup']['ratio']['median']:.0f} ×"]
+             f"{row['transmittance']['grazing']:.1e}", percent(row["shadow"]),
+             f"{row['lookup']['ratio']['median']:.0f} ×"]
             for count, row in values.items()]
     return table(header, rows)
 
