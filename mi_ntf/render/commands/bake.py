@@ -120,8 +120,8 @@ def bake_fields(path: Path, parameters: dict[str, str], environment: Environment
 
 def _lookup(method: str, medium: NRFMedium, table: LightTable | None, options: Options) -> Visibility | None:
     """Return a visibility method without the marches that renders add to it."""
-    made = building.build(method, medium, table, options)
-    return made.looked_up if isinstance(made, MarchedBegin) else made
+    visibility = building.build(method, medium, table, options)
+    return visibility.looked_up if isinstance(visibility, MarchedBegin) else visibility
 
 
 def _options(settings: Settings, medium: NRFMedium) -> Options:
