@@ -96,7 +96,8 @@ def test_grey_profiles(tmp_path):
     np.testing.assert_allclose(decoded(tmp_path / "p.png")[:, 1], light(COLOURS[:, 0]), atol=1.5 * 2.3 / 255)
 
 
-@pytest.mark.parametrize("icc", [profile("sRGB"), ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()])
+@pytest.mark.parametrize("icc", [profile("sRGB"), ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()],
+                         ids=["ours", "lcms"])  # the second has the time in it
 def test_srgb_profiles_leave_the_levels_alone(tmp_path, icc):
     Image.fromarray(PICTURE).save(tmp_path / "a.png", icc_profile=icc)
     image = images.decode(tmp_path / "a.png")
