@@ -22,6 +22,8 @@ from ..scene.media import NRFMedium
 _lock = threading.Lock()
 _maps: OrderedDict[str, TransmittanceMap] = OrderedDict()
 FLOAT32 = np.dtype(np.float32)
+FORMAT = 2
+"""Number of the meaning of texels. 2: atlases of smoke hold optical depths. Stored maps of another are made anew."""
 LightKey = tuple[str, bytes, bool]
 _light_keys: dict[str, list[LightKey]] = {}
 """Name of a map → key of each of its lights, for maps that can be reused light by light."""
@@ -31,7 +33,7 @@ _used: set[str] = set()
 
 def description(medium: NRFMedium, options: Options) -> dict[str, object]:
     """Return the inputs of a map apart from its lights, as a map file records them."""
-    return {"field": medium.field.digest, "representation": medium.representation,
+    return {"texel_format": FORMAT, "field": medium.field.digest, "representation": medium.representation,
             "grid": medium.field.grid.resolution, "map_resolution": options.map_resolution,
             "map_source": options.map_source, "map_components": components(medium, options),
             "samples": 2 / options.step}
