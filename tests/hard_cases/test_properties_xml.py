@@ -24,7 +24,7 @@ KINDS = {
     "Transform": '<transform name="{}"><scale value="4"/></transform>', "Object": '<bsdf type="diffuse" name="{}"/>',
 }  # fmt: skip
 NUMBERS = {"timeout", "map_memory", "scale", "sampling_weight", "noise_threshold", "max_error", "time_budget"}
-WORDS = {"visibility", "bounces", "map_source", "representation", "aovs", "filename", "map_file"}
+WORDS = {"visibility", "bounces", "map_source", "representation", "aovs", "filename", "map_file", "shadow_gradients"}
 FLAGS = {"hide_emitters", "sample_emitters", "unbiased"}
 RANGES = {
     "samples": (8, 8192), "light_samples": (0, 65536), "environment_lights": (1, 65536), "map_resolution": (0, 4096),

@@ -203,7 +203,7 @@ def medium_class(phase_class: type) -> type:
                 for name, tensor in self.field.network.tensors().items():
                     callback.put(name, tensor, mi.ParamFlags.NonDifferentiable | mi.ParamFlags.ReadOnly)
                 return
-            if self._parameters is None and not traversal.is_quiet():
+            if self._parameters is None and not traversal.is_quiet() and self.source.majorant > 0:
                 self._parameters = FieldParameters(self._read)
             if self._parameters:
                 self._parameters.traverse(callback)
