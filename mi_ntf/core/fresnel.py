@@ -100,7 +100,7 @@ def _fifth(x: Array) -> Array:
 def _rim(ops: Ops, roughness: Array) -> tuple[Callable[[Array], Array], Array]:
     """Return ``(R, R̄)``, R as a function of the cosine.
 
-    R is b (1 − c)^q, a fit to quadrature: within 0.01 at c ≥ 0.1, within 0.08 below.
+    R is b (1 − c)^q, a fit to quadrature: within 0.01 at c ≥ 0.1, 0.06 at c ≥ 0.05, and 0.08 below.
     """
     alpha = roughness * roughness
     b = 1 / (1 + alpha * (13 + alpha * (26.4 - 5.3 * alpha)))

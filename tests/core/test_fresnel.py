@@ -59,7 +59,7 @@ def test_rim_reflectance_agrees_with_quadrature(roughness):
     """The fits of R and of its mean R̄ agree with quadrature."""
     grazing, mean = fresnel._rim(ops, roughness)
     for cos in (0.02, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0):
-        error = 0.01 if cos >= 0.1 else 0.08  # as the docstring says of the fit
+        error = 0.01 if cos >= 0.1 else 0.06 if cos > 0.04 else 0.08  # as the docstring says of the fit
         assert grazing(cos) == pytest.approx(_reflected(cos, roughness)[1], abs=error)
     cosines = (np.arange(400) + 0.5) / 400
     assert mean == pytest.approx(2 * np.mean([grazing(c) * c for c in cosines]), abs=1e-4)
