@@ -37,8 +37,8 @@ class Command:
     def interrupt(self, when: Callable[[], bool]) -> tuple[int, str]:
         """Press Ctrl-C as soon as `when` is true; return the exit code of a shell and the last line.
 
-        A shell reports 130 for both 130 and death by SIGINT. CPython ends by the signal, after the command's own
-        sentence, if Ctrl-C came while a library executed text, as `dataclasses` does at import.
+        A shell reports 130 for an exit code of 130 and for death by SIGINT. The latter can come after the command's
+        own sentence, because Mitsuba's handler, in whatever thread it runs, raises the signal a second time.
         """
         end = time.monotonic() + 120
         while not when():
