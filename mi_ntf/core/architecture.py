@@ -32,8 +32,8 @@ LOG_FLOOR = -6.0
 them."""
 MAX_OCTAVES = 24
 """Largest number of octaves: sin(2^k π x) of higher k is noise in single precision."""
-RETRO = "reflectance.retro"
-"""Name of the tensor of the retro-reflection."""
+RETRO, TAIL = "reflectance.retro", "reflectance.tail"
+"""Names of the tensors of the retro-reflection and of the tail of the specular lobe."""
 NAMES = ("density", "reflectance", "transmittance")
 """Networks of every field."""
 
@@ -94,6 +94,9 @@ class Architecture:
     retro: bool = False
     """True if the file has the retro-reflection of :mod:`mi_ntf.core.fresnel`, as the tensor RETRO of one raw number,
     through a sigmoid."""
+    tail: bool = False
+    """True if the file has the tail of :mod:`mi_ntf.core.microfacet`, as the tensor TAIL of one raw number, through a
+    sigmoid."""
     phase: float | None = None
     """Asymmetry g of smoke, which scatters by :mod:`mi_ntf.core.henyey_greenstein`; None: a surface's reflectance.
     Smoke has no normal and no specular lobe: the reflectance network's albedo alone counts."""
@@ -121,7 +124,7 @@ class Architecture:
             for i, (n_in, n_out) in enumerate(pairwise(sizes)):
                 shapes[f"{name}.layers.{i}.weight"] = (n_out, n_in)
                 shapes[f"{name}.layers.{i}.bias"] = (n_out,)
-        return shapes | ({RETRO: (1,)} if self.retro else {})
+        return shapes | ({RETRO: (1,)} if self.retro else {}) | ({TAIL: (1,)} if self.tail else {})
 
 
 @dataclass(frozen=True)
@@ -156,7 +159,7 @@ def header_from_json(data: object, source: str) -> Header:
         nets = {name: _network(member(described, name, dict), name) for name in NAMES}
         if described.get("visibility") is not None:  # absent from files of earlier builds
             nets["visibility"] = _network(member(described, "visibility", dict), "visibility")
-        fresnel, retro = (member({name: False} | described, name, bool) for name in ("fresnel", "retro"))  # likewise
+        fresnel, retro, tail = (member({name: False} | described, name, bool) for name in ("fresnel", "retro", "tail"))
         phase = described.get("phase")  # likewise
         if phase is not None and not abs(number(phase, "the asymmetry of the phase function")) < 1:
             raise ValueError(f"the asymmetry of the phase function is {shown(phase)}, expected -1 to 1, exclusive")
@@ -170,7 +173,8 @@ def header_from_json(data: object, source: str) -> Header:
         x, y, z = (number(c, "the similarity's center") for c in center)
         radius = number(member(similarity, "radius", object), "the similarity's radius", above=0)
         provenance = member({"provenance": {}} | data, "provenance", dict)
-        architecture = Architecture(**nets, fresnel=fresnel, retro=retro, phase=phase, specular_channels=int(channels))
+        architecture = Architecture(**nets, fresnel=fresnel, retro=retro, tail=tail, phase=phase,
+                                    specular_channels=int(channels))
         return Header(architecture, Similarity((x, y, z), radius), provenance)
     except ValueError as error:
         raise MiNtfError(f"{source}: the header's description is incomplete or wrong: {error}; "

@@ -132,11 +132,11 @@ def _clear_distance(field: Density) -> Callable[[Vector, Vector], Float]:
 
 
 def _wide(reflect: Callable[[Vector], Reflectance]) -> Callable[[Vector], tuple[Vector | Float | None, ...]]:
-    """Return `reflect` of surfaces as a function of tuples, with a retro-reflection for each point if there is any."""
+    """Return `reflect` of surfaces as a function of tuples, with the numbers of whole fields for each point."""
 
     def values(x: Vector) -> tuple[Vector | Float | None, ...]:
         r = reflect(x)
-        return *r[:5], None if r.retro is None else r.retro + 0 * r.roughness
+        return *r[:5], *(None if v is None else v + 0 * r.roughness for v in (r.retro, r.tail))
 
     return values
 

@@ -11,7 +11,16 @@ from drjit import nn
 
 from ..core import depth_profile, logistic, mixture, spheres
 from ..core import ops as numpy_ops
-from ..core.architecture import MAX_LOG_DENSITY, MIN_LOG_DENSITY, NO_VISIBILITY, RETRO, Architecture, Encoding, Header
+from ..core.architecture import (
+    MAX_LOG_DENSITY,
+    MIN_LOG_DENSITY,
+    NO_VISIBILITY,
+    RETRO,
+    TAIL,
+    Architecture,
+    Encoding,
+    Header,
+)
 from ..core.errors import MiNtfError
 from ..core.microfacet import MIN_ROUGHNESS
 from ..core.ops import Tensors, normalize
@@ -70,6 +79,8 @@ class NetworkField:
         self._least_specular, self._smoke = arch.least_specular, arch.phase is not None
         self.retro = _retro(arch, tensors)
         """Retro-reflection of :mod:`mi_ntf.core.fresnel`, None without a Fresnel term."""
+        self.tail = _number(tensors, TAIL) if arch.tail else None
+        """Tail of the specular lobe (:mod:`mi_ntf.core.microfacet`), None for GGX."""
         self.quick = arch.reflectance.encoding.kind == "planes"
         """True if a reflectance costs no more than a few fetches."""
 
@@ -132,7 +143,11 @@ class NetworkField:
 def _retro(architecture: Architecture, tensors: Tensors) -> float | None:
     if not architecture.fresnel:
         return None
-    return float(logistic.sigmoid(numpy_ops, tensors[RETRO][0])) if architecture.retro else 0.0
+    return _number(tensors, RETRO) if architecture.retro else 0.0
+
+
+def _number(tensors: Tensors, name: str) -> float:
+    return float(logistic.sigmoid(numpy_ops, tensors[name][0]))
 
 
 def _half(dj: ModuleType) -> bool:

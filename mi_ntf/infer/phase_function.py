@@ -38,4 +38,4 @@ class HenyeyGreenstein:
 def smoke(albedo: Vector, lobe: Lobe) -> Reflectance:
     """Return the reflectance of points that scatter light by a phase function: no normal and no specular lobe."""
     zero, one = dr.zeros(type(albedo[0]), dr.width(albedo[0])), dr.ones(type(albedo[0]), dr.width(albedo[0]))
-    return Reflectance((zero, zero, zero), albedo, one, (zero, zero, zero), zero, False, lobe)
+    return Reflectance((zero, zero, zero), albedo, one, (zero, zero, zero), zero, lobe=lobe)

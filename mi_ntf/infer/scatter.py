@@ -1,7 +1,7 @@
 """Importance sampling of the field's phase function: directions to the light, for a viewer (field coordinates).
 
 Three densities over the side that the normal faces, with c = ⟨n,ω_o⟩⁺: cosine and uniform, which together follow the
-diffuse lobe of a flat skin, ∝ ⟨n,ω_i⟩ + c, exactly, and the GGX half vector (Walter et al. 2007, eqs. 35, 36).
+diffuse lobe of a flat skin, ∝ ⟨n,ω_i⟩ + c, exactly, and the half vector of the specular lobe.
 """
 
 import drjit as dr
@@ -18,18 +18,18 @@ def evaluate(wi: Vector, wo: Vector, reflectance: Reflectance) -> tuple[Vector, 
 
     The value is the phase function (linear RGB, 1/sr), the density that of :func:`sample` (1/sr).
     """
-    normal, albedo, roughness, specular, softness, retro, lobe, _ = reflectance
+    normal, albedo, roughness, specular, softness, retro, tail, lobe, _ = reflectance
     if lobe:
         phase, pdf = lobe.evaluate(wi, wo)
         return tuple(k * c for k, c in zip(albedo, phase, strict=True)), pdf
-    diffuse, glossy = microfacet.scattering(ops, wi, wo, normal, roughness, softness)
+    diffuse, glossy = microfacet.scattering(ops, wi, wo, normal, roughness, softness, tail)
     weights = [fresnel.weights(ops, wi, wo, normal, roughness, s, retro) for s in specular]
     value = tuple(k * w * diffuse + s * glossy for k, (w, s) in zip(albedo, weights, strict=True))
     half = normalize(ops, tuple(a + b for a, b in zip(wi, wo, strict=True)))
     cos_h = dr.maximum(dot(normal, half), 0)
     across = cross(normal, half)
     jacobian = dr.rcp(4 * dr.maximum(dot(wo, half), 1e-6))
-    pdf_specular = microfacet.ggx(dot(across, across), roughness * roughness) * cos_h * jacobian
+    pdf_specular = microfacet.distribution(ops, dot(across, across), roughness * roughness, tail) * cos_h * jacobian
     chance, above = _specular_chance(wo, reflectance)
     flat = (dot(normal, wi) + above) * microfacet.INV_PI
     pdf = (1 - chance) * flat / (1 + 2 * above) + chance * pdf_specular
@@ -46,8 +46,7 @@ def sample(wo: Vector, reflectance: Reflectance, u1: Float, u2: tuple[Float, Flo
     glossy = u1 < chance
     uniform = (u1 - chance) * (1 + 2 * above) > 1 - chance
     phi = 2 * dr.pi * u2[1]
-    alpha = roughness * roughness
-    cos_specular = dr.sqrt((1 - u2[0]) / (1 + (alpha * alpha - 1) * u2[0]))
+    cos_specular = microfacet.sample_cosine(ops, u2[0], roughness * roughness, reflectance.tail)
     cos = dr.select(glossy, cos_specular, dr.select(uniform, u2[0], dr.sqrt(1 - u2[0])))
     sin = dr.safe_sqrt(1 - cos * cos)
     s, t = tangents(normal)

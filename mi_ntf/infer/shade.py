@@ -28,9 +28,9 @@ class Reflectance(NamedTuple):
     """Reflectance of field points: ranges as in :mod:`mi_ntf.core.microfacet`, softness as in :mod:`mi_ntf.core.skin`.
 
     `specular`: weight of the specular lobe, linear RGB; at normal incidence if there is a Fresnel term. `retro`: the
-    field's retro-reflection (:mod:`mi_ntf.core.fresnel`), None without a Fresnel term. `lobe`: a phase function that is
-    weighted by the albedo, in place of normal, roughness and specular weight. `emission`: emitted radiance of matter
-    that reflects nothing.
+    field's retro-reflection (:mod:`mi_ntf.core.fresnel`), None without a Fresnel term. `tail`: that of the specular
+    lobe (:mod:`mi_ntf.core.microfacet`), None for GGX. `lobe`: a phase function that is weighted by the albedo, in
+    place of normal, roughness and specular weight. `emission`: emitted radiance of matter that reflects nothing.
     """
 
     normal: Vector
@@ -39,6 +39,7 @@ class Reflectance(NamedTuple):
     specular: Vector
     softness: Float
     retro: Float | None = None
+    tail: Float | None = None
     lobe: Lobe | None = None
     emission: Vector | None = None
 
@@ -65,7 +66,7 @@ class Points:
         uint = dr.uint32_array_t(type(x[0]))
         self.ray: UInt32 = dr.arange(uint, dr.width(x[0])) if ray is None else ray
         self.ordinal: UInt32 = uint(0) if ordinal is None else ordinal
-        self.normal, self.albedo, self.roughness, self.specular, self.softness, _, self.lobe, _ = reflectance
+        self.normal, self.albedo, self.roughness, self.specular, self.softness, _, self.tail, self.lobe, _ = reflectance
 
     def evaluate(self) -> None:
         """Evaluate the arrays now, before a loop over lights."""
@@ -153,7 +154,8 @@ def _value(wi: Vector, points: Points, skin: bool, specular: bool) -> tuple[Mask
         return cos > 0, [k * diffuse for k in points.albedo]
     direction = wi, points.wo, points.normal, points.roughness
     diffuse, glossy = (
-        microfacet.scattering(ops, *direction, points.softness) if skin else microfacet.lobes(ops, *direction)
+        microfacet.scattering(ops, *direction, points.softness, points.tail) if skin
+        else microfacet.lobes(ops, *direction, points.tail)
     )
     weights = [fresnel.weights(ops, *direction, s, points.reflectance.retro) for s in points.specular]
     return diffuse > 0, [k * w * diffuse + s * glossy for k, (w, s) in zip(points.albedo, weights, strict=True)]

@@ -30,7 +30,7 @@ class FastConfig:
     """Learning rate of the layers."""
     lr_gains: float = 0.02
     """Learning rate of single numbers: the photographs' exposure and white balance, where those are learned, and the
-    retro-reflection."""
+    numbers of a whole field's lobes."""
     lr_end: float = 0.03
     """Factor of the learning rates at the end, after an exponential decay."""
     log_density: float = 3.0
@@ -156,7 +156,8 @@ def configured(preset: str, *, ntf: str | None = None, augmentation: bool = True
     architecture = config.architecture
     if isinstance(config, FastConfig):
         fresnel &= smoke is None
-        architecture = replace(architecture, fresnel=fresnel, retro=fresnel, specular_channels=3 if fresnel else 1)
+        architecture = replace(architecture, fresnel=fresnel, retro=fresnel, tail=fresnel,
+                               specular_channels=3 if fresnel else 1)
         config = replace(config, bounces=bounces, gains=gains)
     architecture = replace(architecture, phase=smoke)
     if ntf is not None:

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass
 
 import torch
 
-from ..core.architecture import MAX_LOG_DENSITY, RETRO
+from ..core.architecture import MAX_LOG_DENSITY, RETRO, TAIL
 from ..core.errors import MiNtfError
 from ..core.progress import Stage
 from . import device, losses, networks, offset, parallel, rays, volume
@@ -103,7 +103,7 @@ class Fast:
         tensors = {k: v for k, v in self.networks.tensors.items() if k.split(".")[0] in names}
         planes = {"params": [v for k, v in tensors.items() if ".planes." in k], "base": self.config.lr_planes}
         layers = {"params": [v for k, v in tensors.items() if ".layers." in k], "base": self.config.lr_layers}
-        numbers = [v for k, v in tensors.items() if k == RETRO]
+        numbers = [v for k, v in tensors.items() if k in (RETRO, TAIL)]
         if self.gains is not None and names == FIELD:
             numbers += [v for v in (self.gains.logs, self.room) if v is not None]
         single = {"params": numbers, "base": self.config.lr_gains}

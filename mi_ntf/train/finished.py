@@ -70,7 +70,7 @@ class FinishedField:
             raise MiNtfError(f"{self.path} was trained with another preset; --continue takes fields of the preset "
                              "'fast' further")
         architecture = replace(config.architecture, density=field.density, reflectance=field.reflectance,
-                               fresnel=field.fresnel, retro=field.retro, phase=field.phase,
+                               fresnel=field.fresnel, retro=field.retro, tail=field.tail, phase=field.phase,
                                specular_channels=field.specular_channels)
         if not self.further:
             return replace(config, architecture=architecture, ntf_from=0.0, ntf_alone=0.0)

@@ -71,12 +71,13 @@ class Flash:
         return torch.exp(-depth)
 
     def send(self, optical: Optical, reflectance: Reflectance, d: torch.Tensor, x: torch.Tensor, view: torch.Tensor,
-             light: torch.Tensor, retro: torch.Tensor | None, phase: float | None = None) -> torch.Tensor:
+             light: torch.Tensor, retro: torch.Tensor | None, phase: float | None = None,
+             tail: torch.Tensor | None = None) -> torch.Tensor:
         """Return the radiance (n, 3) that samples at `x` (n, 3) of rays along `d` send to the camera.
 
         `optical` are the samples' optical depths, `light` (n, 3) radiant intensities. `retro` is the
-        retro-reflection, None without a Fresnel term. `phase` is the asymmetry of smoke. Shadows on skins are left out,
-        see :meth:`lit`.
+        retro-reflection, None without a Fresnel term. `phase` is the asymmetry of smoke, `tail` that of the specular
+        lobe. Shadows on skins are left out, see :meth:`lit`.
         """
         normal, albedo, roughness, specular = reflectance
         toward, distance = self.toward(view, x)
@@ -88,14 +89,14 @@ class Flash:
         wi, wo, n = toward.unbind(1), (-d).unbind(1), normal.unbind(1)
         diffuse_weight, gloss_weight = fresnel.weights(ops, wi, wo, n, roughness, specular.T, retro)
         if self.solid:
-            diffuse, glossy = microfacet.lobes(ops, wi, wo, n, roughness)
+            diffuse, glossy = microfacet.lobes(ops, wi, wo, n, roughness, tail)
             with torch.no_grad():
                 cos_i, cos_o = ((normal * v).sum(1).clamp(min=LEAST_COSINE) for v in (toward, -d))
                 ratio = 1 + cos_o / cos_i
             faces = (normal.detach() * d).sum(1) < 0
             weight = torch.exp(-ratio * optical.front) * -torch.expm1(-ratio * optical.depth) * faces
         else:
-            diffuse, glossy = microfacet.scattering(ops, wi, wo, n, roughness)
+            diffuse, glossy = microfacet.scattering(ops, wi, wo, n, roughness, tail=tail)
             weight = torch.exp(-optical.front) * -torch.expm1(-optical.depth) * self.reaching(view, x)
         lobe: torch.Tensor = (diffuse_weight * diffuse).T * albedo + (gloss_weight * glossy).T
         return weight[:, None] * lobe * light / distance**2

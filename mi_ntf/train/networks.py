@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 
 from ..core import depth_profile, fresnel, logistic, mixture, spheres
-from ..core.architecture import MAX_LOG_DENSITY, MIN_LOG_DENSITY, NO_VISIBILITY, RETRO, Architecture, Encoding
+from ..core.architecture import MAX_LOG_DENSITY, MIN_LOG_DENSITY, NO_VISIBILITY, RETRO, TAIL, Architecture, Encoding
 from ..core.errors import MiNtfError
 from ..core.microfacet import MIN_ROUGHNESS
 from ..core.reference import PLANES
@@ -27,6 +27,9 @@ INITIAL_SPECULAR_LOGIT, INITIAL_ROUGHNESS_LOGIT = -3.0, 1.5
 photographs first. A sharper lobe would be brighter than a black surface, whose normals would turn away from it."""
 INITIAL_RETRO_LOGIT = -2.0
 """Start of the retro-reflection, 0.12: small, and its sigmoid has a slope there."""
+INITIAL_TAIL_LOGIT = 2.0
+"""Start of the tail of the specular lobe, 0.88, near GGX. From a narrower lobe the tail of a metal is learned as a
+diffuse part."""
 POINTS_PER_PART = 65536
 """Points that :func:`in_parts` evaluates at once, which bounds the memory."""
 
@@ -67,6 +70,12 @@ class Networks:
             return None
         raw = self.tensors.get(RETRO)
         return torch.zeros(1) if raw is None else torch.sigmoid(raw)
+
+    @property
+    def tail(self) -> torch.Tensor | None:
+        """Tail (1,) of the specular lobe (:mod:`mi_ntf.core.microfacet`), None for GGX."""
+        raw = self.tensors.get(TAIL)
+        return None if raw is None else torch.sigmoid(raw)
 
     @property
     def phase(self) -> float | None:
@@ -263,6 +272,8 @@ def initial(architecture: Architecture, log_density: float, generator: torch.Gen
     tensors[f"density.layers.{len(architecture.density.hidden)}.bias"] += log_density
     if RETRO in tensors:
         tensors[RETRO] += INITIAL_RETRO_LOGIT
+    if TAIL in tensors:
+        tensors[TAIL] += INITIAL_TAIL_LOGIT
     lobe = tensors[f"reflectance.layers.{len(architecture.reflectance.hidden)}.bias"][6:]
     lobe += torch.tensor([INITIAL_ROUGHNESS_LOGIT] + [INITIAL_SPECULAR_LOGIT] * architecture.specular_channels)
     return Networks(architecture, {k: v.requires_grad_() for k, v in tensors.items()})

@@ -112,12 +112,12 @@ def scatter_sum(value: torch.Tensor, ray: torch.Tensor, count: int) -> torch.Ten
 
 
 def shade(reflectance: Reflectance, d: torch.Tensor, t: torch.Tensor, light: torch.Tensor, retro: torch.Tensor | None,
-          phase: float | None = None) -> torch.Tensor:
+          phase: float | None = None, tail: torch.Tensor | None = None) -> torch.Tensor:
     """Return the radiance (n, 3) that points scatter back along −d, per unit of light weight v.
 
     `t` (n,) is the distance to the light at the lens, `light` (n, 3) its radiant intensity. `retro` is the
     retro-reflection, None without a Fresnel term. `phase` is the asymmetry of smoke, which sends light back by its
-    phase function alone.
+    phase function alone. `tail` is that of the specular lobe, None for GGX.
     """
     if phase is not None:
         back = henyey_greenstein.phase(ops, phase, t.new_tensor(-1.0))
@@ -125,7 +125,7 @@ def shade(reflectance: Reflectance, d: torch.Tensor, t: torch.Tensor, light: tor
         return smoke
     normal, albedo, roughness, specular = reflectance
     cos = -(normal * d).sum(1)
-    diffuse, glossy = microfacet.lobes_collocated(ops, cos, roughness)
+    diffuse, glossy = microfacet.lobes_collocated(ops, cos, roughness, tail)
     diffuse_weight, gloss_weight = fresnel.weights_collocated(ops, cos, roughness, specular.T, retro)
     lobe: torch.Tensor = (diffuse_weight * diffuse).T * albedo + (gloss_weight * glossy).T
     return SURFACE * lobe * light / (t * t)[:, None]
@@ -149,16 +149,17 @@ def render(networks: Networks, rays: Rays, samples: Samples, bounced: Bounced | 
     near = (w.detach() > MIN_WEIGHT).nonzero()[:, 0]
     ray, t, x, w, view = ray[near], t[near], x[near], w[near], rays.view[ray[near]]
     reflectance = networks.reflectance(x)
-    shaded, retro = reflectance, networks.retro
+    shaded, retro, tail = reflectance, networks.retro, networks.tail
     if not lobes:
-        retro = None if retro is None else retro.detach()
+        retro, tail = (None if v is None else v.detach() for v in (retro, tail))
         reflectance = Reflectance(*reflectance[:2], *(v.detach() for v in reflectance[2:]))
         shaded = reflectance._replace(normal=_turned_to(reflectance.normal, -rays.d[ray]))
     if flash is None:
-        radiance = shade(shaded, rays.d[ray], t, rays.light[ray], retro, networks.phase)
+        radiance = shade(shaded, rays.d[ray], t, rays.light[ray], retro, networks.phase, tail)
         color = scatter_sum(v[near, None] * radiance, ray, len(rays))
     else:
-        radiance = flash.send(optical[near], shaded, rays.d[ray], x, view, rays.light[ray], retro, networks.phase)
+        radiance = flash.send(optical[near], shaded, rays.d[ray], x, view, rays.light[ray], retro, networks.phase,
+                              tail)
         color = scatter_sum(radiance, ray, len(rays)) * _lit(flash, rays, ray, w.detach(), x, shaded.normal.detach())
     indirect: torch.Tensor | float = 0.0
     if bounced is not None and bounced.known:

@@ -96,16 +96,17 @@ def test_summary_has_six_lines_and_the_sphere_as_xml(tmp_path, capsys, provenanc
 
 def test_fields_with_a_visibility_network_and_fresnel_effect_and_old_ones_without(tmp_path):
     both = dataclasses.replace(SMALL, visibility=Network(Encoding("frequency", octaves=1), (3,)), fresnel=True,
-                               retro=True)
+                               retro=True, tail=True)
     assert set(both.skeleton()) - set(SMALL.skeleton()) == {
-        f"visibility.layers.{i}.{part}" for i in (0, 1) for part in ("weight", "bias")} | {"reflectance.retro"}
+        f"visibility.layers.{i}.{part}" for i in (0, 1) for part in ("weight", "bias")} | {
+            "reflectance.retro", "reflectance.tail"}
     assert both.skeleton()["visibility.layers.0.weight"] == (3, 18)  # 6 + 1 octave · (sin, cos) · 6
     tensors = make_tensors(both)
     field_file.save(tmp_path / "f", Header(both), tensors)
     header, actual = field_file.load(tmp_path / "f")
     assert header.architecture == both and set(actual) == set(tensors)
     old = Header(SMALL).to_json()
-    for name in ("visibility", "fresnel", "retro", "phase", "specular_channels"):
+    for name in ("visibility", "fresnel", "retro", "tail", "phase", "specular_channels"):
         del old["architecture"][name]
     assert header_from_json(json.loads(json.dumps(old)), "old").architecture == SMALL
 

@@ -81,6 +81,10 @@ FORMULAS = [
             (T, _log_uniform(0.02, 1), _log_uniform(0.02, 1), _log_uniform(0.01, 1)), 3e-6, 3e-5, 10.0),
     # dD/dα is a difference of two terms 1000 times its value where it crosses zero.
     Formula("ggx", lambda o, s, a: [microfacet.ggx(s, a)], (_uniform(0, 1), _log_uniform(0.0225, 1)), 1e-6, 3e-5),
+    Formula("distribution", lambda o, s, a, t: [microfacet.distribution(o, s, a, t)],
+            (_uniform(0, 1), _log_uniform(0.0225, 1), _uniform(0.02, 1)), 1e-5, 1e-3),
+    Formula("smith, tail", lambda o, c, a, t: [2 * c * microfacet.smith(o, c, a, t)],
+            (_uniform(0, 1), _log_uniform(0.0225, 1), _uniform(0.02, 1)), 1e-6, 3e-5),
     Formula("smith", lambda o, c, a: [2 * c * microfacet.smith(o, c, a)], (_uniform(0, 1), _log_uniform(0.0225, 1)),
             1e-6, 3e-6),
     # Directions rounded by 6e-8 under a lobe of width α ≥ 0.0225: 6e-8/α per order of derivative, unit peak-relative.

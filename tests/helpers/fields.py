@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from mi_ntf.core.architecture import MIN_LOG_DENSITY, RETRO, Architecture, Encoding, Header, Network, Similarity
+from mi_ntf.core.architecture import MIN_LOG_DENSITY, RETRO, TAIL, Architecture, Encoding, Header, Network, Similarity
 from mi_ntf.core.microfacet import MIN_ROUGHNESS
 from mi_ntf.infer.network import MIN_DENSITY
 
@@ -40,16 +40,16 @@ def _logit(p):
 
 def blobs(
     centers, radii, *, log_density=5.0, edge=8.0, albedo=(0.6, 0.5, 0.4), roughness=0.5, specular=0.2, similarity=None,
-    components=2, visibility=False, fresnel=False, phase=None, retro=None
+    components=2, visibility=False, fresnel=False, phase=None, retro=None, tail=None
 ) -> tuple[Header, dict]:
     """Opaque balls: ln σ rises from −12 to `log_density` over about radius/`edge`.. around each radius. Normals point
     away from the origin. At most 8 balls; a ball is the level set of a Gaussian, which the three planes' product holds
     exactly. `visibility`: with the baseline's network, too, whose τ is anything between 0 and 1 and smooth. `fresnel`:
     `specular` is the normal reflectance, a number or three of a colour. `phase`: asymmetry of smoke. `retro`:
-    retro-reflection, of fields with a Fresnel term."""
+    retro-reflection, of fields with a Fresnel term. `tail`: that of the specular lobe; None for GGX."""
     weight = np.atleast_1d(specular)
     arch = replace(architecture(components, visibility), fresnel=fresnel or retro is not None, retro=retro is not None,
-                   phase=phase, specular_channels=len(weight))
+                   tail=tail is not None, phase=phase, specular_channels=len(weight))
     t = {k: np.zeros(s) for k, s in arch.skeleton().items()}
     u, v = _axes()
     for i, (c, r) in enumerate(zip(centers, radii, strict=True)):
@@ -70,6 +70,8 @@ def blobs(
         t["density.layers.1.weight"][0, 8 + i] = -1
     if retro is not None:
         t[RETRO][0] = _logit(min(max(retro, 1e-9), 1 - 1e-9))
+    if tail is not None:
+        t[TAIL][0] = _logit(min(max(tail, 1e-9), 1 - 1e-9))
     least = arch.least_specular
     _outward_reflectance(t, albedo, roughness, (weight - least) / (1 - least))
     for name, scale in (("transmittance", 0.5), ("visibility", 0.3)):

@@ -14,13 +14,14 @@ from mi_ntf.core import fresnel, microfacet, ops
 from mi_ntf.render.scene import loaded
 
 
-@pytest.fixture(params=[(0.3, 0.4, None), (0.8, 0.1, None), (0.4, 0.06, 0.0), (0.4, 0.06, 0.6),
-                        (0.6, (0.95, 0.6, 0.5), 0.2)], ids=["glossy", "rough", "fresnel", "retro-reflection", "metal"])
+@pytest.fixture(params=[(0.3, 0.4, None, None), (0.8, 0.1, None, None), (0.4, 0.06, 0.0, None), (0.4, 0.06, 0.6, 0.3),
+                        (0.6, (0.95, 0.6, 0.5), 0.2, 0.0)],
+                ids=["glossy", "rough", "fresnel", "retro-reflection and tail", "metal with Beckmann's lobe"])
 def medium(request, variant, tmp_path):
     mi_ntf.render.register()
-    roughness, specular, retro = request.param
+    roughness, specular, retro, tail = request.param
     path = scenes.write_blobs(tmp_path, roughness=roughness, specular=specular, albedo=(0.7, 0.5, 0.3),
-                              retro=retro)
+                              retro=retro, tail=tail)
     scene = scenes.scene(path, {"type": "nrf"}, {"light": scenes.light("directional")})
     (shape,) = scene.shapes()
     return shape.interior_medium()
@@ -81,7 +82,7 @@ def test_value_is_the_formula_and_weight_is_value_over_density(medium, rng):
     softness = float(medium.field.softness(tuple(mi.Float(c) for c in NORMAL_POINT))[0])
     d = np.array(wo, np.float64)
     directions = tuple(d), tuple(np.full(count, c) for c in viewer), (0.0, 0.0, 1.0), roughness
-    diffuse, gloss = microfacet.scattering(ops, *directions, softness)
+    diffuse, gloss = microfacet.scattering(ops, *directions, softness, medium.field.tail)
     for channel, (albedo, s) in enumerate(zip((0.7, 0.5, 0.3), specular, strict=True)):
         weights = fresnel.weights(ops, *directions, s, medium.field.retro)
         truth = weights[0] * albedo * diffuse + weights[1] * gloss

@@ -58,7 +58,7 @@ class Outward:
     """The spheres' networks with the spheres' own normals."""
 
     fresnel = False
-    retro = None
+    retro = tail = None
     phase = None
 
     def __init__(self, nets):

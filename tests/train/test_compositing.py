@@ -41,7 +41,7 @@ class Slab:
     """Uniform density, Lambert reflectance, normals towards the camera."""
 
     fresnel = False
-    retro = phase = None
+    retro = tail = phase = None
 
     def log_density(self, x):
         return torch.full((len(x),), float(np.log(SIGMA)))

@@ -52,6 +52,7 @@ class Skin:
 
     def __init__(self, roughness: float, specular: float, retro: float | None):
         self.gloss, self.retro, self.fresnel = (roughness, specular), retro, retro is not None
+        self.tail = None
         self.phase = None
 
     def log_density(self, x):

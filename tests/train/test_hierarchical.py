@@ -68,7 +68,7 @@ class Slab:
     """σ = 8 where z > 0, else 0; Lambertian, facing −z."""
 
     fresnel = False
-    retro = None
+    retro = tail = None
     phase = None
 
     def log_density(self, x):

@@ -15,7 +15,7 @@ from mi_ntf.train import networks, ops  # noqa: E402
 SMALL = Architecture(density=Network(Encoding("planes", (5, 9), 3), (7,)),
                      reflectance=Network(Encoding("frequency", octaves=3), (8,)),
                      transmittance=Network(Encoding("frequency", octaves=2), (9, 5), components=2),
-                     visibility=Network(Encoding("frequency", octaves=2), (7, 6)), fresnel=True, retro=True,
+                     visibility=Network(Encoding("frequency", octaves=2), (7, 6)), fresnel=True, retro=True, tail=True,
                      specular_channels=3)
 
 

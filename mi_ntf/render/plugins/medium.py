@@ -88,7 +88,6 @@ from ...infer.backend import module_of
 from ...infer.grid import Density, NetworkVolume
 from ...infer.phase_function import HenyeyGreenstein, smoke
 from ...infer.shade import Reflectance
-from ...infer.skin import Smoke, Softness
 from ...infer.types import Color3, Float, Mask, Ray, Reflected, Vector, Vector3
 from ...infer.volume import VoxelVolume
 from .. import log
@@ -115,14 +114,15 @@ class Reflects(Protocol):
         """Return normal, albedo, roughness and specular weight."""
 
 
-def _reflectance(source: Reflects, softness: Softness | Smoke, retro: float | None, phase: float | None, emissive: bool
+def _reflectance(source: Reflects, field: LoadedField | VolumeField | ChangedField
                  ) -> Callable[[Vector], Reflectance]:
     """Return the reflectance of field points as a function.
 
     The phase function holds it rather than the medium, which holds the phase function. The two would never be freed.
     """
-    back: Float | None = None if retro is None else dr.opaque(mi.Float, retro)
-    lobe = None if phase is None else HenyeyGreenstein(phase, module_of(mi.Float))
+    softness, emissive = field.softness, field.emissive
+    back, tail = (None if v is None else dr.opaque(mi.Float, v) for v in (field.retro, field.tail))
+    lobe = None if field.phase is None else HenyeyGreenstein(field.phase, module_of(mi.Float))
 
     def reflectance(x: Vector) -> Reflectance:
         if lobe and emissive:
@@ -131,7 +131,7 @@ def _reflectance(source: Reflects, softness: Softness | Smoke, retro: float | No
             return smoke(black, lobe)._replace(emission=colour)
         if lobe:
             return smoke(source.reflectance(x)[1], lobe)
-        return Reflectance(*source.reflectance(x), softness(x), back)
+        return Reflectance(*source.reflectance(x), softness(x), back, tail)
 
     return reflectance
 
@@ -169,8 +169,7 @@ def medium_class(phase_class: type) -> type:
             else:
                 self.source = (
                     grid if self.representation == "grid" else NetworkVolume(self.field.network, grid, bound))
-            self.reflectance = _reflectance(self.source, self.field.softness, self.field.retro, self.field.phase,
-                                            self.field.emissive)
+            self.reflectance = _reflectance(self.source, self.field)
             self.to_world = mi.Transform4f(mi.ScalarTransform4f(to_world))
             self.path = path
             phase = phase_class(mi.Properties("nrf"))
@@ -215,8 +214,7 @@ def medium_class(phase_class: type) -> type:
             if parameters and changed:
                 self.field = parameters.field
                 self.source = self.field.grid
-                self.reflectance = _reflectance(parameters.reflectance(self.field.grid), self.field.softness,
-                                                self.field.retro, self.field.phase, self.field.emissive)
+                self.reflectance = _reflectance(parameters.reflectance(self.field.grid), self.field)
             if changed or not keys or "to_world" in keys:
                 self._place(np.array(dr.detach(self.to_world).matrix, np.float64).reshape(4, 4))
                 for emitter in self.followers:

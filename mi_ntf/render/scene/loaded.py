@@ -63,6 +63,11 @@ class LoadedField:
         """Retro-reflection of :mod:`mi_ntf.core.fresnel`, None if the specular weight is the same at all angles."""
         return self.network.retro
 
+    @property
+    def tail(self) -> float | None:
+        """Tail of the specular lobe (:mod:`mi_ntf.core.microfacet`), None for GGX."""
+        return self.network.tail
+
 
 @dataclass(frozen=True)
 class VolumeField:
@@ -75,6 +80,7 @@ class VolumeField:
     softness: Softness | Smoke = field(default_factory=Smoke)
     emissive: bool = False
     retro: float | None = None
+    tail: float | None = None
     trained = False
 
     @property
@@ -119,6 +125,11 @@ class ChangedField:
     def retro(self) -> float | None:
         """Retro-reflection of :mod:`mi_ntf.core.fresnel`, None if the specular weight is the same at all angles."""
         return self.original.retro
+
+    @property
+    def tail(self) -> float | None:
+        """Tail of the specular lobe (:mod:`mi_ntf.core.microfacet`), None for GGX."""
+        return self.original.tail
 
     @property
     def emissive(self) -> bool:

@@ -72,7 +72,7 @@ def _kind(medium: NRFMedium) -> tuple[int, ...]:
     """Return numbers that are the same for media that may be one: those of one field, and all opaque baked surfaces."""
     field = medium.field
     if isinstance(medium.source, GridField) and field.softness.opaque and field.phase is None:
-        return 0, int(field.retro is None), int(field.grid.gloss > MIN_GLOSS)
+        return 0, int(field.retro is None), int(field.tail is None), int(field.grid.gloss > MIN_GLOSS)
     return 1, id(medium.source)
 
 
