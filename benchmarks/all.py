@@ -16,7 +16,8 @@ from . import record, tables
 
 SCRIPTS: dict[str, list[str]] = {"demo": ["--results"], "speed": [], "loops": [], "fields": [], "sequence": [],
                                  "dial": [], "splats": [], "reproduce": [], "smoke": []}
-"""Name of each script → its arguments. `media` is left out, since it needs Mitsuba's scenes."""
+"""Name of each script → its arguments. `media` and `objects` are left out: the first needs Mitsuba's scenes, the second
+8 hours."""
 
 
 def current(name: str) -> bool:
