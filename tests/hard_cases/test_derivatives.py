@@ -45,7 +45,8 @@ def files(tmp_path_factory):
 def case(file, name, light, method):
     """Scene, parameters, key, direction and type for the derivative by half of the blocks of a parameter."""
     integrator = scenes.nrf(method, samples=192, environment_lights=16, map_resolution=64)
-    scene = scenes.scene(file, integrator, {"light": AREA if light == "area" else scenes.light(light)}, size=12, spp=16)
+    scene = scenes.scene(file, integrator, {"light": AREA if light == "area" else scenes.light(light)}, size=12,
+                         spp=64 if name == "density" else 16)
     parameters = mi.traverse(scene)
     key = next(MEDIUM + k for k in (name, f"log_{name}") if MEDIUM + k in parameters)
     places = np.array(parameters[MEDIUM + ("density_blocks" if name == "density" else "reflectance_blocks")])
