@@ -32,14 +32,19 @@ def bounding_sphere(points: np.ndarray) -> Sphere:
     Source: Badoiu and Clarkson 2003, "Smaller core-sets for balls": step by 1/(i+1) towards the farthest point.
     """
     points = np.asarray(points, dtype=np.float64)
-    center = 0.5 * (points.min(0) + points.max(0))
-    best, radius = center, float(np.linalg.norm(points - center, axis=1).max())
+    middle = 0.5 * (points.min(0) + points.max(0))
+    points = points - middle
+    square = (points * points).sum(1)
+    best = center = np.zeros(3)
+    radius = np.inf
     for i in range(1, 200):
-        distance = np.linalg.norm(points - center, axis=1)
-        if distance.max() < radius:
-            best, radius = center, float(distance.max())
-        center = center + (points[distance.argmax()] - center) / (i + 1)
-    return Sphere(best, radius)
+        distance = square - points @ (2 * center)  # squared, less that of the centre from the middle
+        farthest = distance.argmax()
+        length = float(np.linalg.norm(points[farthest] - center))
+        if length < radius:
+            best, radius = center, length
+        center = center + (points[farthest] - center) / (i + 1)
+    return Sphere(middle + best, radius)
 
 
 def find_sphere(images: np.ndarray, c2w: np.ndarray, focal: np.ndarray, principal: np.ndarray,
@@ -116,8 +121,8 @@ def _carve(low: np.ndarray, edge: float, shape: np.ndarray, images: np.ndarray, 
         clear = not any(border.any() for border in (mask[0], mask[-1], mask[:, 0], mask[:, -1]))
         window = footprint(cells, edge, c2w[i], focal[i], principal[i], (mask.shape[1], mask.shape[0]))
         pixels = window.pixels(mask)
-        full = pixels > 0 if clear else ~window.inside | (pixels > 0)
-        cells, views = cells[full], (views + window.inside)[full]
+        full = np.flatnonzero(pixels if clear else ~window.inside | (pixels > 0))
+        cells, views = cells.take(full, 0), (views + window.inside).take(full)
         if not len(cells):
             break
     cells = cells[2 * views >= len(c2w)]

@@ -42,8 +42,10 @@ class Footprint(NamedTuple):
         """Return the number of True pixels of `mask` (H, W) in each window (K,), from a summed-area table."""
         sums = np.zeros((mask.shape[0] + 1, mask.shape[1] + 1), np.int32)
         sums[1:, 1:] = mask.cumsum(0, np.int32).cumsum(1, np.int32)
-        return np.asarray(sums[self.bottom, self.right] - sums[self.top, self.right] - sums[self.bottom, self.left]
-                          + sums[self.top, self.left])
+        row, flat = sums.shape[1], sums.ravel()
+        bottom, top = self.bottom * row, self.top * row
+        return np.asarray(flat[bottom + self.right] - flat[top + self.right] - flat[bottom + self.left]
+                          + flat[top + self.left])
 
 
 def footprint(cells: np.ndarray, edge: float, c2w: np.ndarray, focal: np.ndarray, principal: np.ndarray,
@@ -53,16 +55,16 @@ def footprint(cells: np.ndarray, edge: float, c2w: np.ndarray, focal: np.ndarray
     `focal` and `principal` (2,) and `size` (width, height) are in pixels.
     """
     width, height = size
-    local = (cells - c2w[:3, 3]) @ c2w[:3, :3]
-    depth = -local[:, 2]
-    front = depth > edge
-    safe = np.where(front, depth, 1.0)
-    u = principal[0] + focal[0] * local[:, 0] / safe
-    v = principal[1] - focal[1] * local[:, 1] / safe
-    slant = np.linalg.norm(local, axis=1) / safe  # a length along the ray also moves the pixel beside the axis
-    reach = slant * np.sqrt(3) / 2 * edge * focal.max() / np.maximum(safe - edge, edge)  # half a cell's diagonal
-    left, right = (np.clip(np.floor(u + s * reach) + (s > 0), 0, width).astype(np.int32) for s in (-1, 1))
-    top, bottom = (np.clip(np.floor(v + s * reach) + (s > 0), 0, height).astype(np.int32) for s in (-1, 1))
+    x, y, z = c2w[:3, :3].T @ (cells - c2w[:3, 3]).T
+    front = -z > edge
+    safe = np.where(front, -z, 1.0)
+    u = principal[0] + focal[0] * x / safe
+    v = principal[1] - focal[1] * y / safe
+    slant = np.sqrt(x * x + y * y + z * z) / safe  # a length along the ray also moves the pixel beside the axis
+    reach = slant * (np.sqrt(3) / 2 * edge * focal.max()) / np.maximum(safe - edge, edge)  # half a cell's diagonal
+    # Numbers in [0, width] are rounded down by the conversion to integers.
+    left, right = (np.clip(u + s * reach + (s > 0), 0, width).astype(np.int32) for s in (-1, 1))
+    top, bottom = (np.clip(v + s * reach + (s > 0), 0, height).astype(np.int32) for s in (-1, 1))
     inside = front & (u >= 0) & (u < width) & (v >= 0) & (v < height)
     return Footprint(left, np.where(front, right, left), top, bottom, inside)
 
