@@ -23,6 +23,8 @@ REFLECTANCE_RESOLUTION = 128
 """Largest number of voxels per side of reflectance and of softness."""
 CHANNELS = 10
 """Channels of a reflectance: normal (3), albedo (3), roughness, specular weight (3)."""
+EMPTY = 1 << 20
+"""Coordinate of a line without density, farther than any voxel."""
 PART = 1 << 20
 """Number of points that are evaluated together, which bounds the memory."""
 Progress: TypeAlias = Callable[[float], None]
@@ -70,7 +72,8 @@ def _density(field: NetworkField, n: int, dj: ModuleType, progress: Progress) ->
     for places, samples in sampled_bricks(field, n, (-1, SIDE + 2), dj, progress):
         highest = max(highest, float(samples.max()))
         for axis in (1, 2, 3):
-            inner, before, after = (samples.take(range(k, k + samples.shape[axis] - 2), axis) for k in (1, 0, 2))
+            inner, before, after = (samples[(slice(None),) * axis + (slice(k, k + samples.shape[axis] - 2),)]
+                                    for k in (1, 0, 2))
             samples = (14 * inner - before - after) / 12
         dense = (samples > LOG_MIN_DENSITY).any((1, 2, 3))
         parts.append((places[dense], samples[dense]))
@@ -130,7 +133,8 @@ def flat(reflectance: Reflected) -> list[Float]:
 def _outline(places: np.ndarray, values: np.ndarray, n: int, coarse: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the outline of the density and a mask of the coarse³ voxels (z, y, x) that hold some.
 
-    The outline are the first and last voxel (k, 3), x first, of each line along x that holds density.
+    The outline are the voxels (k, 3), x first, at the ends of lines along x that may be corners of the density's convex
+    hull.
     """
     low, high = np.full((n + 1, n + 1), n, np.int32), np.full((n + 1, n + 1), -1, np.int32)
     matter = np.zeros((coarse,) * 3, bool)
@@ -144,8 +148,24 @@ def _outline(places: np.ndarray, values: np.ndarray, n: int, coarse: int) -> tup
         np.maximum.at(high, where, x[brick, SIDE - line[:, ::-1].argmax(1)])
         brick, *at = np.nonzero(dense)
         matter[tuple(c[brick, i] * coarse // n for c, i in zip((z, y, x), at, strict=True))] = True
-    z, y = np.nonzero(high >= 0)
-    return np.concatenate([np.stack([side[z, y], y, z], 1) for side in (low, high)]), matter
+    ends = []
+    for sign, side in ((1, low), (-1, high)):
+        z, y = np.nonzero(_corners(np.where(high < 0, EMPTY, sign * side)))
+        ends.append(np.stack([side[z, y], y, z], 1))
+    return np.concatenate(ends), matter
+
+
+def _corners(heights: np.ndarray) -> np.ndarray:
+    """Return a mask of the `heights` (z, y), `EMPTY` where there is nothing, that may be corners of their lower hull.
+
+    A height that is no lower than the middle between two neighbours on opposite sides is none.
+    """
+    result, padded = heights < EMPTY, np.pad(heights, 1, constant_values=EMPTY)
+    n, m = heights.shape
+    for z, y in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        before, after = (padded[1 + k * z : 1 + k * z + n, 1 + k * y : 1 + k * y + m] for k in (-1, 1))
+        result &= 2 * heights < before + after
+    return result
 
 
 def support_points(voxels: np.ndarray, n: int, directions: int = 1200) -> np.ndarray:

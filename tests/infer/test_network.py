@@ -15,7 +15,7 @@ from mi_ntf.core.architecture import LOG_FLOOR, Architecture, Encoding, Header, 
 from mi_ntf.core.depth_profile import LEVELS
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.infer import network as network_module
-from mi_ntf.infer.bake import flat, support_points
+from mi_ntf.infer.bake import EMPTY, _corners, flat, support_points
 from mi_ntf.infer.grid import baked
 from mi_ntf.infer.network import CLEAR_DEPTH, MIN_DENSITY, NetworkField
 
@@ -224,3 +224,17 @@ def test_hulls_hold_all_interpolated_density(rng):
     assert missed.mean() < 0.002
     assert len(hull) <= 1206
     np.testing.assert_array_equal(support_points(np.zeros((0, 3)), 4), np.zeros((1, 3)))
+
+
+def test_corners_of_an_outline_reach_as_far_as_all_of_it(rng):
+    """Along every direction towards lower heights, with holes, and with one height alone."""
+    z, y = np.mgrid[:40, :50]
+    for heights in (np.round(30 - np.sqrt(np.maximum(900 - (z - 20) ** 2 - (y - 25) ** 2, 0))).astype(int),
+                    rng.integers(0, 30, (40, 50)), np.full((40, 50), 7)):
+        heights = np.where(rng.random(heights.shape) < 0.1, EMPTY, heights)
+        points = np.stack([heights, y, z], -1)
+        corners, known = _corners(heights), heights < EMPTY
+        d = rng.normal(size=(500, 3))
+        d[:, 0] = -np.abs(d[:, 0])
+        np.testing.assert_allclose((points[corners] @ d.T).max(0), (points[known] @ d.T).max(0), rtol=1e-12)
+        assert corners.sum() < 0.5 * known.sum()
