@@ -4,6 +4,7 @@ import os
 
 import numpy as np
 import pytest
+from helpers import bakes
 
 os.environ.setdefault("MI_NTF_CACHE", "off")  # tests neither read nor fill the user's cache
 
@@ -12,3 +13,9 @@ os.environ.setdefault("MI_NTF_CACHE", "off")  # tests neither read nor fill the 
 def rng() -> np.random.Generator:
     """Random numbers that are the same in every run."""
     return np.random.default_rng(20210922)
+
+
+@pytest.fixture(autouse=True)
+def shared_bakes() -> None:
+    """Bake equal fields of different tests once."""
+    bakes.share()
