@@ -53,8 +53,8 @@ def test_a_sun_that_is_marched_to(tmp_path):
     for name in ("field.safetensors", "sensor.xml"):
         text = text.replace(name, str(SCENE.parent / name))
     (tmp_path / "scene.xml").write_text(text)
-    why = {v: explain(tmp_path / "scene.xml", {"visibility": v, "res": "16"})["effects"]["visibility"]["why"]
-           for v in ("transmittance_atlas", "raymarch")}
+    why = {v: explain(tmp_path / "scene.xml", {"visibility": v, "res": "16", "depth": "2"})["effects"]["visibility"]
+           ["why"] for v in ("transmittance_atlas", "raymarch")}
     assert why["transmittance_atlas"].endswith("; marched to 1 that outshine the others")
     assert why["raymarch"] == "raymarch: chosen by name"
 
@@ -80,7 +80,7 @@ def test_auto_counts_drawn_lights(tmp_path):
 
 def test_maps_of_mixtures_take_four_times_the_memory(tmp_path):
     scene = with_integrator(tmp_path, '<string name="map_source" value="network"/>')
-    report = explain(scene, {"visibility": "transmittance_map"})
+    report = explain(scene, {"visibility": "transmittance_map", "depth": "2"})
     assert report["memory_bytes"]["maps or volumes"] == 4 * 8 * 384**2
 
 
@@ -89,7 +89,7 @@ def test_memory_of_maps_is_bounded(tmp_path):
     scene = with_integrator(tmp_path, '<float name="map_memory" value="4"/>')
     light = f'<include filename="{SCENE.parent}/light_point.xml"/>'
     scene.write_text(scene.read_text().replace(light, '<emitter type="constant"/>'))
-    report = explain(scene, {"visibility": "transmittance_map"})
+    report = explain(scene, {"visibility": "transmittance_map", "depth": "2"})
     assert report["lights"]["count"] == 512 and report["memory_bytes"]["maps or volumes"] == 14 * 8 * 192**2
 
 
@@ -99,7 +99,7 @@ def test_environments_state_their_error(tmp_path, capsys):
     for count in (32, 512):
         scene = with_integrator(tmp_path, f'<integer name="environment_lights" value="{count}"/>')
         scene.write_text(scene.read_text().replace(light, '<emitter type="constant" id="sky"/>'))
-        report = explain(scene, {"visibility": "none"})
+        report = explain(scene, {"visibility": "none", "depth": "2"})
         print_table(report)
         environments += report["environments"]
     assert [e["lights"] for e in environments] == [32, 512]
@@ -107,7 +107,7 @@ def test_environments_state_their_error(tmp_path, capsys):
     assert [e["irradiance_error_percent"] for e in environments] == pytest.approx([5.5, 0.48], rel=0.05)
     assert environments[1]["radius_degrees"] == pytest.approx(3.83, rel=0.02)
     assert "0.48 % of all light" in " ".join(capsys.readouterr().out.split())
-    assert explain(SCENE, {"visibility": "none", "light": "point"})["environments"] == []
+    assert explain(SCENE, {"visibility": "none", "light": "point", "depth": "2"})["environments"] == []
 
 
 def test_table_names_every_effect_within_the_columns_of_the_terminal(capsys, monkeypatch):
