@@ -1,5 +1,7 @@
 """Emitters whose sampling does not find all of their light: `mis_compensation` and a `sampling_weight` of 0."""
 
+from functools import cache
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -47,20 +49,30 @@ def test_wrapped_light_under_mis_compensation(blobs):
     np.testing.assert_allclose(np.mean(pictures[0]), np.mean(pictures[1]), rtol=0.01)
 
 
-@pytest.mark.parametrize("samples", [0, 3])
-def test_sampling_weights_of_0_agree_with_volpath(blobs, samples):
-    """A point of weight 0 is dark; a sky and an area, which scattered rays meet, shine."""
+def weightless() -> dict:
+    """Lights of which those of weight 0 are a point, which is dark, and a sky and an area, which shine."""
     lamp = mi.ScalarTransform4f().look_at([2.5, 3.5, 1.5], list(scenes.SIMILARITY.center), [0, 0, 1]).scale(0.7)
-    lights = {
+    return {
         "dark": {**scenes.light("point"), "sampling_weight": 0.0},
         "sun": {**scenes.light("directional"), "irradiance": 1.0},
         "sky": {**sky(), "sampling_weight": 0.0},
         "lamp": {"type": "rectangle", "to_world": lamp,
                  "emitter": {"type": "area", "radiance": 6.0, "sampling_weight": 0.0}},
     }
+
+
+@pytest.fixture(scope="module")
+def by_volpath(blobs):
+    """Function that returns the pictures by volpath, rendered once."""
+    return cache(lambda: renders(blobs, {"type": "volpath", "max_depth": 2}, weightless(), 512, {"floor": FLOOR}))
+
+
+@pytest.mark.parametrize("samples", [0, 3])
+def test_sampling_weights_of_0_agree_with_volpath(blobs, by_volpath, samples):
+    """A point of weight 0 is dark; a sky and an area, which scattered rays meet, shine."""
     ours = renders(blobs, {"type": "nrf", "visibility": "raymarch", "light_samples": samples, "samples": 512,
-                           "environment_lights": 96}, lights, 64 if samples else 16, {"floor": FLOOR})
-    theirs = renders(blobs, {"type": "volpath", "max_depth": 2}, lights, 512, {"floor": FLOOR})
+                           "environment_lights": 96}, weightless(), 64 if samples else 16, {"floor": FLOOR})
+    theirs = by_volpath()
     ztest.check(ours, theirs, f"sampling_weight {samples}", block=4)
     np.testing.assert_allclose(np.mean(ours), np.mean(theirs), rtol=0.02)
 

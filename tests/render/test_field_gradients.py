@@ -1,5 +1,7 @@
 """Derivatives of the image by a field's density and reflectance, against central differences and closed forms."""
 
+from functools import cache
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -41,12 +43,16 @@ def test_reflectance(blobs, name):
     assert forward(*this) == pytest.approx(expected, rel=5e-3)
 
 
+@pytest.fixture(scope="module")
+def by_density(blobs):
+    """Function that returns the derivative by the density from differences, the first time it is asked for."""
+    return cache(lambda light, part: differences(*case(blobs, "log_density", light, part), STEPS["log_density"]))
+
+
 @pytest.mark.parametrize(("light", "part"), [("point", True), ("point", False), ("env", False)])
-def test_density(blobs, light, part):
+def test_density(blobs, by_density, light, part):
     """Camera visibility and shadows change with the density."""
-    this = case(blobs, "log_density", light, part)
-    expected = differences(*this, STEPS["log_density"])
-    assert backward(*this) == pytest.approx(expected, rel=0.05)
+    assert backward(*case(blobs, "log_density", light, part)) == pytest.approx(by_density(light, part), rel=0.05)
 
 
 def test_density_without_shadows(blobs):
@@ -57,10 +63,9 @@ def test_density_without_shadows(blobs):
     assert forward(*this) == pytest.approx(expected, rel=0.02)
 
 
-def test_density_through_a_map(blobs):
+def test_density_through_a_map(blobs, by_density):
     """The derivative of a looked up shadow is that of the march, and left out where told."""
-    march = case(blobs, "log_density")
-    expected = differences(*march, STEPS["log_density"])
+    expected = by_density("point", True)
     looked_up = backward(*case(blobs, "log_density", visibility="transmittance_map"))
     assert looked_up == pytest.approx(expected, rel=0.1)
     fixed = backward(*case(blobs, "log_density", visibility="transmittance_map", shadow_gradients="none"))

@@ -1,5 +1,7 @@
 """Derivatives of the image by the lights, against central differences over the same random numbers."""
 
+from functools import cache
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -47,24 +49,32 @@ def test_environment_texels(blobs, light_samples, rel, mode):
     assert mode(*case) == pytest.approx(differences(*case, 0.05), rel=rel)
 
 
+def by_position(scene, parameters) -> tuple:
+    """The derivative by the place of the light, along one direction."""
+    return scene, parameters, "light.position", [-0.3, -0.6, 1.0], mi.Point3f
+
+
+@pytest.fixture(scope="module")
+def moved(blobs):
+    """Function that returns the differences by the place of a point light, computed once for each visibility."""
+    return cache(lambda visibility: differences(
+        *by_position(*setting(blobs, {"light": scenes.light("point")}, visibility)), 0.1))
+
+
 @pytest.mark.parametrize(("mode", "visibility"), [
     (forward, "raymarch"), *((backward, v) for v in ("raymarch", "neural_transmittance", "transmittance_map", "none")),
     *(pytest.param(forward, v, marks=pytest.mark.slow) for v in ("neural_transmittance", "transmittance_map", "none"))])
-def test_position(blobs, visibility, mode):
+def test_position(blobs, moved, visibility, mode):
     """The light's distance, angle, shadows and the horizon, where the phase function jumps, move.
 
     Derivatives are the march's even with maps and networks. Differences depend on its steps: from 0.05 to 0.1 they vary
     by 1 %.
     """
-    scene, parameters = setting(blobs, {"light": scenes.light("point")}, "raymarch")
-    case = scene, parameters, "light.position", [-0.3, -0.6, 1.0], mi.Point3f
-    truth = differences(*case, 0.1)
-    without, _ = setting(blobs, {"light": scenes.light("point")}, "none")
-    unshadowed = differences(without, mi.traverse(without), *case[2:], 0.1)
+    truth, unshadowed = moved("raymarch"), moved("none")
     assert abs(truth - unshadowed) > 0.5 * abs(truth)  # shadows matter here
     scene, parameters = setting(blobs, {"light": scenes.light("point")}, visibility)
     expected = unshadowed if visibility == "none" else truth
-    assert mode(scene, parameters, *case[2:]) == pytest.approx(expected, rel=0.03)
+    assert mode(*by_position(scene, parameters)) == pytest.approx(expected, rel=0.03)
 
 
 @pytest.mark.parametrize("other", ["field", "floor"])
@@ -86,7 +96,7 @@ def test_position_moves_shadows_on_other_things(blobs, other):
         scene = scenes.scene(blobs, integrator, {"light": scenes.light("point")}, size=12, spp=16, shapes=shapes)
         parameters = mi.traverse(scene)
         parameters["sensor.to_world"] = mi.Transform4f().look_at(**aim, up=[0, 1, 0])
-        case = scene, parameters, "light.position", [-0.3, -0.6, 1.0], mi.Point3f
+        case = by_position(scene, parameters)
         values += [differences(*case, 0.1), backward(*case)]
     truth, slope, unshadowed, _ = values
     assert abs(truth - unshadowed) > 0.5 * abs(truth)
