@@ -1,6 +1,7 @@
 """Emitters as lights of the field: every kind of Mitsuba's against stock `volpath`, rows against Mitsuba's own
 sampling, orientation, and the noise of resampling."""
 
+from functools import cache
 from unittest import mock
 
 import drjit as dr
@@ -23,20 +24,22 @@ def emitter(kind: str) -> dict:
     return emitters.emitter(kind, MIDDLE, scenes.SIMILARITY.radius)
 
 
-def check_against_volpath(field, light: dict, label: str, **options):
+def renders(field, integrator: dict, light: dict, spp: int) -> list[np.ndarray]:
+    loaded = scenes.scene(field, integrator, light, size=12, spp=spp, sampler="multijitter")
+    return [scenes.render(loaded, seed)[..., :3] for seed in range(SEEDS)]
+
+
+def by_volpath(field, light: dict) -> list[np.ndarray]:
+    return renders(field, {"type": "volpath", "max_depth": 2, "hide_emitters": True}, light, 1024)
+
+
+def check_against_volpath(field, light: dict, label: str, theirs=None, **options):
     """z-test of 3×3 block means at 12×12, and means of 6×6 blocks within 3 %, three to five times volpath's noise in
-    them."""
+    them. `theirs`: the pictures :func:`by_volpath`, if they are known."""
     # A few lights serve for skies as smooth as these: measured 2 % of a block's light, of which volpath's noise is 1 %.
     ours = {"type": "nrf", "visibility": "raymarch", "samples": 512, "hide_emitters": True, "environment_lights": 72}
     ours |= options
-    theirs = {"type": "volpath", "max_depth": 2, "hide_emitters": True}
-    images = [
-        [scenes.render(loaded, seed)[..., :3] for seed in range(SEEDS)]
-        for loaded in (
-            scenes.scene(field, ours, light, size=12, spp=16, sampler="multijitter"),
-            scenes.scene(field, theirs, light, size=12, spp=1024, sampler="multijitter"),
-        )
-    ]  # fmt: skip
+    images = renders(field, ours, light, 16), theirs or by_volpath(field, light)
     ztest.check(*images, label, block=3)
     means = [np.mean(group, 0) for group in images]
     if means[1].any():
@@ -60,11 +63,20 @@ def test_directionalarea_is_as_dark_as_under_volpath(blobs):
     assert check_against_volpath(blobs, {"light": emitter("directionalarea")}, "directionalarea") == 0
 
 
+def mixed() -> dict:
+    return {kind: emitter(kind) for kind in ("spot", "area", "constant")}
+
+
+@pytest.fixture(scope="module")
+def mixed_by_volpath(blobs):
+    """Function that returns the pictures by volpath of the mixed lights, rendered once."""
+    return cache(lambda: by_volpath(blobs, mixed()))
+
+
 @pytest.mark.parametrize("options", [{}, {"light_samples": 3}])
-def test_several_at_once(blobs, options):
+def test_several_at_once(blobs, mixed_by_volpath, options):
     """A scene that mixes rows with drawn lights, summed and sampled."""
-    mixed = {kind: emitter(kind) for kind in ("spot", "area", "constant")}
-    check_against_volpath(blobs, mixed, "mixed", **options)
+    check_against_volpath(blobs, mixed(), "mixed", mixed_by_volpath(), **options)
 
 
 def identity() -> Frame:
