@@ -14,6 +14,7 @@ from mi_ntf.render.maps import building
 from mi_ntf.render.scene.media import find_media
 from mi_ntf.render.transport import camera_light, composition, effects, walk
 
+COARSE = {"resolution": 96}
 EYE = [scenes.SIMILARITY.center[0] + 1.2, scenes.SIMILARITY.center[1] + 1.5, scenes.SIMILARITY.center[2] + 5]
 """The pinhole of `scenes.scene`."""
 
@@ -90,7 +91,7 @@ def test_no_shapes_no_rays(blobs, monkeypatch):
 def test_diffuse_field_has_no_specular_lobe(tmp_path, monkeypatch):
     """A lobe of 1/1000 is left out: the image stays, and the kernel is shorter."""
     path = scenes.write_blobs(tmp_path, log_density=3.0, specular=1e-3, roughness=0.9)
-    scene = scenes.scene(path, nrf(), {"light": scenes.light("point")}, size=24, spp=16)
+    scene = scenes.scene(path, nrf(), {"light": scenes.light("point")}, size=24, spp=16, medium=COARSE)
     with monkeypatch.context() as general:
         general.setattr(effects, "MIN_GLOSS", 0.0)
         with_lobe, count = scenes.render(scene), operations(scene)
@@ -107,7 +108,8 @@ def test_fresnel_effect_is_that_of_fields_trained_with_it(tmp_path, monkeypatch)
     """Other fields do not evaluate it, however rough they are."""
     paths = (scenes.write_blobs(tmp_path / str(rim), log_density=3.0, specular=0.041 if rim else 1e-3, roughness=0.99,
                                 fresnel=rim) for rim in (False, True))
-    faint, scene = (scenes.scene(p, nrf(), {"light": scenes.light("point")}, size=24, spp=16) for p in paths)
+    faint, scene = (scenes.scene(p, nrf(), {"light": scenes.light("point")}, size=24, spp=16, medium=COARSE)
+                    for p in paths)
     assert not described(faint).specular and not described(faint).fresnel
     assert described(scene).specular and described(scene).fresnel
     with monkeypatch.context() as before:

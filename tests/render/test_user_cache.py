@@ -67,6 +67,12 @@ def test_a_field_is_baked_once(path, bakes, cache):
     assert len(bakes) == 2 and len(list((cache / "fields").iterdir())) == 2
 
 
+def test_one_file_is_one_field_however_its_path_is_written(path, bakes):
+    """As Mitsuba finds a file that a scene names, and as a program names it."""
+    assert loaded.load(f"{path.parent}/./{path.name}", 32) is loaded.load(str(path), 32)
+    assert len(bakes) == 1
+
+
 @pytest.mark.parametrize("damage", ["cut", "flipped", "zeros", "another program's"])
 def test_a_damaged_entry_is_made_anew(path, bakes, cache, damage):
     first = loaded.load(str(path), 48)

@@ -194,6 +194,7 @@ def load(path: str, resolution: int | None) -> LoadedField | VolumeField:
 
     The result is cached by path, the file's identity and time, resolution and variant.
     """
+    path = str(Path(path))  # Mitsuba finds files of a scene as "folder/./name"
     stat = Path(path).stat() if Path(path).is_file() else None
     _begin_other_media(str(mi.variant()))
     with _one_at_a_time:
