@@ -19,7 +19,7 @@ import tyro
 from tyro.conf import FlagCreatePairsOff
 
 from mi_ntf import __version__
-from mi_ntf.commands import analysis, fields, machine, scenes, usage
+from mi_ntf.commands import analysis, fields, machine, refining, scenes, usage
 from mi_ntf.commands.options import UsageError
 from mi_ntf.core import errors, interruption, progress
 
@@ -33,8 +33,8 @@ class Command(Protocol):
 
 GROUPS: dict[str, dict[str, type[Command]]] = {
     "From an object to a field": {
-        "capture": fields.Capture, "inspect": fields.Inspect, "train": fields.Train, "info": fields.Info,
-        "import": fields.Import, "swap": scenes.Swap, "export": fields.Export},
+        "capture": fields.Capture, "inspect": fields.Inspect, "train": fields.Train, "refine": refining.Refine,
+        "info": fields.Info, "import": fields.Import, "swap": scenes.Swap, "export": fields.Export},
     "Pictures": {
         "render": scenes.Render, "view": scenes.View, "sequence": scenes.RenderSequence, "bake": scenes.Bake},
     "Accuracy and time": {

@@ -31,6 +31,7 @@ MAY_IMPORT = {
     "evaluate": {"core", "jobs", "infer", "render", "data", "evaluate", "sequence"},
     "sequence": {"core", "jobs", "infer", "render", "sequence"},
     "view": {"core", "infer", "render", "evaluate", "view"},
+    "refine": {"core", "infer", "render", "data", "refine"},
 }
 """Which folders of the package a folder may import."""
 
@@ -48,6 +49,7 @@ FORBIDDEN = {
     # Metrics that live in PyTorch are offered where it is installed.
     "evaluate": set(),
     "view": TORCH,
+    "refine": TORCH,
 }
 """Third parties that a folder must not import, not even inside a function."""
 

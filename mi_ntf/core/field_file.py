@@ -15,6 +15,10 @@ from .ops import Tensors
 
 _BAKED = "baked."
 """Prefix of the names of arrays that were baked from the tensors (:func:`add_baked`), and their key in the metadata."""
+_REFINED = "refined."
+"""Prefix of the names of arrays that refine the reflectance (:func:`add_refinement`)."""
+REFINED_CHANNELS = {"albedo": 3, "roughness": 1, "specular": 3}
+"""Channels of a refinement by quantity, in their order; there is the albedo alone, or there are all."""
 _LARGEST = 1e36
 """Upper bound of a network's sums, below which no order of summation overflows single precision."""
 
@@ -31,12 +35,15 @@ def save(path: str | Path, header: Header, tensors: Tensors, dtype: type = np.fl
 
 def rounded(tensors: Tensors, dtype: type = np.float16) -> Tensors:
     """Return `tensors` in the number formats in which :func:`save` stores them."""
-    return {k: np.ascontiguousarray(v, _fitting(v, dtype) if ".planes." in k else np.float32)
-            for k, v in tensors.items()}
+    return {k: np.ascontiguousarray(v, _fitting(v, dtype) if ".planes." in k else
+                                    v.dtype if k.startswith(_REFINED) else np.float32) for k, v in tensors.items()}
 
 
 def load(path: str | Path) -> tuple[Header, Tensors]:
-    """Read header and float32 tensors; raise one MiNtfError that names every mismatch with the header's skeleton."""
+    """Read header and tensors; raise one MiNtfError that names every mismatch with the header's skeleton.
+
+    Tensors of networks are float32. The arrays of a refinement, if any, are among the tensors (:func:`refinement`).
+    """
     header = load_header(path)
     if isinstance(header, voxels.Voxels):
         raise MiNtfError(f"{path} is a field of voxels, which has no networks; give a file of `mi-ntf train`")
@@ -46,7 +53,35 @@ def load(path: str | Path) -> tuple[Header, Tensors]:
     except (safetensors.SafetensorError, TypeError, AttributeError) as error:  # the last two: types that NumPy lacks
         raise MiNtfError(f"{path} is no field file ({str(error)[:200]}); make it anew with `mi-ntf train`") from None
     _check(str(path), header, tensors)
-    return header, {k: v.astype(np.float32) for k, v in tensors.items()}
+    return header, {k: v if k.startswith(_REFINED) else v.astype(np.float32) for k, v in tensors.items()}
+
+
+def refinement(tensors: Tensors) -> Tensors:
+    """Return the arrays of the refinement among the tensors of a field, by their names in its bricks; {} if none."""
+    return {k.removeprefix(_REFINED): v for k, v in tensors.items() if k.startswith(_REFINED)}
+
+
+def add_refinement(path: str | Path, output: str | Path, arrays: Tensors, record: Json) -> None:
+    """Write the field file `path` as `output` with a refinement, in place of any older one.
+
+    Parameters
+    ----------
+    path, output
+        Field files, which may be the same.
+    arrays
+        Differences of the reflectance from the networks' own, the arrays of a :class:`mi_ntf.infer.bricks.Bricks` with
+        the channels of ``REFINED_CHANNELS``.
+    record
+        Entry ``refined`` of the provenance.
+    """
+    header, _ = load(path)
+    with safetensors.safe_open(path, "np") as file:
+        data = {k: file.get_tensor(k) for k in file.keys() if not k.startswith((_BAKED, _REFINED))}
+    data |= {_REFINED + k: np.ascontiguousarray(v) for k, v in arrays.items()}
+    _check(str(output), header, data)
+    described = header.to_json()
+    described["provenance"] = described["provenance"] | {"refined": record}
+    files.write(output, safetensors.numpy.save(data, metadata={KEY: json.dumps(described)}))
 
 
 def add_baked(path: str | Path, arrays: Tensors, stamp: str) -> None:
@@ -146,7 +181,11 @@ def _number(data: object, *keys: str) -> float | None:
 def _check(source: str, header: Header, tensors: Tensors) -> None:
     skeleton = header.architecture.skeleton()
     faults = [f"missing tensor {k}" for k in skeleton if k not in tensors]
-    faults += [f"unknown tensor {k[:80]}" for k in tensors if k not in skeleton]
+    faults += [f"unknown tensor {k[:80]}" for k in tensors if k not in skeleton and not k.startswith(_REFINED)]
+    refined = refinement(tensors)
+    if refined:
+        counts = np.cumsum(list(REFINED_CHANNELS.values())).tolist()
+        faults += voxels.brick_faults(_REFINED.removesuffix("."), refined, (counts[0], counts[-1]))
     for name, shape in skeleton.items():
         if name not in tensors:
             continue

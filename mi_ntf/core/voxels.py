@@ -176,18 +176,24 @@ def check(source: str, header: Voxels, arrays: Tensors) -> None:
     faults += [f"unknown array {name[:80]}" for name in arrays if name not in expected]
     if not faults:
         for part, (counts, channels) in parts.items():
-            faults += _faults(part, {name: arrays[f"{part}.{name}"] for name in ARRAYS}, max(counts), channels)
+            faults += brick_faults(part, {name: arrays[f"{part}.{name}"] for name in ARRAYS}, channels, max(counts))
     if faults:
         raise MiNtfError(f"{source} does not match its header: {'; '.join(faults[:4])}; "
                          "make it anew with `mi-ntf import`")
 
 
-def _faults(part: str, arrays: Tensors, resolution: int, channels: Iterable[int]) -> list[str]:
-    """Return what is wrong with the arrays of one set of bricks, as far as their forms and ranges go."""
+def brick_faults(part: str, arrays: Tensors, channels: Iterable[int], resolution: int | None = None) -> list[str]:
+    """Return what is wrong with the `arrays` of one set of bricks called `part`, as far as their forms and ranges go.
+
+    `channels` are the legal numbers of channels. None: any `resolution` of 2 or more is legal.
+    """
+    if set(arrays) != set(ARRAYS):
+        return [f"its arrays {part} are {', '.join(sorted(arrays))[:80]}, expected {', '.join(ARRAYS)}"]
     size, ranges, stored = arrays["resolution"], arrays["range"], arrays["words"]
     faults = []
-    if size.shape != (1,) or not np.issubdtype(size.dtype, np.integer) or int(size[0]) != resolution:
-        faults.append(f"{part}.resolution is {shown(size.tolist())}, expected [{resolution}]")
+    whole = size.shape == (1,) and np.issubdtype(size.dtype, np.integer)
+    if not whole or not (size[0] == resolution if resolution else 2 <= size[0] <= MAX_SIDE):
+        faults.append(f"{part}.resolution is {shown(size.tolist())}, expected [{resolution or f'2 to {MAX_SIDE}'}]")
     if ranges.ndim != 2 or ranges.shape not in [(2, n) for n in channels] or stored.ndim != 5:
         faults.append(f"{part}.range has the shape {ranges.shape}, expected 2 × {' or '.join(map(str, channels))}")
     elif not np.issubdtype(ranges.dtype, np.floating) or not (np.abs(ranges.astype(np.float64)) < 1e30).all():

@@ -60,8 +60,8 @@ Offset = tuple[float, float, float]
 
 
 def load_dataset(folder: Path, say: Say = print, *, size: int | None = None, masks: Path | None = None,
-                 background: str | None = None, flash_offset: Offset | Literal["estimate"] | None = None
-                 ) -> dict[str, Split]:
+                 background: str | None = None, flash_offset: Offset | Literal["estimate"] | None = None,
+                 flash: bool = True) -> dict[str, Split]:
     """Return the splits `train`, `val` and `test` with all their images, in one similarity.
 
     Parameters
@@ -79,6 +79,8 @@ def load_dataset(folder: Path, say: Say = print, *, size: int | None = None, mas
     flash_offset : tuple of float or "estimate", optional
         Place of the flash (right, up, forward) from the lens in the data set's lengths, if it has no `pl_pos`. With
         "estimate" the lens is its place until training has found another.
+    flash : bool
+        False: the caller knows the light. Lights that the data set does not have are not estimated.
 
     Raises
     ------
@@ -98,16 +100,16 @@ def load_dataset(folder: Path, say: Say = print, *, size: int | None = None, mas
         for note in [*notes, *data.notes, *(PREFIX + text for text in [*data.assumed, *assumed])]:
             say(note)
         return _load(folder, data, split_off(views, say), say, size, background == "black",
-                     _flash_note(offset, estimate, views["train"][0]))
+                     flash, _flash_note(offset, estimate, views["train"][0]) if flash else None)
     except MiNtfError as error:
         raise MiNtfError(f"{error} (read as {name})") from error
 
 
-def _load(folder: Path, data: DataSet, views: Views, say: Say, size: int | None, black: bool, flash: str | None
-          ) -> dict[str, Split]:
+def _load(folder: Path, data: DataSet, views: Views, say: Say, size: int | None, black: bool, flash: bool,
+          note: str | None) -> dict[str, Split]:
     """Return the splits of `views` with their images and everything that the data set leaves open.
 
-    `flash` is a note on the place of the flash.
+    `flash`: estimate the intensity of a flash where the data set has none; `note` is a note on its place.
     """
     _check_lights(every(views))
     poses.check_views(views["train"], None if data.sphere is None else data.sphere[0])
@@ -131,10 +133,10 @@ def _load(folder: Path, data: DataSet, views: Views, say: Say, size: int | None,
     lights = {name: np.stack([v.c2w[:3, 3] if v.light_pos is None else v.light_pos for v in split]).astype(np.float32)
               for name, split in views.items()}
     first = views["train"][0]
-    if flash:
-        say(flash)
-    calibrated, estimate = first.light_intensity is not None, 0.0
-    if not calibrated:
+    if note:
+        say(note)
+    calibrated, estimate = first.light_intensity is not None, 1.0
+    if not calibrated and flash:
         estimate = estimates.find_intensity(loaded["train"].images, lights["train"], center, radius)
         say(f"no light intensity given ('pl_intensity'): {estimate:.4g} W/sr estimated, so that bright surfaces have "
             f"albedo {estimates.ALBEDO}; photographs determine intensity times albedo alone")

@@ -22,10 +22,12 @@ from ..core.architecture import (
     Header,
 )
 from ..core.errors import MiNtfError
+from ..core.field_file import refinement
 from ..core.microfacet import MIN_ROUGHNESS
 from ..core.ops import Tensors, normalize
 from ..core.reference import PLANES
 from . import ops
+from .refined import Refinement
 from .types import Array, Float, Mask, Reflected, Vector
 
 Profile: TypeAlias = Callable[[Vector, Vector], tuple[list[Float], Float]]
@@ -83,6 +85,8 @@ class NetworkField:
         """Tail of the specular lobe (:mod:`mi_ntf.core.microfacet`), None for GGX."""
         self.quick = arch.reflectance.encoding.kind == "planes"
         """True if a reflectance costs no more than a few fetches."""
+        refined = refinement(tensors)
+        self._refinement = Refinement(refined, dj) if refined else None
 
     def tensors(self) -> dict[str, Array]:
         """Return the planes and the packed weights of the density and reflectance networks, by name."""
@@ -104,6 +108,11 @@ class NetworkField:
 
     def reflectance(self, p: Vector) -> Reflected:
         """Return normal, albedo, roughness and specular weight at `p`; of smoke 0, its albedo, 1 and 0."""
+        reflected = self.learned_reflectance(p)
+        return self._refinement.apply(reflected, p) if self._refinement else reflected
+
+    def learned_reflectance(self, p: Vector) -> Reflected:
+        """Return the reflectance of the networks alone, without a refinement."""
         raw = self._reflectance.layers(self._reflectance.encode(p))
         if self._smoke:
             zero, one = dr.zeros(type(raw[3]), dr.width(raw[3])), dr.ones(type(raw[3]), dr.width(raw[3]))

@@ -12,13 +12,12 @@ import numpy as np
 
 from ..core.architecture import LOG_FLOOR
 from ..core.microfacet import MIN_ROUGHNESS
-from ..core.ops import normalize
-from . import ops
 from .bake import REFLECTANCE_RESOLUTION
 from .blocks import VOXELS, Blocks
 from .bricks import NUMBER, OCTANTS, SIDE, any_between, bricks_per_side, octants_with_matter
 from .grid import GridField, PlacedVoxels
 from .network import LOG_MIN_DENSITY, NOTHING, coloured
+from .refined import changed
 from .types import Float, Reflected, Vector
 from .volume import FAINTEST, SPECULAR, VoxelVolume, hull_of
 
@@ -61,16 +60,7 @@ class Corrections:
         """Return `reflected`, the field's own reflectance at `p`, with the changes."""
         place = self.lattice.voxels(p)
         change = {name: self.lattice.blocks.at(values, CHANNELS[name], place) for name, values in self.values.items()}
-        normal, albedo, roughness, specular = reflected
-        if "normal" in change:
-            normal = normalize(ops, tuple(a + b for a, b in zip(normal, change["normal"], strict=True)))
-        if "albedo" in change:
-            albedo = tuple(a + b for a, b in zip(albedo, change["albedo"], strict=True))
-        if "roughness" in change:
-            roughness = dr.clip(roughness + change["roughness"][0], MIN_ROUGHNESS, 1)
-        if "specular" in change:
-            specular = tuple(dr.clip(a + b, 0, 1) for a, b in zip(specular, change["specular"], strict=True))
-        return normal, albedo, roughness, specular
+        return changed(reflected, change)
 
 
 class VoxelParameters:

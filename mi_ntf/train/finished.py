@@ -33,7 +33,11 @@ class FinishedField:
     @classmethod
     def load(cls, path: Path, further: bool = False) -> "FinishedField":
         """Read the field file `path`. Raises MiNtfError."""
-        return cls(path, *field_file.load(path), further)
+        header, tensors = field_file.load(path)
+        if field_file.refinement(tensors):
+            raise MiNtfError(f"{path} was refined with `mi-ntf refine`, which training would undo; train the field "
+                             "that it was made of, and refine the result again")
+        return cls(path, header, tensors, further)
 
     @property
     def steps(self) -> int:

@@ -221,6 +221,13 @@ def medium_class(phase_class: type) -> type:
                     emitter.follow()
 
         @property
+        def parameters(self) -> FieldParameters:
+            """Density and reflectance at voxels."""
+            if self._parameters is None:
+                self._parameters = FieldParameters(self._read)
+            return self._parameters
+
+        @property
         def attached(self) -> Sequence[str]:
             """Names of the field's parameters that carry gradients."""
             return self._parameters.attached() if self._parameters else ()

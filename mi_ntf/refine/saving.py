@@ -1,0 +1,71 @@
+"""Writing a field whose voxels were refined."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ..core import field_file
+from ..core import voxels as voxel_file
+from ..core.field_file import REFINED_CHANNELS
+from ..core.json_values import Json
+from ..infer.bricks import SIDE
+from ..infer.refined import packed
+from ..infer.volume import VoxelVolume
+from ..infer.voxel_parameters import CHANNELS
+from .subject import Subject
+
+INVISIBLE = 1e-3
+"""Difference of a reflectance up to which a voxel counts as unchanged."""
+
+
+def save(subject: Subject, output: Path, record: Json) -> None:
+    """Write the field of `subject` with its present reflectance.
+
+    A trained field keeps its networks, and gets the differences at voxels (:mod:`mi_ntf.infer.refined`). A field of
+    voxels gets other voxels. `record` is the entry ``refined`` of the provenance.
+    """
+    if isinstance(subject.medium.field.grid, VoxelVolume):
+        _save_voxels(subject, output, record)
+    else:
+        _save_trained(subject, output, record)
+
+
+def _save_trained(subject: Subject, output: Path, record: Json) -> None:
+    lattice = subject.lattice
+    network = subject.medium.field.network
+    _, albedo, roughness, specular = network.learned_reflectance(lattice.centres())
+    learned = {"albedo": albedo, "roughness": (roughness,), "specular": specular}
+    parts = []
+    for name, count in REFINED_CHANNELS.items():
+        if subject.has(name):
+            own = np.stack([np.array(v) for v in learned[name]], -1)
+            parts.append(_voxels(subject, name, count) - own.reshape(-1, SIDE, SIDE, SIDE, count))
+    if all(np.abs(part).max(initial=0.0) <= INVISIBLE for part in parts[1:]):
+        parts = parts[:1]
+    values = np.concatenate(parts, -1)
+    arrays = packed(values, lattice.blocks.places, int(max(lattice.counts)), (np.abs(values) > INVISIBLE).any(-1))
+    field_file.add_refinement(subject.medium.path, output, arrays, record)
+
+
+def _save_voxels(subject: Subject, output: Path, record: Json) -> None:
+    path = subject.medium.path
+    header = field_file.load_header(path)
+    assert isinstance(header, voxel_file.Voxels)
+    arrays = voxel_file.load(path, header)
+    density = {name: arrays[f"density.{name}"] for name in voxel_file.ARRAYS}
+    # The reflectance of a surface, or the colour of smoke.
+    channels = CHANNELS if subject.has("normal") else {"emission" if header.emissive else "albedo": 3}
+    values = np.concatenate([_voxels(subject, name, count) for name, count in channels.items()], -1)
+    lattice = subject.lattice
+    reflectance = packed(values, lattice.blocks.places, int(max(lattice.counts)), np.ones(values.shape[:-1], bool))
+    changed = replace(header, reflectance_counts=header.reflectance_counts or header.counts,
+                      provenance=header.provenance | {"refined": record})
+    voxel_file.save(output, changed, density, reflectance)
+
+
+def _voxels(subject: Subject, name: str, channels: int) -> np.ndarray:
+    values: np.ndarray = np.array(subject.get(name)).reshape(-1, SIDE, SIDE, SIDE, channels)
+    return values
