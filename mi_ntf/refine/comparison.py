@@ -11,8 +11,8 @@ from .gains import products
 from .photographs import Camera, Photographs
 from .subject import Subject
 
-SHOWN, SHOWN_SIZE, SHOWN_SPP = 3, 128, 4
-"""Number of photographs, their longer side in pixels, and samples per pixel of each of two pictures."""
+SHOWN, SHOWN_SIZE, SHOWN_RAYS = 3, 128, 1 << 16
+"""Number of photographs, their longer side in pixels, and camera rays of each of two pictures."""
 
 
 class Comparison(NamedTuple):
@@ -34,11 +34,12 @@ def compare(subject: Subject, held: Photographs, gains: bool) -> list[Comparison
     shrink = max(1, -(-max(held.height, held.width) // SHOWN_SIZE))
     shape = held.height // shrink, held.width // shrink
     camera, result = Camera(shape[1], shape[0]), []
+    spp = max(1, SHOWN_RAYS // (shape[0] * shape[1]))
     for view in np.unique(np.linspace(0, held.views - 1, SHOWN).round().astype(int)).tolist():
         held.aim(camera, view, shrink=shrink)
         subject.light(held, view)
         target, weight = held.part(view, (0, 0), shape, shrink)
-        one, other = (subject.render(camera.sensor, 2 * view + k, SHOWN_SPP).numpy() for k in range(2))
+        one, other = (subject.render(camera.sensor, 2 * view + k, spp).numpy() for k in range(2))
         sums = products(one, other, target, weight)
         seen = weight > 0
         factor = seen * (sums[0] / np.maximum(sums[1], 1e-30) if gains else np.ones(3)).astype(np.float32)

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -40,7 +41,9 @@ class Camera:
             Focal length and principal point (2,) in pixels of this film, from its top left corner.
         """
         parameters = self._parameters
-        parameters["to_world"] = mi.Transform4f(mi.Matrix4f(mitsuba_to_opengl(c2w).tolist()))
+        matrix = mi.Matrix4f(mitsuba_to_opengl(c2w).tolist())
+        dr.make_opaque(matrix)  # so that no place is compiled into a kernel
+        parameters["to_world"] = mi.Transform4f(matrix)
         parameters["x_fov"] = float(np.degrees(2 * np.arctan(0.5 * self.width / focal)))
         parameters["principal_point_offset_x"] = float(0.5 - principal[0] / self.width)
         parameters["principal_point_offset_y"] = float(0.5 - principal[1] / self.height)

@@ -16,6 +16,7 @@ from ..core.errors import MiNtfError
 from ..core.json_values import Json
 from ..data.readers import load_dataset
 from ..data.schema import Split, fingerprint
+from ..infer.types import Array, Float
 from ..render.scene.environment_option import Environment
 from . import checkpoint, page, saving
 from .comparison import Comparison, compare, difference
@@ -26,8 +27,8 @@ from .voxels import Voxels
 
 TILE = 64
 """Side of the parts of photographs that steps compare, in pixels."""
-SPP, SPP_GRADIENT = 2, 1
-"""Samples per pixel of each of the two pictures that are compared, and of the one that is differentiated."""
+RAYS, GRADIENT_RAYS = 1 << 14, 1 << 12
+"""Camera rays of the picture that is compared, and of the one that is differentiated."""
 DARK = 0.05
 """Brightness, relative to the bright parts of the photographs, below which errors count absolutely."""
 INTERVAL = 50.0
@@ -89,9 +90,10 @@ def refine(scene: Path, dataset: Path, output: Path, *, parameters: tuple[str, .
     -----
     A checkpoint ``OUTPUT.ckpt`` is written every minute. The same command continues it, and it is deleted at the end.
 
-    A step compares two independent pictures A and B with the photograph t, whose product (A − t)(B − t) has the
-    expected value of the squared error without their noise. A third one is differentiated at `max_depth` 2. Light of
-    more bounces is in A and B alone, so its own derivative is left out, which changes the way and not the end.
+    A step compares a picture A with the photograph t, and differentiates another picture B, so that the product of
+    error and derivative has no bias. The product (A − t)(B − t) has the expected value of the squared error without its
+    noise. A picture with the parameters at 0 tells how much of A is their light. Light that was scattered more than
+    once is in A, and has no derivative. That changes the way, not the end.
     """
     if minutes is not None and steps is not None:
         raise MiNtfError(f"both --minutes {minutes:g} and --steps {steps} are given; a run is limited by one of them")
@@ -182,7 +184,7 @@ class Run:
     def _finish(self, original: dict[str, mi.TensorXf], before: list[Comparison], after: list[Comparison]) -> Refined:
         """Write field and page, delete the checkpoint, and return the figures."""
         errors = [difference(pictures) for pictures in (before, after)]
-        kept = errors[1] < errors[0]
+        kept = errors[1] <= errors[0]
         if not kept:
             self._subject.set(original)
         gains = {}
@@ -202,30 +204,33 @@ class Run:
         rng = np.random.default_rng([self._seed, self.step])
         view = int(rng.integers(self._pool.views))
         corner = self._aim(view, rng)
-        self._subject.set({name: voxels.tensor() for name, voxels in self._voxels.items()})
         target, weight = self._pool.part(view, corner, (self._side, self._side))
-        one, other = (self._render(3 * self.step + k, SPP) for k in range(2))
+        self._subject.set({name: 0 * voxels.tensor() for name, voxels in self._voxels.items()})
+        without = self._render(3 * self.step)
+        self._subject.set({name: voxels.attach() for name, voxels in self._voxels.items()})
+        one = self._render(3 * self.step)
+        seed = self._seeded(3 * self.step + 1)
+        direct = self._subject.render_direct(self._camera.sensor, seed, max(1, GRADIENT_RAYS // self._side**2))
+        other = self._render(3 * self.step + 2) if self._subject.bounces else direct.numpy()
         self._gains.add(view, products(one, other, target, weight))
         gain = self._gains.all()[view].astype(np.float32)
-        errors = [gain * picture - target for picture in (one, other)]
-        self._sums = AVERAGE * self._sums + [(weight * errors[0] * errors[1]).sum(), (weight * target**2).sum()]
-        weight = weight / (self._exposure * np.maximum(target, 0) + DARK)
-        error, light = (gain * weight * value for value in ((errors[0] + errors[1]) / 2, gain * (one + other) / 2))
-        projections = [self._back_projected(each) for each in (error, light)]
-        rate = min(2 - 2 * self.progress, 1.0)
+        error = gain * one - target
+        self._sums = AVERAGE * self._sums + [(weight * error * (gain * other - target)).sum(),
+                                             (weight * target**2).sum()]
+        weight = gain * weight / (self._exposure * np.maximum(target, 0) + DARK)
+        light = gain * np.maximum(one - without, 0)
+        projections = [self._back_projected(direct, weight * each) for each in (error, light)]
+        rate = max(min(2 - 2 * self.progress, 1.0), 0.0)
         for name, voxels in self._voxels.items():
-            voxels.step(projections[0][name], projections[1][name], max(rate, 0.0))
+            voxels.step(projections[0][name], projections[1][name], rate)
         self.step += 1
         self.trace.append((self.step, math.sqrt(max(self._sums[0], 0) / max(self._sums[1], 1e-30))))
 
-    def _back_projected(self, values: np.ndarray) -> dict[str, mi.Float]:
-        """Return Jᵀ `values` (h, w, 3) by parameter, J being the derivative of the picture that was aimed at last."""
-        self._subject.set({name: voxels.attach() for name, voxels in self._voxels.items()})
-        # The same samples for all values of a step.
-        picture = self._subject.render_direct(self._camera.sensor, self._seeded(3 * self.step + 2), SPP_GRADIENT)
+    def _back_projected(self, picture: Array, values: np.ndarray) -> dict[str, Float]:
+        """Return Jᵀ `values` (h, w, 3) by parameter, J being the derivative of `picture`."""
         dr.set_grad(picture, mi.TensorXf(np.ascontiguousarray(values, np.float32)))
         dr.enqueue(dr.ADMode.Backward, picture)
-        dr.traverse(dr.ADMode.Backward)
+        dr.traverse(dr.ADMode.Backward, dr.ADFlag.ClearVertices)  # the edges are needed again
         return {name: voxels.projected() for name, voxels in self._voxels.items()}
 
     def _aim(self, view: int, rng: np.random.Generator) -> tuple[int, int]:
@@ -243,11 +248,12 @@ class Run:
         """Compare a part of a photograph for its gain alone."""
         corner = self._aim(view, np.random.default_rng([self._seed, view, 1]))
         target, weight = self._pool.part(view, corner, (self._side, self._side))
-        one, other = (self._render(-2 * view - k - 1, SPP) for k in range(2))
+        one, other = (self._render(-2 * view - k - 1) for k in range(2))
         self._gains.add(view, products(one, other, target, weight))
 
-    def _render(self, number: int, spp: int) -> np.ndarray:
-        picture: np.ndarray = self._subject.render(self._camera.sensor, self._seeded(number), spp).numpy()
+    def _render(self, number: int) -> np.ndarray:
+        picture: np.ndarray = self._subject.render(self._camera.sensor, self._seeded(number),
+                                                  max(1, RAYS // self._side**2)).numpy()
         return picture
 
     def _seeded(self, number: int) -> int:

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -45,6 +46,8 @@ class Subject:
         True if the light is that of the photographs' flash.
     medium
         The field's medium.
+    bounces
+        True if the scene's `max_depth` has light that is scattered more than once.
     """
 
     def __init__(self, path: Path, defined: dict[str, str], environment: Environment) -> None:
@@ -67,8 +70,8 @@ class Subject:
                              '<integrator type="nrf"/>')
         settings = _settings(context.settings, self._scene.environment() is not None)
         self._full: Any = _integrator(settings)
-        depth = settings.max_depth
-        self._direct: Any = _integrator(replace(settings, max_depth=depth if 0 <= depth <= 2 else 2))
+        self.bounces = not 0 <= settings.max_depth <= 2
+        self._direct: Any = _integrator(replace(settings, max_depth=2)) if self.bounces else self._full
 
     @property
     def solid(self) -> bool:
@@ -110,8 +113,10 @@ class Subject:
     def light(self, photographs: Photographs, view: int) -> None:
         """Move the flash to that of a photograph, if it is the light."""
         if self.flash:
-            self._parameters["lamp.position"] = mi.Point3f(photographs.lamp[view].tolist())
-            self._parameters["lamp.intensity.value"] = mi.Color3f(photographs.intensity[view].tolist())
+            place: Array = mi.Point3f(photographs.lamp[view].tolist())
+            intensity: Array = mi.Color3f(photographs.intensity[view].tolist())
+            dr.make_opaque(place, intensity)  # so that they are not compiled into kernels
+            self._parameters["lamp.position"], self._parameters["lamp.intensity.value"] = place, intensity
             self._parameters.update()
 
     def render(self, sensor: mi.Sensor, seed: int, spp: int) -> Array:

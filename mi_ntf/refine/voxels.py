@@ -9,9 +9,9 @@ import numpy as np
 from ..infer.types import Array, Float
 from ..infer.voxel_parameters import Lattice
 
-MEMORY = 0.9
+MEMORY = 0.8
 """Decay of a voxel's accumulated light, each time that a photograph shows it."""
-PRIOR = 1.0
+PRIOR = 0.5
 """Weight of the field as it was, in photographs that show a voxel as well as the mean voxel is shown."""
 LARGEST = 0.3
 """Largest relative change by one step."""
@@ -24,7 +24,7 @@ HIGHEST = {"albedo": 1.0, "specular": 1.0, "emission": np.inf}
 class Voxels:
     """Values of one parameter at the voxels of a `lattice`.
 
-    A picture p is linear in the values a: p = J a. Errors e of pictures change the values by the factors
+    Their light in a picture is linear in the values a: p = J a. Errors e of pictures change the values by the factors
     1 − Jᵀ e / Σ Jᵀ p, as in the algebraic reconstruction of tomography (Andersen and Kak 1984). The sum over past
     pictures is the light that a voxel has contributed, so the mean of many noisy errors counts. Both back-projections
     are smoothed over neighbours, since a photograph shows each voxel by few samples.

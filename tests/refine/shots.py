@@ -17,8 +17,8 @@ from mi_ntf.render.scene.environment_option import Environment
 SIZE, ANGLE, RESOLUTION = 24, 0.7, 48
 FOCAL = schema.focal_length(ANGLE, SIZE)
 CENTER, RADIUS = np.array(scenes.SIMILARITY.center), scenes.SIMILARITY.radius
-SKY = np.full((8, 16, 3), 0.4, np.float32)
-SKY[1:4, 3:7] = [3.0, 2.5, 2.0]
+SKY = np.full((8, 16, 3), 0.8, np.float32)
+SKY[:4] = [1.6, 1.5, 1.4]
 MOVED = '<translate x="2" y="-1" z="0.5"/>'
 """Place of the field in the scene; photographs have the field's own coordinates."""
 
@@ -26,10 +26,10 @@ MOVED = '<translate x="2" y="-1" z="0.5"/>'
 def write_scene(folder: Path, field: Path, integrator="") -> Path:
     """A scene with the field under the sky."""
     mi.Bitmap(SKY).write(str(folder / "sky.exr"))
-    x, y, z = CENTER + [2, -1, 0.5]
+    x, y, z = CENTER + np.array([2, -1, 0.5])
     path = folder / f"{field.stem}.xml"
     path.write_text(f"""<scene version="3.9.0">
-        <integrator type="nrf">{integrator}<integer name="environment_lights" value="32"/></integrator>
+        <integrator type="nrf">{integrator}<integer name="environment_lights" value="16"/></integrator>
         <emitter type="envmap"><string name="filename" value="{folder / 'sky.exr'}"/></emitter>
         <shape type="sphere"><point name="center" x="{x}" y="{y}" z="{z}"/><float name="radius" value="{RADIUS}"/>
             <bsdf type="null"/>
@@ -62,11 +62,24 @@ def photograph(of: Subject, folder: Path, counts: dict[str, int], spp=64) -> Pat
 
 
 def with_patch(of: Subject, path: Path, factor=0.8) -> np.ndarray:
-    """Write the field with its albedo times `factor` on the right of a plane; return a mask of the voxels there."""
+    """Write the field with its albedo times `factor` on the left of a plane; return a mask of the voxels there."""
     x = np.array(of.lattice.centres()[0])
     values = of.get("albedo").numpy()
-    patch = (x > 0.1).reshape(values.shape[:4])
+    patch = (x < -0.3).reshape(values.shape[:4])
     of.set({"albedo": mi.TensorXf(np.where(patch[..., None], factor * values, values))})
     saving.save(of, path, {"made": "by a test"})
     of.set({"albedo": mi.TensorXf(values)})
     return patch
+
+
+def albedo(field: Path, folder: Path) -> np.ndarray:
+    """Albedo (n, 3) of the field in the pixels of the photographs for training that show matter alone."""
+    scene = mi.load_dict({"type": "scene", "light": {"type": "constant"},
+                          "integrator": scenes.nrf("none", aovs="albedo"),
+                          "ball": scenes.ball(field, resolution=RESOLUTION)})
+    camera, found = Camera(SIZE, SIZE), []
+    for frame in json.loads((folder / "transforms_train.json").read_text())["frames"]:
+        camera.place(np.array(frame["transform_matrix"]), FOCAL, np.full(2, SIZE / 2))
+        image = scene.integrator().render(scene, camera.sensor, 1, 16).numpy()
+        found.append(image[image[..., 3] > 0.95][:, 4:7])
+    return np.concatenate(found)
