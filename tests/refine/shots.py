@@ -43,18 +43,22 @@ def subject(path: Path) -> Subject:
     return Subject(path, {}, Environment())
 
 
-def photograph(of: Subject, folder: Path, counts: dict[str, int], spp=64) -> Path:
-    """Photographs of `counts` views by split, without a word on their light."""
+LAMP = (CENTER + RADIUS * np.array([1.5, 3.0, 2.0])).tolist()
+
+
+def photograph(of: Subject, folder: Path, counts: dict[str, int], spp=64, lamp=False) -> Path:
+    """Photographs of `counts` views by split, without a word on their light, or lit by a `lamp` of 40 W/sr."""
+    light = {"pl_pos": LAMP, "pl_intensity": [40.0] * 3} if lamp else {}
     rng, camera, to_scene = np.random.default_rng(4), Camera(SIZE, SIZE), of.to_scene()
     for split, count in counts.items():
         (folder / split).mkdir(parents=True)
         frames = []
         for i, direction in enumerate(view_directions(count, rng)):
             c2w = camera_to_world(CENTER + 3.4 * RADIUS * direction, CENTER)
-            camera.place(to_scene @ c2w, FOCAL, np.full(2, SIZE / 2))
+            camera.place(to_scene @ c2w, schema.focal_length(ANGLE, SIZE), np.full(2, SIZE / 2))
             image = of._full.render(of._scene, camera.sensor, 50 + i, spp).numpy()
             schema.write_exr(folder / split / f"{i}.exr", image)
-            frames.append({"file_path": f"{split}/{i}.exr", "transform_matrix": c2w.tolist()})
+            frames.append({"file_path": f"{split}/{i}.exr", "transform_matrix": c2w.tolist(), **light})
         (folder / f"transforms_{split}.json").write_text(json.dumps({
             "camera_angle_x": ANGLE, "w": SIZE, "h": SIZE, "frames": frames,
             "unit_sphere": {"center": CENTER.tolist(), "radius": RADIUS}}))

@@ -1,28 +1,33 @@
 """Fields that photographs refine, from the command to the file."""
 
-import json
+import dataclasses
 
 import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import scenes
+from helpers.variants import VARIANT
 from refine import shots
 
 import mi_ntf
-from mi_ntf.cli import main
-from mi_ntf.core import field_file, progress
+from mi_ntf.core import field_file, progress, voxels
 from mi_ntf.core.errors import MiNtfError
-from mi_ntf.data import schema
-from mi_ntf.refine import refine
-from mi_ntf.refine.gains import Gains
+from mi_ntf.data import grids, schema
+from mi_ntf.importing import of_grid
+from mi_ntf.infer.refined import Refinement, packed
+from mi_ntf.refine import refine, refining
+from mi_ntf.refine.gains import Gains, products
 from mi_ntf.refine.photographs import Camera
+
+
+@pytest.fixture(autouse=True)
+def few_rays(monkeypatch):
+    monkeypatch.setattr(refining, "RAYS", 1 << 12)
 
 
 @pytest.fixture(scope="module")
 def case(tmp_path_factory):
     """Scene of the field with the wrong patch, photographs of the right one, and both fields."""
-    from helpers.variants import VARIANT
-
     mi.set_variant(VARIANT)
     mi_ntf.register()
     folder = tmp_path_factory.mktemp("case")
@@ -37,14 +42,128 @@ def case(tmp_path_factory):
 def test_a_patch_is_found_again(case, tmp_path):
     """An albedo that is 20 % too dark in a half of the object comes back, and the other half stays."""
     scene, photographs, right, wrong = case
-    report = refine(scene, photographs, tmp_path / "out.safetensors", steps=30, gains=False)
+    report = refine(scene, photographs, tmp_path / "out.safetensors", steps=24, gains=False)
     true, before, after = (shots.albedo(f, photographs).mean(1) for f in (right, wrong, tmp_path / "out.safetensors"))
     patch, rest = before / true < 0.81, before / true > 0.999
     assert after[patch].sum() / true[patch].sum() == pytest.approx(1, abs=0.03)
     assert after[rest].sum() / true[rest].sum() == pytest.approx(1, abs=0.03)
     assert report.kept and report.after < 0.5 * report.before
     header, _ = field_file.load(tmp_path / "out.safetensors")
-    assert header.provenance["refined"]["steps"] == 30
+    assert header.provenance["refined"]["steps"] == 24
     page = (tmp_path / "out.html").read_text()
     assert "closer to the photographs" in page
     assert {p.suffix for p in tmp_path.iterdir()} == {".safetensors", ".html"}
+
+
+def test_an_interrupted_run_goes_on(case, tmp_path, monkeypatch):
+    """Ctrl-C leaves a checkpoint, from which the same command gets the same field; other commands are told."""
+    scene, photographs, *_ = case
+    out, update = tmp_path / "out.safetensors", progress.Stage.update
+
+    def press(stage, done, text=""):
+        if "step 2" in text:
+            raise KeyboardInterrupt
+        update(stage, done, text)
+
+    refine(scene, photographs, tmp_path / "whole.safetensors", steps=3, gains=False)
+    with monkeypatch.context() as patch:
+        patch.setattr(progress.Stage, "update", press)
+        with pytest.raises(KeyboardInterrupt):
+            refine(scene, photographs, out, steps=3, gains=False)
+    assert not out.exists() and out.with_suffix(".safetensors.ckpt").is_file()
+    with pytest.raises(MiNtfError, match="other seed; repeat that command"):
+        refine(scene, photographs, out, steps=3, gains=False, seed=1)
+    assert refine(scene, photographs, out, steps=3, gains=False).steps == 3
+    one, other = (field_file.load(path)[1] for path in (out, tmp_path / "whole.safetensors"))
+    np.testing.assert_array_equal(one["refined.index"], other["refined.index"])
+    np.testing.assert_allclose(one["refined.range"], other["refined.range"], rtol=1e-3)
+    assert not out.with_suffix(".safetensors.ckpt").exists()
+
+
+def test_smoke_of_voxels_under_the_flash(tmp_path, monkeypatch):
+    """A field file alone is lit by each photograph's flash; a field of voxels becomes one with other colours."""
+    monkeypatch.setattr(shots, "SIZE", 16)
+    density = np.ones((12, 12, 12), np.float32)
+    right, wrong = tmp_path / "right.safetensors", tmp_path / "wrong.safetensors"
+    bounds = shots.CENTER + shots.RADIUS * np.array([[-0.5] * 3, [0.5] * 3])
+    for path, albedo in ((right, 0.8), (wrong, 0.6)):
+        voxels.save(path, *of_grid(grids.Grid(2 * density, bounds), albedo))
+    subject = shots.subject(right)
+    subject._parameters["lamp.position"] = mi.Point3f(shots.LAMP)
+    subject._parameters["lamp.intensity.value"] = mi.Color3f(40.0)
+    subject._parameters.update()
+    photographs = shots.photograph(subject, tmp_path / "set", {"train": 3, "val": 1, "test": 1}, lamp=True)
+    report = refine(wrong, photographs, tmp_path / "out.safetensors", steps=8)
+    assert report.after < 0.3 * report.before and not report.gains
+    lit = shots.CENTER[None] + shots.RADIUS * np.array([[0.2, 0.42, 0.3]])
+    found = mi_ntf.Field.load(tmp_path / "out.safetensors").reflectance(lit).albedo
+    assert found == pytest.approx(np.full((1, 3), 0.8), abs=0.06)
+    header = field_file.load_header(tmp_path / "out.safetensors")
+    assert header.reflectance_counts == header.counts and header.provenance["refined"]["parameters"] == ["albedo"]
+
+
+def test_cameras_see_what_photographs_show():
+    """Rays of Mitsuba's camera are those of the data set's, also of a principal point beside the middle."""
+    c2w = np.eye(4)
+    c2w[:3, :3] = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+    c2w[:3, :3] *= np.sign(np.linalg.det(c2w[:3, :3]))
+    c2w[:3, 3] = 1, 2, 3
+    camera = Camera(20, 10)
+    camera.place(c2w, 30.0, np.array([4.0, 7.0]))
+    place = mi.Point2f((np.mgrid[:10, :20][::-1].reshape(2, -1) + 0.5) / [[20], [10]])
+    ray, _ = camera.sensor.sample_ray(0, 0, place, mi.Point2f(0.5))
+    _, expected = schema.pixel_rays(c2w, 30.0, 20, 10, np.array([4.0, 7.0]))
+    np.testing.assert_allclose(np.array(ray.d).T, expected.reshape(-1, 3), atol=1e-5)
+
+
+def test_differences_are_read_as_written():
+    """Values at voxels come back, and there is no difference where no block is, whatever the others' signs."""
+    from mi_ntf.infer.backend import module
+
+    dj, rng = module(VARIANT), np.random.default_rng(2)
+    values = np.zeros((2, 8, 8, 8, 7), np.float32)
+    values[0] = rng.uniform(-0.2, -0.1, (8, 8, 8, 7))
+    arrays = packed(values, np.array([[1, 2, 0], [2, 2, 0]]), 33)
+    voxel = np.array([[8, 16, 0], [11, 18, 3], [15, 23, 7], [28, 28, 28]])
+    p = [dj.Float(((voxel[:, k] + 0.5) / 33 * 2 - 1).astype(np.float32)) for k in range(3)]
+    one, half = dj.Float(np.ones(4, np.float32)), dj.Float(np.full(4, 0.5, np.float32))
+    _, albedo, roughness, specular = Refinement(arrays, dj).apply(((one,) * 3, (half,) * 3, half, (half,) * 3), p)
+    found = np.stack([np.array(v) for v in (*albedo, roughness, *specular)], 1) - 0.5
+    z, y, x = (voxel[:3, ::-1] % 8).T
+    np.testing.assert_allclose(found[:3], values[0, z, y, x], atol=1e-5)
+    np.testing.assert_allclose(found[3], 0, atol=1e-6)
+
+
+def test_gains_follow_the_photographs_and_keep_their_mean():
+    """Pictures that are half as bright as one of two photographs have another gain there, and no other mean."""
+    gains, picture = Gains(2, fixed=False), np.full((2, 2, 3), 0.5)
+    weight = np.ones((2, 2, 3))
+    for view, factor in enumerate((1.0, 2.0)):
+        gains.add(view, products(picture, picture, factor * picture, weight))
+    gains.settle()
+    np.testing.assert_allclose(gains.all(), [[1] * 3, [2] * 3])
+    for view, factor in enumerate((1.0, 2.0)):
+        for _ in range(60):
+            gains.add(view, products(2 * picture, 2 * picture, factor * picture, weight))
+    np.testing.assert_allclose(gains.all(), [[1] * 3, [2] * 3], rtol=1e-3)
+    assert (Gains(2, fixed=True).all() == 1).all()
+
+
+def test_what_does_not_fit_is_refused(case, tmp_path):
+    """Each sentence names the fault and the remedy."""
+    scene, photographs, _, wrong = case
+    out = tmp_path / "out.safetensors"
+    with pytest.raises(MiNtfError, match="'colour' cannot be refined; this field has albedo, specular"):
+        refine(scene, photographs, out, parameters=("colour",))
+    with pytest.raises(MiNtfError, match="--minutes is -1; it must be positive"):
+        refine(scene, photographs, out, minutes=-1)
+    stock = tmp_path / "stock.xml"
+    stock.write_text(scene.read_text().replace("<integrator type=\"nrf\">", "<integrator type=\"volpath\">").replace(
+        '<integer name="environment_lights" value="16"/>', ""))
+    with pytest.raises(MiNtfError, match="its integrator is no nrf"):
+        refine(stock, photographs, out)
+    header, tensors = field_file.load(wrong)
+    damaged = {name: value[:, :2] if name == "refined.range" else value for name, value in tensors.items()}
+    with pytest.raises(MiNtfError, match=r"refined.range has the shape \(2, 2\), expected 2 × 3 or 7"):
+        field_file.save(out, header, damaged)
+    assert dataclasses.asdict(header)["provenance"]["refined"] == {"made": "by a test"}
