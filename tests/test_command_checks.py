@@ -9,6 +9,7 @@ from mi_ntf import cli
 
 @pytest.mark.parametrize(("line", "name", "right"), [
     ("train d -o f.png", "f.png", ".safetensors"),
+    ("refine s.xml d -o f.png", "f.png", ".safetensors"),
     ("export f.safetensors -o m.png", "m.png", ".ply, .obj, .glb, .stl, .vol or .vdb"),
     ("swap s.xml f.safetensors -o n.exr", "n.exr", ".xml"),
     ("bake s.xml -o m.png", "m.png", ".exr"),
@@ -40,6 +41,7 @@ def test_a_finished_file_is_replaced_only_on_request(line, tmp_path, monkeypatch
     ("train d -o f.safetensors", "torch", "train"),
     ("train d -o f.safetensors --view", "viser", "view"),
     ("inspect d", "matplotlib", "train"),
+    ("refine s.xml d -o f.safetensors", "matplotlib", "train"),
     ("view s.xml", "viser", "view"),
     ("export f.safetensors -o m.ply", "trimesh", "mesh"),
     ("compare a.exr b.exr", "skimage", "eval"),

@@ -84,8 +84,8 @@ def packed(values: np.ndarray, places: np.ndarray, resolution: int, matter: np.n
         in_bricks, in_dense = (there, slice(None), *to), (there, *to)
         bricks[in_bricks] = np.moveaxis(values[slot[there]][:, z, y, x], -1, 1)
         dense[in_dense] = mask[slot[there]][:, z, y, x]
-    kept = dense.any((1, 2, 3))
-    arrays = pack(bricks[kept], inner[kept], octants_of(dense[kept]), resolution, 0.0)
+    occupied = dense.any((1, 2, 3))
+    arrays = pack(bricks[occupied], inner[occupied], octants_of(dense[occupied]), resolution, 0.0)
     low, step = arrays["range"]
     level = np.round(-low / step)  # of 0, which the empty brick holds where others are negative
     arrays["range"] = np.stack([-level * step, step]).astype(np.float32)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 def verdict(report: Refined) -> str:
     """Return a sentence on what the refinement has brought."""
     change = f"held-back photographs differ by {report.after:.1%} and differed by {report.before:.1%}"
-    if report.kept:
+    if report.improved:
         return f"the field is closer to the photographs: {change}"
     return f"the field is no closer to the photographs ({change}), so the file holds it as it was"
 
@@ -34,7 +34,7 @@ def write(output: Path, report: Refined, before: Sequence[Comparison], after: Se
           trace: Sequence[tuple[int, float]]) -> None:
     """Write the page beside the field file `output`. Differences are relative RMSE."""
     page = Page(output.name)
-    (page.text if report.kept else page.warning)(f"{verdict(report)}.".replace("the", "The", 1))
+    (page.text if report.improved else page.warning)(f"{verdict(report)}.".replace("the", "The", 1))
     page.table(["", ""], [["parameters", ", ".join(report.parameters)], ["photographs", report.photographs],
                           ["steps", report.steps], ["minutes", f"{report.seconds / 60:.1f}"],
                           ["difference before", f"{report.before:.2%}"], ["difference after", f"{report.after:.2%}"]])

@@ -48,7 +48,7 @@ class Refined:
     before: float
     after: float
     photographs: int
-    kept: bool = True
+    improved: bool = True
     """False: the result was no better, and the file holds the field as it was."""
     gains: dict[str, list[float]] = field(default_factory=dict)
 
@@ -184,15 +184,15 @@ class Run:
     def _finish(self, original: dict[str, mi.TensorXf], before: list[Comparison], after: list[Comparison]) -> Refined:
         """Write field and page, delete the checkpoint, and return the figures."""
         errors = [difference(pictures) for pictures in (before, after)]
-        kept = errors[1] <= errors[0]
-        if not kept:
+        improved = errors[1] <= errors[0]
+        if not improved:
             self._subject.set(original)
         gains = {}
         if self._with_gains:
             gains = {name: [round(float(g), 4) for g in row]
                      for name, row in zip(self._pool.names, self._gains.all(), strict=True)}
         report = Refined(str(self._output), list(self._voxels), self.step, round(self.seconds, 1), errors[0], errors[1],
-                         self._pool.views, kept, gains)
+                         self._pool.views, improved, gains)
         record: Json = {k: v for k, v in asdict(report).items() if k not in ("file", "gains")}
         saving.save(self._subject, self._output, record)
         page.write(self._output, report, before, after, self.trace)
@@ -219,18 +219,20 @@ class Run:
                                              (weight * target**2).sum()]
         weight = gain * weight / (self._exposure * np.maximum(target, 0) + DARK)
         light = gain * np.maximum(one - without, 0)
-        projections = [self._back_projected(direct, weight * each) for each in (error, light)]
+        # The graph of derivatives is needed twice.
+        projections = [self._back_projected(direct, weight * each, flags) for each, flags in (
+            (error, dr.ADFlag.ClearVertices), (light, dr.ADFlag.Default))]
         rate = max(min(2 - 2 * self.progress, 1.0), 0.0)
         for name, voxels in self._voxels.items():
             voxels.step(projections[0][name], projections[1][name], rate)
         self.step += 1
         self.trace.append((self.step, math.sqrt(max(self._sums[0], 0) / max(self._sums[1], 1e-30))))
 
-    def _back_projected(self, picture: Array, values: np.ndarray) -> dict[str, Float]:
+    def _back_projected(self, picture: Array, values: np.ndarray, flags: dr.ADFlag) -> dict[str, Float]:
         """Return Jᵀ `values` (h, w, 3) by parameter, J being the derivative of `picture`."""
         dr.set_grad(picture, mi.TensorXf(np.ascontiguousarray(values, np.float32)))
         dr.enqueue(dr.ADMode.Backward, picture)
-        dr.traverse(dr.ADMode.Backward, dr.ADFlag.ClearVertices)  # the edges are needed again
+        dr.traverse(dr.ADMode.Backward, flags)
         return {name: voxels.projected() for name, voxels in self._voxels.items()}
 
     def _aim(self, view: int, rng: np.random.Generator) -> tuple[int, int]:

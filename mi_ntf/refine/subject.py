@@ -82,13 +82,13 @@ class Subject:
         """Return the (4, 4) matrix from the world of the photographs to the scene."""
         return self.medium.frame.of_capture(self.medium.field.similarity)
 
-    def names(self, wanted: tuple[str, ...]) -> list[str]:
-        """Return the field's names of the parameters `wanted`. Raises MiNtfError."""
+    def names(self, requested: tuple[str, ...]) -> list[str]:
+        """Return the field's names of the parameters `requested`. Raises MiNtfError."""
         known = [name for name in HIGHEST if self.has(name)]
-        for name in wanted:
+        for name in requested:
             if name not in known:
                 raise MiNtfError(f"--parameters: {name!r} cannot be refined; this field has {', '.join(known)}")
-        return list(dict.fromkeys(wanted))
+        return list(dict.fromkeys(requested))
 
     def has(self, name: str) -> bool:
         """Return True if the field has a parameter of this name."""

@@ -1,11 +1,13 @@
 """Fields that photographs refine, from the command to the file."""
 
 import dataclasses
+import json
 
 import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import scenes
+from helpers.programs import run_program
 from helpers.variants import VARIANT
 from refine import shots
 
@@ -18,6 +20,8 @@ from mi_ntf.infer.refined import Refinement, packed
 from mi_ntf.refine import refine, refining
 from mi_ntf.refine.gains import Gains, products
 from mi_ntf.refine.photographs import Camera
+
+BOX = shots.CENTER + shots.RADIUS * np.array([[-0.5] * 3, [0.5] * 3])
 
 
 @pytest.fixture(autouse=True)
@@ -47,7 +51,7 @@ def test_a_patch_is_found_again(case, tmp_path):
     patch, rest = before / true < 0.81, before / true > 0.999
     assert after[patch].sum() / true[patch].sum() == pytest.approx(1, abs=0.03)
     assert after[rest].sum() / true[rest].sum() == pytest.approx(1, abs=0.03)
-    assert report.kept and report.after < 0.5 * report.before
+    assert report.improved and report.after < 0.5 * report.before
     header, _ = field_file.load(tmp_path / "out.safetensors")
     assert header.provenance["refined"]["steps"] == 24
     page = (tmp_path / "out.html").read_text()
@@ -85,9 +89,8 @@ def test_smoke_of_voxels_under_the_flash(tmp_path, monkeypatch):
     monkeypatch.setattr(shots, "SIZE", 16)
     density = np.ones((12, 12, 12), np.float32)
     right, wrong = tmp_path / "right.safetensors", tmp_path / "wrong.safetensors"
-    bounds = shots.CENTER + shots.RADIUS * np.array([[-0.5] * 3, [0.5] * 3])
     for path, albedo in ((right, 0.8), (wrong, 0.6)):
-        voxels.save(path, *of_grid(grids.Grid(2 * density, bounds), albedo))
+        voxels.save(path, *of_grid(grids.Grid(2 * density, BOX), albedo))
     subject = shots.subject(right)
     subject._parameters["lamp.position"] = mi.Point3f(shots.LAMP)
     subject._parameters["lamp.intensity.value"] = mi.Color3f(40.0)
@@ -167,3 +170,23 @@ def test_what_does_not_fit_is_refused(case, tmp_path):
     with pytest.raises(MiNtfError, match=r"refined.range has the shape \(2, 2\), expected 2 × 3 or 7"):
         field_file.save(out, header, damaged)
     assert dataclasses.asdict(header)["provenance"]["refined"] == {"made": "by a test"}
+
+
+def test_the_command_ends_well(tmp_path):
+    """The program writes field and page, prints its figures, and ends with exit code 0."""
+    wrong = tmp_path / "wrong.safetensors"
+    voxels.save(wrong, *of_grid(grids.Grid(np.full((8, 8, 8), 2, np.float32), BOX), 0.6))
+    photographs = shots.photograph(shots.subject(wrong), tmp_path / "set", {"train": 3, "val": 1, "test": 1}, lamp=True)
+    done = run_program("mi-ntf", "refine", wrong, photographs, "-o", "out.safetensors", "--steps", "1", "--json",
+                       cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["steps"] == 1 and (tmp_path / "out.html").is_file()
+
+
+def test_training_refuses_a_refined_field(case, tmp_path):
+    """Networks alone would be trained, and the differences lost."""
+    pytest.importorskip("torch")
+    from mi_ntf.train.finished import FinishedField
+
+    with pytest.raises(MiNtfError, match="was refined"):
+        FinishedField.load(case[3])
