@@ -142,6 +142,7 @@ def smaller(words):
 
 NEEDS_MORE = {
     "mi-ntf bridge": "tests/test_bridge.py builds it",
+    "mi-ntf refine": "tests/refine runs it",
     "python -m benchmarks.": "tests/benchmarks runs the scripts",
     "python scenes/skull/make_picture.py": "the photographs are not part of this project",
 }

@@ -17,7 +17,7 @@ from mi_ntf.core.errors import MiNtfError
 from mi_ntf.data import grids, schema
 from mi_ntf.importing import of_grid
 from mi_ntf.infer.refined import Refinement, packed
-from mi_ntf.refine import refine, refining
+from mi_ntf.refine import comparison, refine, refining
 from mi_ntf.refine.gains import Gains, products
 from mi_ntf.refine.photographs import Camera
 
@@ -27,6 +27,7 @@ BOX = shots.CENTER + shots.RADIUS * np.array([[-0.5] * 3, [0.5] * 3])
 @pytest.fixture(autouse=True)
 def few_rays(monkeypatch):
     monkeypatch.setattr(refining, "RAYS", 1 << 12)
+    monkeypatch.setattr(comparison, "SHOWN_RAYS", 1 << 13)
 
 
 @pytest.fixture(scope="module")
@@ -183,7 +184,7 @@ def test_the_command_ends_well(tmp_path):
     assert json.loads(done.stdout)["steps"] == 1 and (tmp_path / "out.html").is_file()
 
 
-def test_training_refuses_a_refined_field(case, tmp_path):
+def test_training_refuses_a_refined_field(case):
     """Networks alone would be trained, and the differences lost."""
     pytest.importorskip("torch")
     from mi_ntf.train.finished import FinishedField
