@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core import files, progress
+from ..core import files, interruption, progress
 from ..core.errors import MiNtfError
 from ..core.json_values import Json
 from ..data.readers import load_dataset
@@ -133,7 +133,7 @@ class Run:
         self._sums = np.zeros(2)
         self.trace: list[tuple[int, float]] = []
         self._identity = {"parameters": names, "seed": seed, "gains": gains, "data": fingerprint(splits),
-                          "field": subject.medium.field.digest}
+                          "field": subject.medium.field.digest, "scene": subject.digest}
         self._checkpoint = Path(f"{output}.ckpt")
 
     def limit(self, seconds: float, steps: float) -> None:
@@ -174,6 +174,10 @@ class Run:
                     if time.monotonic() - saved > INTERVAL:
                         self._save()
                         saved = time.monotonic()
+            except Exception as error:  # Mitsuba turns Ctrl-C into errors of its own
+                if interruption.caused(error):
+                    self._save()
+                raise
             except KeyboardInterrupt:
                 self._save()
                 raise

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -46,13 +48,20 @@ class Subject:
         True if the light is that of the photographs' flash.
     medium
         The field's medium.
+    digest
+        Hash of the scene's file and options.
     bounces
         True if the scene's `max_depth` has light that is scattered more than once.
     """
 
     def __init__(self, path: Path, defined: dict[str, str], environment: Environment) -> None:
         self.flash = path.suffix.lower() == ".safetensors"
+        if self.flash and (defined or environment != Environment()):
+            raise MiNtfError(f"{path} is a field file, lit by the flash of each photograph, and has no $names and no "
+                             "environment; leave -D and --env out, or give a scene")
         self._scene = _flash_scene(path) if self.flash else scene_file.load(path, defined, environment)
+        options = json.dumps([defined, repr(environment)], sort_keys=True)
+        self.digest = hashlib.sha256(path.read_bytes() + options.encode()).hexdigest()
         media = [m for m in find_media(self._scene) if getattr(m, "is_nrf", False)]
         if len(media) != 1:
             raise MiNtfError(f"{path}: the scene has {len(media)} nrf media, and photographs refine one field; give a "

@@ -161,6 +161,8 @@ def test_what_does_not_fit_is_refused(case, tmp_path):
         refine(scene, photographs, out, parameters=("colour",))
     with pytest.raises(MiNtfError, match="--minutes is -1; it must be positive"):
         refine(scene, photographs, out, minutes=-1)
+    with pytest.raises(MiNtfError, match="leave -D and --env out, or give a scene"):
+        refine(wrong, photographs, out, defined={"light": "env"})
     stock = tmp_path / "stock.xml"
     stock.write_text(scene.read_text().replace("<integrator type=\"nrf\">", "<integrator type=\"volpath\">").replace(
         '<integer name="environment_lights" value="16"/>', ""))
