@@ -14,9 +14,9 @@ from mi_ntf.data import images, schema
 from mi_ntf.data.readers import load_dataset
 
 
-def load(folder):
+def load(folder, **options):
     messages = []
-    return load_dataset(folder, messages.append), "\n".join(messages)
+    return load_dataset(folder, messages.append, **options), "\n".join(messages)
 
 
 def check_cameras(split, views, rtol=1e-6):
@@ -79,6 +79,13 @@ def test_nerf_synthetic(tmp_path):
     assert messages.startswith(f"NeRF-synthetic (Blender) data set in {tmp_path}: 16 photographs, 24x24 pixels\n")
     assert "sphere is found from the masks' visual hull" in messages
     assert "a flash at the lens is assumed" in messages and "W/sr estimated" in messages
+
+
+def test_photographs_under_a_known_light(tmp_path):
+    """Nothing is said or estimated of a flash."""
+    splits, messages = load(forms.blender(tmp_path), flash=False)
+    assert "flash" not in messages and "W/sr" not in messages
+    assert not splits["train"].calibrated and (splits["train"].light_intensity == 1).all()
 
 
 def test_nrhints(tmp_path):
