@@ -154,6 +154,7 @@ def print_summary(description: Json) -> None:
     words = [f"{score:.1f} dB on {name} photographs" for name, score in scores.items() if score is not None]
     print(f"PSNR      {', '.join(words) or 'not known'}")
     print(f"trained   {_training(record) or 'not known'}")
+    voxels.print_refinement(record)
 
 
 def _training(record: Json) -> str:

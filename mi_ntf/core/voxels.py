@@ -163,6 +163,15 @@ def print_rest(description: Json) -> None:
     lobe = "as a surface" if of["phase"] is None else f"phase function of asymmetry {of['phase']:g}"
     print(f"scatters  {lobe}")
     print(f"made of   {record.get('source', 'not known')}")
+    print_refinement(record)
+
+
+def print_refinement(provenance: Json) -> None:
+    """Print the line of ``mi-ntf info`` on the refinement of a field, if its provenance has one."""
+    record = provenance.get("refined")
+    if isinstance(record, dict) and isinstance(record.get("parameters"), list):
+        print(f"refined   {', '.join(map(str, record['parameters']))}, in {record.get('steps')} steps by "
+              f"{record.get('photographs')} photographs")
 
 
 def check(source: str, header: Voxels, arrays: Tensors) -> None:

@@ -175,7 +175,7 @@ def test_what_does_not_fit_is_refused(case, tmp_path):
     assert dataclasses.asdict(header)["provenance"]["refined"] == {"made": "by a test"}
 
 
-def test_the_command_ends_well(tmp_path):
+def test_the_command_ends_well(tmp_path, capsys):
     """The program writes field and page, prints its figures, and ends with exit code 0."""
     wrong = tmp_path / "wrong.safetensors"
     voxels.save(wrong, *of_grid(grids.Grid(np.full((8, 8, 8), 2, np.float32), BOX), 0.6))
@@ -184,6 +184,8 @@ def test_the_command_ends_well(tmp_path):
                        cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["steps"] == 1 and (tmp_path / "out.html").is_file()
+    field_file.print_summary(field_file.describe(tmp_path / "out.safetensors"))
+    assert "refined   albedo, in 1 steps by 4 photographs" in capsys.readouterr().out
 
 
 def test_training_refuses_a_refined_field(case):
