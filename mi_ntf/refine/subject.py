@@ -6,7 +6,7 @@ import hashlib
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -28,6 +28,13 @@ from .voxels import HIGHEST
 
 LIGHT_SAMPLES = 4
 """Sampled lights per shading point under an environment."""
+
+
+class Renderer(Protocol):
+    """The ``nrf`` integrator."""
+
+    def render(self, scene: mi.Scene, sensor: mi.Sensor, seed: int, spp: int, /) -> Array:
+        """Return a picture (h, w, 4), linear RGBA."""
 
 
 class Subject:
@@ -78,9 +85,9 @@ class Subject:
             raise MiNtfError(f"{path}: its integrator is no nrf, which knows derivatives by a field; give the scene "
                              '<integrator type="nrf"/>')
         settings = _settings(context.settings, self._scene.environment() is not None)
-        self._full: Any = _integrator(settings)
+        self._full = _integrator(settings)
         self.bounces = not 0 <= settings.max_depth <= 2
-        self._direct: Any = _integrator(replace(settings, max_depth=2)) if self.bounces else self._full
+        self._direct = _integrator(replace(settings, max_depth=2)) if self.bounces else self._full
 
     @property
     def solid(self) -> bool:
@@ -158,6 +165,7 @@ def _settings(settings: Settings, environment: bool) -> Settings:
                    light_samples=settings.light_samples or LIGHT_SAMPLES * environment)
 
 
-def _integrator(settings: Settings) -> Any:
+def _integrator(settings: Settings) -> Renderer:
     values = {name: value for name, value in vars(settings).items() if name in properties.INTEGRATOR and value != ""}
-    return mi.load_dict({"type": "nrf", **values})
+    integrator: Renderer = mi.load_dict({"type": "nrf", **values})
+    return integrator
