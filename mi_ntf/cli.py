@@ -93,7 +93,7 @@ def parse(words: list[str]) -> Command:
         with redirect_stderr(box):
             return _parsed(name, words[1:])
     except SystemExit:
-        raise UsageError(usage.sentence(name, words[1:], box.getvalue())) from None
+        raise UsageError(usage.sentence(name, words[1:], box.getvalue(), description(name))) from None
 
 
 def overview() -> str:

@@ -201,6 +201,11 @@ def test_bad_usage_is_2(calls: list, line: str):
     ("sequence x -o d --engine pbs", "--engine is 'pbs', must be dask, local or submitit"),
     ("train x -o f --minuts=3", "train has no option --minuts; did you mean --minutes?"),
     ("train x -o f --zzz", "train has no option --zzz"),
+    ("capture s.xml -o DIR", "capture has no option -o"),  # in place of "folder needs a value"
+    ("capture s.xml --vews 3", "capture has no option --vews; did you mean --views?"),
+    ("train x -m cuda_ad_rgb", "train has no option -m"),
+    ("capture s.xml -D", "--define needs a value"),
+    ("capture s.xml d --flash-offset -1,2 --test_views x", "--test-views is 'x', must be a whole number"),
     ("capture a b c", "capture has no place for 'c': it is one argument too many"),
     ("render", "the following arguments are required: SCENE.xml"),
     ("render --env-rotate far x", "argument --env-rotate: invalid float value: 'far'"),

@@ -1,5 +1,6 @@
 """Sentences for command lines that tyro refuses, in place of its boxes."""
 
+import difflib
 import re
 
 _COLOUR = re.compile(r"\x1b\[[\d;]*m")
@@ -8,35 +9,47 @@ _NAMES = re.compile(r"^ {4}(?=\S)(.*)$")
 """Line of a box that names an argument; its description is indented further."""
 
 
-def sentence(command: str, words: list[str], box: str) -> str:
-    """Return what is wrong with the `words` after `command`, and what is legal, from tyro's text `box`."""
-    lines = _COLOUR.sub("", box).splitlines()
-    lines = [line[2:].rstrip(" │") for line in (lines[1:-1] if box.count("╭") else lines[2:])]
-    end = next((i for i, line in enumerate(lines) if _RULE.match(line)), len(lines))
-    text, rest = " ".join(" ".join(lines[:end]).split()), " ".join(lines[end:])
-    if text.startswith("Missing from"):
-        names = [name[1].split(", ")[0] for line in lines[:end] if (name := _NAMES.match(line))]
-        fault = f"{command} needs {' and '.join(names)}"
-    elif missing := re.search(r"Missing value for argument '([^']+)'", text):
-        fault = f"{missing[1].split('/')[-1]} needs a value"
-    elif unknown := re.match(r"Unrecognized (?:or misplaced )?options: (.*)", text):
-        fault = _unknown(command, words, unknown[1], rest)
-    elif refused := re.match(r"Error parsing (\S+):", text) or re.search(r" for argument '([^']+)'", text):
-        option = refused[1].split("/")[-1]
-        legal = _legal(text)
-        fault = f"{option} is {_value(words, option)!r}, must be {legal}" if legal else text
-    else:
-        fault = text
+def sentence(command: str, words: list[str], box: str, described: str) -> str:
+    """Return what is wrong with the `words` after `command`, and what is legal.
+
+    `box` is tyro's text of the error. It may name an argument that an unknown option took the place of, so options are
+    looked up in `described`, the command's help, first.
+    """
+    fault = _unknown(command, words, described) or _fault(command, words, box)
     return fault if fault.endswith("?") else f"{fault.rstrip('.')}; `mi-ntf {command} -h` describes the options"
 
 
-def _unknown(command: str, words: list[str], listed: str, rest: str) -> str:
-    """Return the sentence for the first of the words that no argument takes."""
-    word = next((w for w in sorted(words, key=len, reverse=True) if w and listed.startswith(w)), listed.split()[0])
-    if not word.startswith("-"):
+def _unknown(command: str, words: list[str], described: str) -> str:
+    """Return the sentence for the first of the words that is no option of the command; "" if all are."""
+    known = re.findall(r"--?[a-zA-Z][\w-]*", " ".join(re.findall(r"^  (-.*)", described, re.M)))
+    for word in words:
+        option = word.partition("=")[0].replace("_", "-")
+        if re.match("--?[a-zA-Z]", word) and option not in known and option[:2] not in known:  # -mVARIANT is one word
+            near = difflib.get_close_matches(option, known, 1)
+            return f"{command} has no option {word.partition('=')[0]}" + (f"; did you mean {near[0]}?" if near else "")
+    return ""
+
+
+def _fault(command: str, words: list[str], box: str) -> str:
+    """Return what is wrong by tyro's text."""
+    lines = _COLOUR.sub("", box).splitlines()
+    lines = [line[2:].rstrip(" │") for line in (lines[1:-1] if box.count("╭") else lines[2:])]
+    end = next((i for i, line in enumerate(lines) if _RULE.match(line)), len(lines))
+    text = " ".join(" ".join(lines[:end]).split())
+    if text.startswith("Missing from"):
+        names = [name[1].split(", ")[0] for line in lines[:end] if (name := _NAMES.match(line))]
+        return f"{command} needs {' and '.join(names)}"
+    if missing := re.search(r"Missing value for argument '([^']+)'", text):
+        return f"{missing[1].split('/')[-1]} needs a value"
+    if listed := re.match(r"Unrecognized (?:or misplaced )?options: (.*)", text):
+        word = next((w for w in sorted(words, key=len, reverse=True) if w and listed[1].startswith(w)),
+                    listed[1].split()[0])
         return f"{command} has no place for {word!r}: it is one argument too many"
-    near = re.search(r"(?:Perhaps you meant|similar to).*?:\s.*?(--[\w-]+)", rest)
-    return f"{command} has no option {word.partition('=')[0]}" + (f"; did you mean {near[1]}?" if near else "")
+    if refused := re.match(r"Error parsing (\S+):", text) or re.search(r" for argument '([^']+)'", text):
+        option = refused[1].split("/")[-1]
+        legal = _legal(text)
+        return f"{option} is {_value(words, option)!r}, must be {legal}" if legal else text
+    return text
 
 
 def _legal(text: str) -> str:

@@ -13,9 +13,10 @@ from mi_ntf.data import assumptions, inspect_figures, measures
 from mi_ntf.data.measures import Numbers, Splits, percent
 from mi_ntf.data.page import Page
 from mi_ntf.data.readers import find_form, load_dataset
-from mi_ntf.data.schema import DataSet, View
+from mi_ntf.data.schema import DataSet, Split, View
 
 THUMBNAILS = 12
+LONGEST = 1024  # pixels of a photograph's longer side up to which training gains detail
 POINTS = 2000  # of the reconstructed points, in the figure of the cameras
 
 
@@ -48,7 +49,7 @@ def _inspect(folder: Path, out: Path, options: dict[str, Any]) -> Numbers:
             "assumed": [text for text in messages if text.startswith(assumptions.PREFIX)],
             "estimate": estimate, **numbers,
             "warnings": measures.warnings(numbers, rows), "page": str(out),
-            "next": _next(folder, splits["train"].located, options),
+            "next": _next(folder, splits["train"], options),
             "views": [{key: _plain(value) for key, value in row._asdict().items()} for row in rows]}
     with progress.Stage("writing the page", inner=True):
         _page(folder, form.read(folder), splits, rows, data).write(out)
@@ -65,13 +66,15 @@ def print_table(data: Numbers) -> None:
           f"verdict: {verdict if count else 'nothing here will harm the field'}", f"next: {data['next']}", sep="\n")
 
 
-def _next(folder: Path, located: bool, options: dict[str, Any]) -> str:
-    """Return the command that trains on the data set with the same options."""
-    flash = options.get("flash_offset")
+def _next(folder: Path, split: Split, options: dict[str, Any]) -> str:
+    """Return the command that trains on the data set with the same options; it scales large photographs down."""
+    flash, longer = options.get("flash_offset"), max(split.images.shape[1:3])
+    if options.get("size") is None and longer > LONGEST:
+        options = options | {"size": LONGEST}
     words = ["mi-ntf", "train", str(folder), "-o", f"{folder.resolve().name}.safetensors"]
     for key in ("size", "masks", "background"):
         words += [f"--{key}", str(options[key])] if options.get(key) is not None else []
-    if not located or flash == "estimate":
+    if not split.located or flash == "estimate":
         words += ["--flash-offset", "estimate"]
     elif flash is not None:
         words.append(f"--flash-offset={','.join(f'{v:g}' for v in flash)}")

@@ -257,6 +257,12 @@ def test_the_next_command_has_the_same_options(tmp_path, form, options, more):
                                + "--minutes 10")
 
 
+def test_the_next_command_scales_large_photographs_down(tmp_path, monkeypatch):
+    monkeypatch.setattr("mi_ntf.data.inspect.LONGEST", forms.SIZE - 1)
+    numbers = inspect(forms.capture(tmp_path / "set"), tmp_path / "page.html")
+    assert f" --size {forms.SIZE - 1} " in numbers["next"]
+
+
 def test_the_place_of_the_flash_is_estimated_by_training_and_only_if_it_is_not_known(tmp_path):
     numbers = inspect(forms.colmap(tmp_path / "set"), tmp_path / "page.html", flash_offset="estimate")
     assert dict(summary(numbers))["flash beside the lens"] == (
