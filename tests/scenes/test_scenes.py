@@ -65,11 +65,22 @@ def test_mesh_scene_renders_its_reference(name, light):
     assert (error < 0.05).all(), error
 
 
-@pytest.mark.parametrize("path", sorted(SCENES.glob("*/*.xml")), ids=lambda path: f"{path.parent.name}/{path.stem}")
+SHIPPED = [*sorted(SCENES.glob("*/*.xml")), *sorted((SCENES.parent / "docs/gallery").glob("*.xml"))]
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: f"{path.parent.name}/{path.stem}")
 def test_cameras_lights_and_shapes_have_ids(path):
     """Parameters without an id have names such as ``object_94808915120464``, which differ in each process."""
-    root = ET.parse(path).getroot()
-    assert all(root.findall(kind) == root.findall(f"{kind}[@id]") for kind in ("sensor", "emitter", "shape"))
+    assert not _without_id(ET.parse(path).getroot())
+
+
+def test_the_example_on_a_floor_has_ids():
+    assert not _without_id(ET.fromstring(script(SCENES.parent / "examples/own_mesh.py").BOXES))
+
+
+def _without_id(root: ET.Element) -> list[str]:
+    """Return the kinds of a scene's cameras, lights, shapes and media that have no id. Nested ones need none."""
+    return [node.tag for node in root if node.tag in ("sensor", "emitter", "shape", "medium") and not node.get("id")]
 
 
 def test_parameters_of_a_shipped_scene_have_names():
