@@ -6,6 +6,7 @@ import pytest
 
 from mi_ntf.core import voxels
 from mi_ntf.core.splats import Splats, density, optical_depth
+from mi_ntf.field import Field
 from mi_ntf.importing_splats import of_splats
 
 COLOUR = (0.7, 0.3, 0.1)
@@ -36,7 +37,8 @@ def rendered(integrator="nrf", **things):
               "to_world": mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]),
               "film": {"type": "hdrfilm", "width": 16, "height": 16, "pixel_format": "rgb",
                        "rfilter": {"type": "box"}}}
-    scene = mi.load_dict({"type": "scene", "integrator": {"type": integrator}, "sensor": camera, **things})
+    integrator = {"type": integrator} if isinstance(integrator, str) else integrator
+    scene = mi.load_dict({"type": "scene", "integrator": integrator, "sensor": camera, **things})
     return np.array(mi.render(scene, spp=64))
 
 
@@ -76,3 +78,44 @@ def test_a_lamp_does_not_change_emission_but_the_field_shadows_a_floor(field):
     behind = rendered(field=field, floor=floor, lamp=lamp) - dark
     assert behind[8, 8].max() < 0.5 * lit[8, 8].min()
     assert (behind < lit + 0.02).all()
+
+
+LAMPS = {"above": {"type": "directional", "direction": [0, -1, 0], "irradiance": {"type": "rgb", "value": [3, 1, 0]}},
+         "beside": {"type": "directional", "direction": [-1, 0, 0], "irradiance": {"type": "rgb", "value": [1, 1, 2]}}}
+
+
+def catcher(field):
+    return field | {"interior": field["interior"] | {"shadow_catcher": True}}
+
+
+def roof():
+    """An opaque square above the field, at right angles to the camera's rays."""
+    to_world = mi.ScalarTransform4f().translate([0, 1.8, 0]).rotate([1, 0, 0], 90).scale(1.8)
+    return {"type": "rectangle", "to_world": to_world}
+
+
+def test_a_shadow_catcher_loses_the_fraction_of_light_that_a_surface_blocks(field):
+    """The lamp above is in the shadow of the roof, and the one beside is not: 1/4, 1/2 and 2/2 of the light is left."""
+    open_sky = rendered(field=catcher(field), **LAMPS)
+    assert np.allclose(open_sky, rendered(field=field, **LAMPS), atol=1e-5)  # no shadow on itself
+    left = rendered(field=catcher(field), roof=roof(), **LAMPS)
+    assert np.allclose(left, open_sky * [0.25, 0.5, 1.0], atol=1e-4)
+    assert np.allclose(rendered(field=field, roof=roof(), **LAMPS), open_sky, atol=1e-5)  # it has to be asked for
+
+
+@pytest.mark.parametrize("visibility", ["raymarch", "transmittance_map"])
+def test_smoke_dims_a_shadow_catcher_by_its_transmittance(field, visibility):
+    """A slab of smoke between the field and the only lamp lets e^(−0.9) through."""
+    slab = {"type": "cube", "to_world": mi.ScalarTransform4f().translate([0, 2.2, 0]).scale([2, 0.3, 2]),
+            "bsdf": {"type": "null"}, "interior": {"type": "homogeneous", "sigma_t": 1.5, "albedo": 0.0}}
+    lamp = {"type": "point", "position": [0, 60.0, 0]}
+    integrator = {"type": "nrf", "visibility": visibility}
+    bright = rendered(field=catcher(field), lamp=lamp)
+    left = rendered(integrator, field=catcher(field), lamp=lamp, slab=slab)
+    assert left.sum() == pytest.approx(np.exp(-0.9) * bright.sum(), rel=0.02)
+
+
+def test_an_emitting_field_alone_catches_shadows():
+    smoke = Field.from_grid(np.ones((4, 4, 4), np.float32)).shape()
+    with pytest.raises(RuntimeError, match=r"shadow_catcher is true, but .* emits no light .* with --emissive"):
+        mi.load_dict(catcher(smoke))

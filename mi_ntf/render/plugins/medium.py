@@ -9,6 +9,8 @@ scale           float     1        10⁻¹² to 10¹² scene units per capture u
 representation  string    grid     grid, network ``grid``: baked voxels; ``network``: the networks, exact and slower
 resolution      integer   by field 16 to 1024    voxels per side of the baked grid; by default twice the finest density
                                                  plane, 192 to 512
+shadow_catcher  boolean   false                  the lights' shadows darken what the field emits; for fields of
+                                                 ``mi-ntf import --emissive``
 sample_emitters boolean   true                   as for any medium; for stock volumetric integrators
 =============== ========= ======== ============= =======================================================================
 
@@ -44,6 +46,11 @@ is its own, and the visibility methods that are trained refuse it.
 Every collision scatters (the single-scattering albedo is 1), with the field's reflectance as phase function. Smoke has
 the phase function of Henyey and Greenstein in place of a surface's reflectance. Media may overlap: the ``nrf``
 integrator adds their densities. Stock volumetric integrators know one medium at a time and are no reference there.
+
+A `shadow_catcher` keeps the colours that its file emits, and the scene's lights stand for those of its photographs. Each
+colour has as a factor the fraction of the lights' irradiance, from all sides and by red, green and blue, that other
+fields, media and surfaces let through to the point. A `shadow_catcher` casts shadows on them, and none on itself. Only
+``nrf`` renders this.
 
 A medium in a ``shapegroup`` lies where each ``instance`` places it, under the ``nrf`` integrator alone.
 
@@ -157,8 +164,12 @@ def medium_class(phase_class: type) -> type:
             self.representation = read.choice("representation", "grid", REPRESENTATIONS)
             resolution = read.whole("resolution", 0, 16, 1024) or None
             read.flag("sample_emitters", True)
+            self.shadow_catcher = read.flag("shadow_catcher", False)
             self._read = loaded.load(path, resolution)
             self.field: LoadedField | VolumeField | ChangedField = self._read
+            if self.shadow_catcher and not self.field.emissive:
+                raise MiNtfError(f"nrf medium: shadow_catcher is true, but {path} emits no light of its own; leave it "
+                                 "out, or import the splats with --emissive")
             self._parameters: FieldParameters | None = None
             grid, bound = self.field.grid, math.exp(MAX_LOG_DENSITY)  # clipping alone bounds the networks
             if isinstance(grid, VoxelVolume):

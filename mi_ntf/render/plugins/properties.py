@@ -15,7 +15,7 @@ import numpy as np
 
 from ...core.errors import MiNtfError
 
-MEDIUM = ("filename", "to_world", "scale", "representation", "resolution", "sample_emitters")
+MEDIUM = ("filename", "to_world", "scale", "representation", "resolution", "shadow_catcher", "sample_emitters")
 INTEGRATOR = (
     "visibility", "samples", "light_samples", "environment_lights", "map_resolution", "map_source", "map_components",
     "map_memory", "map_file", "max_depth", "rr_depth", "bounces", "unbiased", "shadow_gradients", "aovs",

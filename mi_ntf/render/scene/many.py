@@ -38,6 +38,7 @@ class Crowd:
 
     attached: Sequence[str] = ()
     attached_log_density = None
+    shadow_catcher = False
 
     def __init__(self, members: Sequence[NRFMedium]) -> None:
         self.members = members
@@ -71,6 +72,8 @@ class Crowd:
 def _kind(medium: NRFMedium) -> tuple[int, ...]:
     """Return numbers that are the same for media that may be one: those of one field, and all opaque baked surfaces."""
     field = medium.field
+    if medium.shadow_catcher:
+        return 2, id(medium)  # casts shadows on the others of its kind
     if isinstance(medium.source, GridField) and field.softness.opaque and field.phase is None:
         return 0, int(field.retro is None), int(field.tail is None), int(field.grid.gloss > MIN_GLOSS)
     return 1, id(medium.source)

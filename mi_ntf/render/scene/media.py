@@ -23,7 +23,8 @@ from .traversal import traverse
 class NRFMedium(Protocol):
     """Attributes of the ``nrf`` medium plugin, whose class exists once a variant is set.
 
-    `source`: density, of the baked voxels or of the networks, as `representation` says; `path`: the field file.
+    `source`: density, of the baked voxels or of the networks, as `representation` says; `path`: the field file;
+    `shadow_catcher`: shadows of others darken the light that the field emits.
     """
 
     field: LoadedField | VolumeField | ChangedField
@@ -31,6 +32,7 @@ class NRFMedium(Protocol):
     source: Density
     representation: str
     path: str
+    shadow_catcher: bool
 
     @property
     def attached(self) -> Sequence[str]:
@@ -80,6 +82,11 @@ class InstancedMedium:
     def path(self) -> str:
         """Field file of the medium."""
         return self.medium.path
+
+    @property
+    def shadow_catcher(self) -> bool:
+        """True if shadows of others darken the light that the field emits."""
+        return self.medium.shadow_catcher
 
     def reflectance(self, x: Vector) -> Reflectance:
         """Return the reflectance at field points."""

@@ -211,6 +211,9 @@ class _CameraLight:
         emission = points.reflectance.emission
         if emission is not None:
             if self.first_run:
+                if self.effects.lit and part.medium.shadow_catcher:
+                    arriving = self.scene.arriving(part, points, self.stream)
+                    emission = tuple(a * b for a, b in zip(emission, arriving, strict=True))
                 self._add(light, emission, weight, index)
         elif self.effects.lit:
             reflected = self.scene.reflect(part, points, self.stream, view if self.effects.collocated else None)

@@ -15,7 +15,9 @@ import mitsuba as mi
 
 from ...core.errors import MiNtfError
 from ...infer import march, shade
+from ...infer.backend import module_of
 from ...infer.bundle import Strand
+from ...infer.phase_function import HenyeyGreenstein, smoke
 from ...infer.types import Float, Mask, Ray, UInt32, Vector3, Visibility
 from ...infer.visibility import REGISTRY
 from ...infer.visibility.attached_shadow import AttachedShadow
@@ -268,6 +270,26 @@ class Composition:
                                   self.effects.gradients, not surface)  # fmt: skip
             total = [a + b for a, b in zip(total, light, strict=True)]
         return total
+
+    def arriving(self, part: Part, points: shade.Points, stream: UInt32) -> list[Float]:
+        """Return the fraction, RGB, of the lights' irradiance from all sides that arrives at points of `part`.
+
+        The rest is in the shadow of other fields and surfaces. It is 1 where no light would arrive. `stream`: opaque
+        seed of sampled lights.
+        """
+        one: Float = dr.ones(mi.Float, dr.width(points.x[0]))
+        white = smoke((one, one, one), HenyeyGreenstein(0, module_of(mi.Float)))
+        even = shade.Points(points.x, points.wo, white, points.ray, points.ordinal)
+        arriving, all_light = ([dr.zeros(mi.Float, dr.width(one)) for _ in range(3)] for _ in range(2))
+        own, gradients = FieldVisibility(part.frame, KnownTransmittance(mi.Float(1))), self.effects.gradients
+        for source, mapped in self.lights.sources(part.all_lights, part.frame, even, stream, 0, gradients):
+            others = [FieldVisibility(p.frame, method) for p in self.parts if p.medium is not part.medium
+                      and (method := p.for_all if mapped and not part.all_lights.moving else p.for_sampled)]
+            shadow = Shadow(own, others, self.surfaces) if part.for_sampled else None
+            for total, visibility in ((arriving, shadow), (all_light, None)):
+                light = shade.reflect(even, source, visibility, False, gradients)
+                total[:] = [a + b for a, b in zip(total, light, strict=True)]
+        return [dr.select(total > 0, a / total, 1) for a, total in zip(arriving, all_light, strict=True)]
 
     def shadow(self, part: Part, sampled: bool, far: bool = False) -> Visibility | None:
         """Return the visibility of lights from points of `part` through all fields and surfaces.

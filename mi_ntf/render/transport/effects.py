@@ -96,7 +96,7 @@ def describe(scene: mi.Scene, settings: Settings, sensor: mi.Sensor, spp: int, m
     # Derivatives by a light's position need the light's own transmittance. A camera ray crosses a surface or ends there
     # at random, while a shadow ray is attenuated.
     collocated = (lit and not gradients and settings.visibility != "none" and _at_camera(lights, sensor, media)
-                  and not lets_light_through(scene))
+                  and not lets_light_through(scene) and not any(m.shadow_catcher for m in media))
     width, height = sensor.film().crop_size()
     bounces = _bounces(settings, media, surfaces, gradients) if lit and not 0 <= depth <= 2 else ""
     _check_field_gradients(media, settings, bounces)
