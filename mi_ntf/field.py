@@ -158,7 +158,8 @@ class Field:
         return cls.from_grid(values, colours, (low, high), phase)
 
     @classmethod
-    def from_splats(cls, path: str | Path, emissive: bool = False, resolution: int | None = None) -> "Field":
+    def from_splats(cls, path: str | Path, emissive: bool = False, resolution: int | None = None,
+                    bounds: ArrayLike | None = None) -> "Field":
         """Make a field of voxels in memory of Gaussian splats.
 
         Parameters
@@ -170,6 +171,8 @@ class Field:
             light is baked into them.
         resolution
             Voxels along the longest side, 16 to 2048. By default it follows from the splats' sizes.
+        bounds
+            Lower and upper corner of a box outside of which splats are left out.
 
         Raises
         ------
@@ -177,7 +180,8 @@ class Field:
             If the file is missing or damaged, or a value is out of range.
         """
         _ready()
-        return cls.of_voxels(*importing_splats.of_splats(splat_files.read(path), resolution, emissive, str(path)))
+        box = None if bounds is None else grids.corners(bounds, "from_splats")
+        return cls.of_voxels(*importing_splats.of_splats(splat_files.read(path), resolution, emissive, str(path), box))
 
     @classmethod
     def of_voxels(cls, header: Voxels, density: Tensors, reflectance: Tensors | None = None) -> "Field":

@@ -66,10 +66,7 @@ def import_grid(source: Path, output: Path, scale: float = 1.0, albedo: str | No
             constant = 1.0 if numbers is None else _triple(numbers)
             grid = Grid(grid.density, grid.bounds, None if numbers else grids.read_albedo(Path(albedo)))
         if bounds is not None:
-            box = _numbers(bounds)
-            if box is None or len(box) != 6:
-                raise MiNtfError(f"--bounds is {bounds}, expected six numbers, x0,y0,z0,x1,y1,z1")
-            grid = Grid(grid.density, np.array(box).reshape(2, 3), grid.albedo)
+            grid = Grid(grid.density, box_of(bounds), grid.albedo)
         contents = of_grid(grids.checked(grid, str(source)), constant, phase, source.name)
         voxels.save(output, *contents)
         header = contents[0]
@@ -102,6 +99,14 @@ def of_grid(grid: Grid, albedo: ArrayLike = 1.0, phase: float = 0.0, source: str
     header = Voxels(low, high, _counts(density), None if colour is None else _counts(colour), float(phase),
                     (red, green, blue), provenance={"source": source})
     return header, bricks.of_dense(density[..., None], matter), reflectance
+
+
+def box_of(bounds: str) -> np.ndarray:
+    """Return the corners (2, 3) of the text x0,y0,z0,x1,y1,z1. Raises MiNtfError if it is something else."""
+    box = _numbers(bounds)
+    if box is None or len(box) != 6:
+        raise MiNtfError(f"--bounds is {bounds}, expected six numbers, x0,y0,z0,x1,y1,z1")
+    return grids.corners(np.array(box).reshape(2, 3), "--bounds")
 
 
 def print_summary(report: Imported) -> None:

@@ -198,7 +198,7 @@ class Train:
         return shlex.join(words)
 
 
-SPLATS_LACK = {"scale": 1.0, "albedo": None, "phase": 0.0, "bounds": None, "order": "zyx"}
+SPLATS_LACK = {"scale": 1.0, "albedo": None, "phase": 0.0, "order": "zyx"}
 SPLATS_HAVE = {"emissive": False, "resolution": None}
 """Defaults of the options of `mi-ntf import` for either form of files."""
 
@@ -217,7 +217,7 @@ class Import:
     phase: Annotated[float, options.named("G")] = 0.0
     """Asymmetry of the phase function, of Henyey and Greenstein: -1 backward, 0 isotropic, 1 forward."""
     bounds: Annotated[str | None, options.named("BOX")] = None
-    """Corners x0,y0,z0,x1,y1,z1 in place of the file's."""
+    """Corners x0,y0,z0,x1,y1,z1 in place of a grid's. Splats outside are left out."""
     order: Annotated[Literal["zyx", "xyz"], options.named("{zyx,xyz}")] = "zyx"
     """Axes of arrays of NumPy; many NeRF programs have x first."""
     emissive: options.Flag = False
@@ -240,7 +240,8 @@ class Import:
                 raise MiNtfError(f"--{name} is for {'grids' if splats else 'Gaussian splats'}, and {self.source} "
                                  f"holds {'splats' if splats else 'a grid'}; leave it out")
         if splats:
-            field = importing_splats.import_splats(self.source, self.output, self.resolution, self.emissive)
+            field = importing_splats.import_splats(self.source, self.output, self.resolution, self.emissive,
+                                                   self.bounds)
             return options.print_report(field, self.json, importing_splats.print_summary)
         report = import_grid(self.source, self.output, self.scale, self.albedo, self.phase, self.bounds, self.order)
         options.print_report(report, self.json, print_summary)

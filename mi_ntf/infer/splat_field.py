@@ -5,7 +5,7 @@ from types import ModuleType
 import numpy as np
 
 from ..core import splat_normals
-from ..core.errors import MiNtfError
+from ..core.errors import MiNtfError, shown
 from ..core.ops import Tensors
 from ..core.splats import Splats
 from ..core.voxels import Voxels
@@ -28,13 +28,15 @@ COLOUR_BLUR = 0.75
 """Smallest standard deviation of a splat in the reflectance, voxels: wide enough that no density lies outside of it."""
 OPAQUE = 16.0
 """Upper bound of a voxel's optical depth. More would cost digits elsewhere, since voxels have 16 bits."""
+FAR = 0.01
+"""Fraction of the splats on either side, along each axis, that may be far away from the others."""
 MOST_BLOCKS = 64_000
 """Number of blocks of density above which the voxels become longer, which bounds the memory."""
 
 
 def voxelised(splats: Splats, dj: ModuleType, resolution: int | None = None, emissive: bool = False,
-              provenance: dict[str, object] | None = None, progress: Progress = lambda done: None
-              ) -> tuple[Voxels, Tensors, Tensors]:
+              provenance: dict[str, object] | None = None, progress: Progress = lambda done: None,
+              bounds: np.ndarray | None = None) -> tuple[Voxels, Tensors, Tensors]:
     """Return header, density and reflectance of a field of kind *voxels* (:func:`mi_ntf.core.voxels.save`).
 
     Parameters
@@ -53,16 +55,23 @@ def voxelised(splats: Splats, dj: ModuleType, resolution: int | None = None, emi
         Free-form JSON about the origin.
     progress
         Receives the fraction of the work that is done.
+    bounds
+        Corners (2, 3) of a box. Splats with centres outside are left out, and the others end at its sides.
     """
     splats = splats.take(np.flatnonzero(splats.opacities >= VISIBLE))
     if not len(splats):
         raise MiNtfError(f"no splat has an opacity of {VISIBLE:.4f} or more, so there is nothing to import")
-    lattice = lattice_of(splats, resolution)
+    if bounds is not None:
+        splats = splats.take(np.flatnonzero(((splats.centres >= bounds[0]) & (splats.centres <= bounds[1])).all(1)))
+        if not len(splats):
+            raise MiNtfError(f"no splat has its centre in the box {shown(bounds.tolist())}, so there is nothing to "
+                             "import; give a larger one")
+    lattice = lattice_of(splats, resolution, bounds=bounds)
     sums = SplatSums(splats, lattice, dj)
     longer = 1.0
     while sums.count > MOST_BLOCKS:  # the blocks of a surface grow with the square of the resolution
         longer *= 1.03 * (sums.count / MOST_BLOCKS) ** 0.5
-        lattice = lattice_of(splats, resolution, longer)
+        lattice = lattice_of(splats, resolution, longer, bounds)
         sums = SplatSums(splats, lattice, dj)
     progress(0.2)
     density = sums.bricks(np.minimum(sums.total(), np.float32(OPAQUE / lattice.size)))
@@ -76,11 +85,29 @@ def voxelised(splats: Splats, dj: ModuleType, resolution: int | None = None, emi
     return header, density, reflectance
 
 
-def lattice_of(splats: Splats, resolution: int | None, longer: float = 1.0) -> Lattice:
-    """Return voxels that hold all `splats`, with an empty one at each side; `longer`: factor of their length."""
+def crowded_box(splats: Splats) -> np.ndarray | None:
+    """Return the corners (2, 3) of the box of all `splats` but a few that are far away from the others.
+
+    None if that box is at least half as long as the box of all. It leaves out ``FAR`` of the splats on either side
+    along each axis, and is longer by a tenth on either side than that.
+    """
+    low, high = np.quantile(splats.centres.astype(np.float64), (FAR, 1 - FAR), axis=0)
+    box = np.stack([low - 0.1 * (high - low), high + 0.1 * (high - low)])
+    longest = np.ptp(splats.centres.astype(np.float64), axis=0).max()
+    return box if 2 * (box[1] - box[0]).max() < longest and (box[1] > box[0]).all() else None
+
+
+def lattice_of(splats: Splats, resolution: int | None, longer: float = 1.0, bounds: np.ndarray | None = None
+               ) -> Lattice:
+    """Return voxels that hold all `splats`, with an empty one at each side.
+
+    `longer`: factor of their length; `bounds`: corners (2, 3) of a box that they do not leave by more than an edge.
+    """
     shortest = splats.scales.min(1).astype(np.float64)
     reach = splats.reach(3.0)
     low, high = (splats.centres - reach).min(0), (splats.centres + reach).max(0)
+    if bounds is not None:
+        low, high = np.maximum(low, bounds[0]), np.minimum(high, bounds[1])
     scales = np.sort(splats.scales.astype(np.float64), axis=1)
     area = splats.opacities * scales[:, 1] * scales[:, 2]
     order = np.argsort(shortest)

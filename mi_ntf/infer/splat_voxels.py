@@ -63,7 +63,7 @@ class SplatSums:
     Parameters
     ----------
     splats
-        The splats, all within the lattice.
+        The splats. Those that leave the lattice end at its sides.
     lattice
         The voxels.
     dj

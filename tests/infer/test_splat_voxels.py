@@ -108,6 +108,34 @@ def test_voxels_follow_the_shortest_axes_and_bounds():
     assert splat_field.lattice_of(tiny, None).counts.max() < splat_field.MOST_VOXELS + 16
 
 
+def test_a_box_leaves_out_far_splats_and_cuts_large_ones():
+    """Six small splats around the origin, one far away, and a wide one whose matter ends at the sides of the box."""
+    few, box = round_splats().take(np.arange(8)), np.array([[-2.0, -1.5, -1.2], [2.0, 1.5, 1.2]])
+    centres, scales = np.array(few.centres), np.array(few.scales)
+    centres[6], centres[7], scales[7] = (500, 0, 0), (0.2, 0.1, 0.0), (3.0, 0.6, 0.6)
+    splats = Splats(centres, scales, np.tile([1.0, 0, 0, 0], (8, 1)), few.opacities, few.colours)
+    header, *parts = of_splats(splats, 128, bounds=box)
+    size = (header.high[0] - header.low[0]) / header.counts[0]
+    assert (np.abs(np.array([header.low, header.high]) - box).max(0) < 16 * size).all() and header.high[0] < 3
+    assert header.provenance["splats"] == 7
+    field, near = Field.of_voxels(header, *parts), splats.take(np.array([0, 1, 2, 3, 4, 5, 7]))
+    points = np.random.default_rng(6).uniform(box[0], box[1], (500, 3))
+    truth = density(near, points)
+    assert np.abs(field.density(points) - truth).mean() < 0.01 * truth.mean()
+    assert (field.density(np.array([[header.high[0] + 0.1, 0.1, 0], [500, 0, 0]])) == 0).all()
+    with pytest.raises(MiNtfError, match=r"no splat has its centre in the box \[\[7"):
+        of_splats(splats, 128, bounds=np.array([[7.0, 7, 7], [8, 8, 8]]))
+
+
+def test_the_box_of_most_splats_is_proposed_where_a_few_are_far():
+    splats = on_mesh(trimesh.creation.icosphere(3), 2000)
+    assert splat_field.crowded_box(splats) is None
+    far = Splats(np.where(np.arange(2000)[:, None] % 200 == 0, 50 * splats.centres, splats.centres), splats.scales,
+                 splats.rotations, splats.opacities, splats.colours)
+    box = splat_field.crowded_box(far)
+    assert ((box[0] < -1) & (box[0] > -1.3) & (box[1] > 1) & (box[1] < 1.3)).all()
+
+
 def test_voxels_become_longer_where_their_blocks_would_be_too_many(monkeypatch):
     splats = on_mesh(trimesh.creation.icosphere(3), 2000)
     monkeypatch.setattr(splat_field, "MOST_BLOCKS", 300)

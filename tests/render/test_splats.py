@@ -1,6 +1,7 @@
 """Gaussian splats as a field: the command, the field in memory, and the shadow on a floor."""
 
 import json
+import re
 
 import mitsuba as mi
 import numpy as np
@@ -9,6 +10,7 @@ import trimesh
 from helpers.programs import run_program
 from helpers.splats import on_mesh, write_ply
 
+from mi_ntf.cli import main
 from mi_ntf.evaluate.metrics import relative_rmse
 from mi_ntf.field import Field
 
@@ -58,7 +60,22 @@ def test_the_command_writes_a_field_that_others_read(tmp_path):
     assert "scatters  as a surface" in info.stdout and "splats.ply" in info.stdout
 
 
+def test_far_splats_are_named_with_the_box_that_leaves_them_out(tmp_path, capsys):
+    splats = on_mesh(torus(tmp_path), 500)
+    splats.centres[::200] *= 40
+    path, output = write_ply(tmp_path / "splats.ply", splats), tmp_path / "field.safetensors"
+    words = ["import", str(path), "-o", str(output), "--resolution", "32"]
+    assert main(words) == 0
+    note = r"note: a few splats .* make the box (\d+) times .*; (--bounds=\S+) leaves"
+    found = re.search(note, capsys.readouterr().out)
+    assert int(found[1]) > 10
+    assert main([*words, found[2], "--overwrite"]) == 0
+    printed = capsys.readouterr().out
+    assert "splats: 497 with" in printed and "note:" not in printed
+
+
 @pytest.mark.parametrize(("words", "expected"), [
+    (["--bounds=0,0,0,1,1"], "expected six numbers"), (["--bounds=1,0,0,0,1,1"], "expected two corners, the lower"),
     (["--scale", "2"], "--scale is for grids"), (["--resolution", "3"], "expected 16 to 2048"),
 ])
 def test_options_that_do_not_fit_are_refused(tmp_path, words, expected):

@@ -47,10 +47,10 @@ Every collision scatters (the single-scattering albedo is 1), with the field's r
 the phase function of Henyey and Greenstein in place of a surface's reflectance. Media may overlap: the ``nrf``
 integrator adds their densities. Stock volumetric integrators know one medium at a time and are no reference there.
 
-A `shadow_catcher` keeps the colours that its file emits, and the scene's lights stand for those of its photographs. Each
-colour has as a factor the fraction of the lights' irradiance, from all sides and by red, green and blue, that other
-fields, media and surfaces let through to the point. A `shadow_catcher` casts shadows on them, and none on itself. Only
-``nrf`` renders this.
+A `shadow_catcher` keeps the colours that its file emits, and the scene's lights stand for those of its photographs.
+Each colour has as a factor the fraction of the lights' irradiance, from all sides and by red, green and blue, that
+other fields, media and surfaces let through to the point. A `shadow_catcher` casts shadows on them, and none on
+itself. Only ``nrf`` renders this.
 
 A medium in a ``shapegroup`` lies where each ``instance`` places it, under the ``nrf`` integrator alone.
 
