@@ -4,6 +4,7 @@ import os
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import chain, count
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -41,9 +42,9 @@ def swap(scene: Path, field: Path, out: Path, shapes: str = "", parameters: dict
 
     `shapes` chooses them as the option ``--shapes`` does: by names, by ``not:`` and names, or all ("" by default).
     Shapes that emit light or hold a sensor stay. `parameters` become the defaults of $names. The field sits in one
-    bounding ``sphere`` with a ``null`` BSDF, with the centre and radius of the capture. The integrator becomes ``nrf``
-    with ``<default name="visibility" value="auto"/>``. It keeps `hide_emitters`, the channels of ``aov`` that ``nrf``
-    has, and `max_depth`, also where it was the old integrator's default.
+    bounding ``sphere``, "field", with a ``null`` BSDF and the centre and radius of the capture. The integrator becomes
+    ``nrf`` with ``<default name="visibility" value="auto"/>``. It keeps `hide_emitters`, the channels of ``aov`` that
+    ``nrf`` has, and `max_depth`, also where it was the old integrator's default.
 
     Sensors, films, emitters, parameters and includes stay. An include that holds shapes or the integrator is inlined,
     with the defaults of ``$parameters`` in its name. BSDFs, textures and groups that nothing refers to any more are
@@ -60,6 +61,7 @@ def swap(scene: Path, field: Path, out: Path, shapes: str = "", parameters: dict
     content = _Content(root, scene)
     sphere = _bounding_sphere(similarity, os.path.relpath(field, out.parent))
     replaced, unchanged = content.replace(shapes, sphere)
+    sphere.set("id", content.free_name("field"))
     notes = _replace_integrator(root, content.defaults)
     content.drop_unused()
     scene_xml.move_paths(root, scene.parent, out.parent, content.defaults, sphere.find("medium/string"))
@@ -100,6 +102,12 @@ class _Content:
         replaced, unchanged = ([str(shape) for shape, yes in zip(shapes, chosen, strict=True) if yes is is_new]
                           for is_new in (True, False))
         return replaced, unchanged + self._lights()
+
+    def free_name(self, name: str) -> str:
+        """Return `name`, or with a number if an element of the scene has that id."""
+        taken = {self._value(e.get("id", "")) for tree in (self.root, *self.includes.reached(self.root))
+                 for e in tree.iter()}
+        return next(n for n in chain([name], (f"{name}_{i}" for i in count(2))) if n not in taken)
 
     def drop_unused(self) -> None:
         """Drop definitions that neither the scene nor its includes refer to, until all are used."""

@@ -66,6 +66,7 @@ def test_meshes_become_one_sphere_with_the_field(folder):
     spheres = [s for s in root.findall("shape") if s.get("type") == "sphere"]
     assert len(spheres) == 1 and len(root.findall("shape")) == 2
     sphere = spheres[0]
+    assert sphere.get("id") == "field"
     assert {k: float(sphere.find("point").get(k)) for k in "xyz"} == {"x": 0.25, "y": -1.0, "z": 3.0}
     assert sphere.find("point").get("name") == "center"
     assert (sphere.find("float").get("name"), float(sphere.find("float").get("value"))) == ("radius", 1.75)
@@ -73,6 +74,15 @@ def test_meshes_become_one_sphere_with_the_field(folder):
     medium = sphere.find("medium")
     assert (medium.get("type"), medium.get("name")) == ("nrf", "interior")
     assert medium.find("string").attrib == {"name": "filename", "value": "f.safetensors"}
+
+
+def test_the_sphere_has_a_name_of_its_own(folder):
+    """Sensors and lights of includes count, as do values of $names."""
+    (folder / "sensor.xml").write_text(SENSOR.replace("<sensor ", '<sensor id="field" '))
+    (folder / "mesh.xml").write_text(MESH.replace('id="wood"', 'id="field_$n"').replace(
+        "<integrator", '<default name="n" value="2"/><integrator'))
+    sphere = _swap(folder, folder / "scene.xml").find("shape[@type='sphere']")
+    assert sphere.get("id") == "field_3"
 
 
 def test_integrator_is_replaced_and_keeps_depth_and_hide_emitters(folder):
@@ -201,7 +211,7 @@ def test_chosen_shapes_are_replaced_and_all_others_stay(own):
         "replaced: cow (obj), instance2; kept: table (cube), cube, instance1, floor (rectangle), lamp (area light), "
         "disk (area light), glow (area), sun (point)")
     root = ET.parse(own / "scene.xml").getroot()
-    assert _shapes(root) == ["table", "sphere", "merge", "merge", "lamp", "merge", "cube", "grass", "cylinder",
+    assert _shapes(root) == ["table", "field", "merge", "merge", "lamp", "merge", "cube", "grass", "cylinder",
                              "instance", "disk", "floor"]
 
 
@@ -209,7 +219,7 @@ def test_all_but_a_floor_is_replaced(own):
     report = swap(own / "mesh.xml", own / "f.safetensors", own / "scene.xml", "not:floor")
     assert report.replaced == ["table (cube)", "cow (obj)", "cube", "instance1", "instance2"]
     root = ET.parse(own / "scene.xml").getroot()
-    assert _shapes(root) == ["sphere", "merge", "merge", "lamp", "disk", "floor"]
+    assert _shapes(root) == ["field", "merge", "merge", "lamp", "disk", "floor"]
 
 
 def test_materials_that_others_refer_to_are_kept_out_of_replaced_shapes(own):

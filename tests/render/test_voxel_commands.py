@@ -1,6 +1,8 @@
 """Commands on fields of voxels: a ball of smoke, and one that is denser than a texel resolves."""
 
+import csv
 import json
+import re
 from pathlib import Path
 
 import mitsuba as mi
@@ -10,7 +12,10 @@ import trimesh
 
 from mi_ntf import Field, cli, load_scene
 from mi_ntf.data import grids
+from mi_ntf.evaluate.tradeoff import references
+from mi_ntf.evaluate.tradeoff.ways import Subject
 from mi_ntf.importing import import_grid
+from mi_ntf.render.maps.building import SAMPLES
 from mi_ntf.view.session import Session
 
 SCENE = """<scene version="3.0.0"><default name="x" value="3"/>
@@ -63,6 +68,40 @@ def test_surface_of_voxels_lies_at_the_level(scene, capsys):
     mesh = trimesh.load(json.loads(capsys.readouterr().out)["file"], process=False)
     assert mesh.is_watertight and mesh.volume > 0
     np.testing.assert_allclose(np.linalg.norm(mesh.vertices, axis=1), RADIUS / 2, atol=0.04)
+
+
+def test_swap_puts_voxels_in_place_of_a_mesh(scene):
+    """The swapped scene renders as the one that was written by hand, whose sphere is larger."""
+    mesh = scene.with_name("mesh.xml")
+    shape = '<shape type="sphere" id="ball"/></scene>'
+    mesh.write_text(re.sub(r"<integrator.*?</integrator>", '<integrator type="direct"/>',
+                           re.sub(r"<shape.*", shape, scene.read_text(), flags=re.S), flags=re.S))
+    run("swap", mesh, scene.with_name("ball.safetensors"), "-o", scene.with_name("swapped.xml"), "--overwrite")
+    swapped = load_scene(scene.with_name("swapped.xml"), {"visibility": "transmittance_map"})
+    assert "field.interior_medium.density" in mi.traverse(swapped)
+    assert np.array(mi.render(swapped, spp=64, seed=1)).mean() == pytest.approx(
+        np.array(mi.render(load_scene(scene, {}), spp=64, seed=2)).mean(), rel=0.05)
+
+
+def test_references_of_a_study_march_twice_the_default_steps(scene):
+    """The default of the integrator is 0, and stands for at least one step for each voxel."""
+    subject = Subject(scene, {})
+    assert subject.properties["samples"] == 0
+    assert references.marched(subject).properties(subject)["samples"] == 2 * SAMPLES
+
+
+@pytest.mark.slow
+def test_tradeoff_studies_voxels(scene, tmp_path):
+    """Methods that have no networks to train have a row, and the others have none."""
+    study = scene.with_name("study.xml")
+    study.write_text(scene.read_text().replace("transmittance_map", "$visibility").replace(
+        "<default ", '<default name="visibility" value="auto"/><default name="spp" value="1"/><default ', 1))
+    run("tradeoff", study, "-o", tmp_path, "--budget", "20s")
+    with (tmp_path / "tradeoff.csv").open() as file:
+        ways = {row["way"] for row in csv.DictReader(file)}
+    assert ways >= {"raymarch", "transmittance map", "transmittance atlas", "no shadows", "stock volpath"}
+    assert not ways & {"ray network", "neural transmittance", "visibility MLP"}
+    assert (tmp_path / "index.html").is_file()
 
 
 def test_sequence_and_viewer_show_voxels(scene):

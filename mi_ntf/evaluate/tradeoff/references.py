@@ -33,7 +33,7 @@ def marched(subject: Subject) -> Way:
     """
     properties = subject.properties
     light_samples = properties["light_samples"] or (SAMPLED if subject.lights > SAMPLED else 0)
-    return Way("raymarch", (("samples", min(2 * int(properties["samples"]), 8192)), ("light_samples", light_samples),
+    return Way("raymarch", (("samples", subject.finer_steps), ("light_samples", light_samples),
                             ("bounces", "paths")))
 
 

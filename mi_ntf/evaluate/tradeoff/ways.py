@@ -11,6 +11,7 @@ import mitsuba as mi
 from ...core.errors import MiNtfError
 from ...infer.visibility import REGISTRY
 from ...render.lights import scene_lights
+from ...render.maps import building
 from ...render.plugins.registration import load_scene
 from ...render.scene import changed, environment_option, scene_file
 from ...render.scene.environment_option import Environment
@@ -26,6 +27,8 @@ PROPERTIES = ("samples", "light_samples", "environment_lights", "map_resolution"
 """Properties of the scene's integrator that all ways use; its method, limits, map files and outputs are left out."""
 STOCK, MESH, BOUND = "volpath", "mesh", "none"
 """Ways besides the visibility methods, and the method without visibility, which is a bound, not a choice."""
+MOST_STEPS = 8192
+"""Largest number of steps of a march that the integrator takes."""
 SAMPLED = 4
 """Lights sampled at each point in place of all; a few suffice, since each sample of a pixel takes others."""
 BASELINES = ("ray_network", "visibility_mlp", "transmittance_volume")
@@ -48,6 +51,7 @@ class Subject:
     - lights: number of lights with the scene's own dials
     - environment: true if an environment is cut into lights
     - properties: values of `PROPERTIES` of the scene's integrator
+    - finer_steps: twice the steps of the scene's marches
     - methods: names of the visibility methods that support all media
 
     Raises MiNtfError where the scene cannot be rendered.
@@ -68,6 +72,8 @@ class Subject:
         self.environment = any(d.cells for d in light.discrete)
         self.lights = len(light.rows.power) + len(light.sampled)
         self.methods = [name for name, method in REGISTRY.items() if all(map(method.needs, self.media))]
+        steps = settings.samples or max(map(building.samples, self.media))
+        self.finer_steps = min(2 * steps, MOST_STEPS)
         self._scenes: dict[int, mi.Scene] = {}
 
     def texels(self, method: str) -> int:
@@ -163,7 +169,7 @@ def finer(subject: Subject, methods: list[str]) -> list[Way]:
               if "map_resolution" in REGISTRY[name].dials]
     if values["map_components"] != 2 and values["map_source"] == "field":
         dials += [(name, "map_components", 2) for name in methods if "map_components" in REGISTRY[name].dials]
-    dials.append(("raymarch", "samples", min(2 * int(values["samples"]), 8192)))
+    dials.append(("raymarch", "samples", subject.finer_steps))
     if values["bounces"] == "auto" and not 0 <= int(values["max_depth"]) <= 2:
         dials += [(name, "bounces", "paths") for name in methods if REGISTRY[name].automatic]
     if subject.environment and not values["light_samples"]:
