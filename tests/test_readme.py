@@ -37,7 +37,12 @@ def folder(tmp_path_factory):
     with a COLMAP model, a grid, two images."""
     folder = tmp_path_factory.mktemp("readme")
     shutil.copytree(ROOT / "scenes", folder / "scenes")
-    shutil.copytree(ROOT / "docs/gallery", folder / "docs/gallery")
+    shutil.copytree(ROOT / "docs/gallery", folder / "docs/gallery", ignore=shutil.ignore_patterns("assets"))
+    script = folder / "docs/gallery/assets.py"
+    text = script.read_text()
+    for number, fewer in (("= 96", "= 12"), ("= 40_000", "= 400"), ("= 192", "= 24")):
+        text = text.replace(number, fewer)
+    script.write_text(text)
     for scene in folder.rglob("*.xml"):
         _make_coarse(scene)
     sys.path.insert(0, str(ROOT / "examples"))

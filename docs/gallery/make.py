@@ -1,11 +1,14 @@
 """Render the pictures of the gallery page: docs/gallery/NAME.xml becomes NAME.jpg.
 
     python docs/gallery/make.py [NAME ...] [--size 400] [--out docs/gallery]
+
+Volumes of the scenes that are not in ``docs/gallery/assets`` yet are made first, by ``assets.py``.
 """
 
 import time
 from pathlib import Path
 
+import assets
 import mitsuba as mi
 import numpy as np
 import tyro
@@ -24,7 +27,9 @@ def main(names: tyro.conf.Positional[tuple[str, ...]] = (), size: int = 400, spp
          out: Path = GALLERY) -> None:
     """Render the scenes `names`, or all."""
     out.mkdir(parents=True, exist_ok=True)
-    for name in names or sorted(path.stem for path in GALLERY.glob("*.xml")):
+    names = names or tuple(sorted(path.stem for path in GALLERY.glob("*.xml")))
+    assets.make(names)
+    for name in names:
         start = time.perf_counter()
         parameters = {"res": str(size)} | ({} if spp is None else {"spp": str(spp)})
         image = np.array(mi.render(mi.load_file(str(GALLERY / f"{name}.xml"), **parameters)))
