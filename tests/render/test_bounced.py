@@ -136,3 +136,28 @@ def test_a_field_that_no_line_meets(tmp_path):
               "ball": pictures.ball(pictures.save(tmp_path, field), resolution=64)}  # fmt: skip
     image = pictures.render("raymarch", things, max_depth=-1)
     assert np.isfinite(image).all()
+
+
+def test_an_albedo_that_is_set_takes_part_in_bounces(skin, monkeypatch, tmp_path):
+    """The patches of an earlier picture, in memory or in the user's cache, do not stand for those of another albedo."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    integrator = {"type": "nrf", "visibility": "raymarch", "max_depth": -1, "bounces": "radiosity", "samples": 96}
+
+    def right_ball(scene):
+        return np.array(mi.render(scene, spp=16))[:, 13:, :3].mean((0, 1))
+
+    def darkened(scene):
+        parameters = mi.traverse(scene)
+        key = "ball0.interior_medium.albedo"
+        parameters[key] = 0 * parameters[key]
+        parameters.update()
+        return right_ball(scene)
+
+    things = {"type": "scene", "integrator": integrator, "sensor": look(), "light": SUN, **pair(skin)}
+    monkeypatch.setenv("MI_NTF_CACHE", "off")
+    expected = darkened(mi.load_dict(things))
+    monkeypatch.setenv("MI_NTF_CACHE", "on")
+    scene = mi.load_dict(things)
+    bright = right_ball(scene)
+    assert bright[0] > 1.01 * expected[0]
+    np.testing.assert_allclose(darkened(scene), expected, rtol=1e-3)

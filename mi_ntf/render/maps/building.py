@@ -128,7 +128,8 @@ def build(name: str, medium: NRFMedium, table: LightTable | None, options: Optio
             return make(map_file.read(Path(log.resolve(options.map_file)), medium, lights, options, channels))
         if not options.cache:
             return make()
-        if isinstance(medium.field, ChangedField) and user_cache.mode() == "on":
+        field = medium.field
+        if isinstance(field, ChangedField) and field.digest != field.original.digest and user_cache.mode() == "on":
             # A density that was set in the scene has a name in this process alone.
             with user_cache.switched("memory"):
                 return keep(make, channels=channels, step=step, directions=directions, options=options,

@@ -20,7 +20,7 @@ from ...infer.voxel_parameters import CHANNELS, Lattice, VoxelParameters
 from .loaded import ChangedField, LoadedField, VolumeField
 
 _changes = itertools.count(1)
-"""Numbers of densities that were set, in place of a hash of all voxels."""
+"""Numbers of values that were set, in place of a hash of all voxels."""
 
 
 class FieldParameters:
@@ -34,7 +34,7 @@ class FieldParameters:
     Attributes
     ----------
     field
-        The field with the density that was set.
+        The field with the values that were set.
     """
 
     def __init__(self, field: LoadedField | VolumeField) -> None:
@@ -62,7 +62,7 @@ class FieldParameters:
     def changed(self, keys: Sequence[str]) -> bool:
         """Take over the tensors called `keys`; return True if any of them is a parameter of the field."""
         mine = [key for key in self.tensors if key in keys]
-        voxels = self.voxels
+        voxels, grid, digest = self.voxels, self.field.grid, self.field.digest
         for key in mine:
             tensor = self.tensors[key]
             if key == voxels.density_name:
@@ -75,12 +75,14 @@ class FieldParameters:
             if key == voxels.density_name:
                 voxels.density = tensor.array
                 grid = voxels.changed_grid()
-                self.field = ChangedField(self._read, grid, f"{self._read.digest} changed {next(_changes)}")
+                digest = f"{self._read.digest} changed {next(_changes)}"
             else:
                 voxels.reflectance[self._names[key]] = tensor.array
                 self._set.add(self._names[key])
         if self._set & {"roughness", "specular"}:
-            self.field = ChangedField(self._read, _with_gloss(self.field.grid, voxels.gloss()), self.field.digest)
+            grid = _with_gloss(grid, voxels.gloss())
+        if mine:
+            self.field = ChangedField(self._read, grid, digest, f"{self._read.digest} changed {next(_changes)}")
         return bool(mine)
 
     def reflectance(self, source: GridField | VoxelVolume) -> Reflecting:

@@ -49,6 +49,11 @@ class LoadedField:
     emissive = False
 
     @property
+    def appearance(self) -> str:
+        """Hash of density and reflectance."""
+        return self.digest
+
+    @property
     def similarity(self) -> Similarity:
         """Transform from the capture to the field."""
         return self.header.similarity
@@ -89,6 +94,11 @@ class VolumeField:
         return self.grid.digest
 
     @property
+    def appearance(self) -> str:
+        """Hash of density and reflectance."""
+        return self.digest
+
+    @property
     def header(self) -> NoReturn:
         """Raise MiNtfError, since there is no trained field."""
         raise MiNtfError(f"{self.name} is no trained field, so it has no networks; choose "
@@ -100,11 +110,15 @@ class VolumeField:
 
 @dataclass(frozen=True)
 class ChangedField:
-    """The field `original` with voxels that were set in the scene; `digest`: its hash, another one for each density."""
+    """The field `original` with voxels that were set in the scene.
+
+    `digest` is another one for each density, and `appearance` for each density or reflectance, of this process alone.
+    """
 
     original: LoadedField | VolumeField
     grid: GridField | VoxelVolume
     digest: str
+    appearance: str
 
     @property
     def similarity(self) -> Similarity:

@@ -17,6 +17,7 @@ from ...infer.irradiance import Irradiance
 from ...infer.types import Float, Mask, Ray, UInt32, Vector, Vector3
 from .. import log, user_cache
 from ..maps import building
+from ..scene.loaded import ChangedField
 from ..scene.media import NRFMedium
 from ..scene.settings import Settings
 from .shadow import Part
@@ -67,8 +68,10 @@ class Patches:
     def __init__(self, scene: FieldScene) -> None:
         self._key = _key(scene)
         self.skins = [Skin(part.medium) for part in scene.parts]
-        arrays = user_cache.cached("patches", user_cache.key(*self._key), lambda: self._search(scene),
-                                 placed=len(self.skins) > 1)
+        # Values that were set in the scene have a name in this process alone.
+        changed = any(isinstance(part.medium.field, ChangedField) for part in scene.parts)
+        arrays = self._search(scene) if changed else user_cache.cached(
+            "patches", user_cache.key(*self._key), lambda: self._search(scene), placed=len(self.skins) > 1)
         for number, skin in enumerate(self.skins):
             for name in Skin.ARRAYS:
                 setattr(skin, name, arrays[f"{number}.{name}"])
@@ -135,7 +138,7 @@ class Patches:
 def _key(scene: FieldScene) -> tuple[object, ...]:
     """Return all inputs of patches. The patches of a single field do not depend on its placement."""
     media = [part.medium for part in scene.parts]
-    fields = [(m.field.digest, m.representation, m.field.grid.resolution, len(media) > 1 and m.frame.placement())
+    fields = [(m.field.appearance, m.representation, m.field.grid.resolution, len(media) > 1 and m.frame.placement())
               for m in media]
     return mi.variant(), min(radiosity.STEPS, scene.settings.samples or radiosity.STEPS), tuple(fields)
 
