@@ -46,12 +46,13 @@ def _run(words: Sequence[str]) -> int:
 
         return main(words[1:])
     assert words[0] == "python", words
-    former, sys.argv = sys.argv, list(words[1:])
+    former, sys.argv, path = sys.argv, list(words[1:]), sys.path[:]
     try:
         if words[1] == "-m":
             sys.argv = list(words[2:])
             runpy.run_module(words[2], run_name="__main__", alter_sys=True)
         else:
+            sys.path.insert(0, str(Path(words[1]).parent.absolute()))  # as of a script that Python runs
             runpy.run_path(words[1], run_name="__main__")
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else 0 if end.code is None else 1
@@ -59,7 +60,7 @@ def _run(words: Sequence[str]) -> int:
         traceback.print_exc()
         return 1
     finally:
-        sys.argv = former
+        sys.argv, sys.path[:] = former, path
     return 0
 
 

@@ -23,7 +23,7 @@ from ..scene.settings import Settings
 from .shadow import Part
 
 SEED = 7
-LIGHT_SAMPLES = 16
+LIGHT_SAMPLES = 64
 """Least number of sampled lights of a patch. They are the same for all samples of a pixel."""
 
 
@@ -173,7 +173,8 @@ def _direct(scene: FieldScene, part: Part, skin: Skin) -> np.ndarray:
         return np.zeros((0, 3))
     one, zero = dr.ones(mi.Float, n), dr.zeros(mi.Float, n)
     x, normal = radiosity.above(skin.position, skin.normal), tuple(_vector(skin.normal))
-    white = shade.Points(tuple(_vector(x)), normal, shade.Reflectance(normal, (one, one, one), one, zero, zero))
+    reflectance = shade.Reflectance(normal, (one, one, one), one, (zero, zero, zero), zero)
+    white = shade.Points(tuple(_vector(x)), normal, reflectance)
     light = scene.reflect(part, white, dr.opaque(mi.UInt32, SEED), surface=True, light_samples=LIGHT_SAMPLES)
     return _rows(light) * np.pi
 
