@@ -19,15 +19,14 @@ BOXES = """<scene version="3.9.0">
     <sensor type="perspective" id="camera"><float name="fov" value="35"/>
         <transform name="to_world"><lookat origin="2, 4, 7" target="-0.4, 0.1, 0" up="0, 1, 0"/></transform>
         <sampler type="independent"> <integer name="sample_count" value="16"/> </sampler>
-        <film type="hdrfilm"> <integer name="width" value="96"/> <integer name="height" value="96"/> </film>
-    </sensor>
+        <film type="hdrfilm"> <integer name="width" value="96"/> <integer name="height" value="96"/> </film></sensor>
     <emitter type="point" id="lamp">
         <point name="position" x="4" y="5" z="3"/> <rgb name="intensity" value="150"/> </emitter>
     <shape type="cube" id="box"><bsdf type="diffuse"> <rgb name="reflectance" value="0.7, 0.3, 0.2"/> </bsdf></shape>
     <shape type="cube" id="small_box"><transform name="to_world"><scale value="0.4"/><translate y="1.4"/></transform>
         <bsdf type="diffuse"> <rgb name="reflectance" value="0.2, 0.4, 0.7"/> </bsdf></shape>
-    <shape type="rectangle" id="floor"><transform name="to_world">
-        <rotate x="1" angle="-90"/><scale value="5"/><translate y="-1"/></transform></shape>
+    <shape type="rectangle" id="floor">
+        <transform name="to_world"><rotate x="1" angle="-90"/><scale value="5"/><translate y="-1"/></transform></shape>
 </scene>"""
 
 
