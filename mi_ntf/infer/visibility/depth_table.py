@@ -15,9 +15,9 @@ from ..profile import DepthProfile
 from ..types import Float, Vector
 from .raymarch import MAX_OPTICAL_DEPTH
 
-FRACTIONS = (1e-3, 0.1, 0.3, 0.6, 1.0)
-"""Fractions of the depth at the places of a texel; the first is where matter begins. They lie between equal steps of
-the depth, which thin smoke needs, and of its root, which dense smoke needs. That is a choice and not derived."""
+FRACTIONS = (1e-3, 0.1, 0.4, 0.7, 1.0)
+"""Fractions of the depth at the places of a texel; the first is where matter begins. The second is near the light, since
+dense smoke loses most light there. Equal steps follow. That is a choice and not derived."""
 FAINTEST = 1e-4
 """Optical depth of a whole ray below which it is clear."""
 SHORTEST = 1e-6
