@@ -8,6 +8,7 @@ import difflib
 import io
 import re
 import shutil
+import signal
 import sys
 import textwrap
 import traceback
@@ -60,6 +61,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"mi-ntf: error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt as error:
+        if arguments is None:  # Mitsuba's handler, in whatever thread, may raise the signal again while Python ends
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
         print(f"mi-ntf: {str(error) or 'stopped'}", file=sys.stderr)
         return 130
     except Exception as error:

@@ -35,18 +35,13 @@ class Command:
                                             env={**os.environ, "XDG_CACHE_HOME": str(folder / "cache")})
 
     def interrupt(self, when: Callable[[], bool]) -> tuple[int, str]:
-        """Press Ctrl-C as soon as `when` is true; return the exit code of a shell and the last line.
-
-        A shell reports 130 for an exit code of 130 and for death by SIGINT. The latter can come after the command's
-        own sentence, because Mitsuba's handler, in whatever thread it runs, raises the signal a second time.
-        """
+        """Press Ctrl-C as soon as `when` is true; return the exit code and the last line."""
         end = time.monotonic() + 120
         while not when():
             assert self.process.poll() is None and time.monotonic() < end, self.said.read_text()
             time.sleep(0.02)
         os.killpg(self.process.pid, signal.SIGINT)
         code = self.process.wait(60)
-        code = 130 if code == -signal.SIGINT else code
         assert "Traceback" not in self.said.read_text()
         return code, self.said.read_text().splitlines()[-1].removeprefix("\x1b[0m")  # end of a warning of Mitsuba's
 

@@ -79,7 +79,7 @@ def test_own_mesh_from_photographs_to_an_object_on_its_floor(tmp_path):
     """The floor stays as it is, and lies in the shadow of the field where it lay in that of the meshes."""
     pytest.importorskip("torch")
     printed = _run("own_mesh.py", "--out", tmp_path, "--views", 8, "--size", 32, "--spp", 4, "--steps", 80)
-    assert "replaced: box" in printed and "small_box" in printed and "kept: floor" in printed
+    assert "replaced: box (cube), small_box (cube); kept: floor (rectangle), lamp (point)" in printed
     assert (tmp_path / "compared.png").is_file()
     relit, mesh = (read_image(tmp_path / name)[..., :3].mean(-1) for name in ("relit.exr", "mesh.exr"))
     assert relit.shape == mesh.shape == (96, 96)

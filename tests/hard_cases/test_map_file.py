@@ -64,7 +64,7 @@ WRONG = {
     "a list": (attribute("[1, 2]"), "is no JSON object"),
     "a number": (attribute(3.0), "is no JSON object"),
     "endless JSON": (attribute("[" * 50_000), "is no JSON object"),
-    "an empty object": (attribute("{}"), "texel_format is None, the scene's is"),
+    "an empty object": (attribute("{}"), "field is None, the scene's is"),
     "where is text": (about(where="here"), "where is here, the scene's is"),
     "where is deep": (about(where=[[1.0], 2.0, 3.0]), r"where is \[\[1.0\], 2.0, 3.0\], the scene's is"),
     "where is huge": (about(where=[10**400, 0, 0]), "where is "),

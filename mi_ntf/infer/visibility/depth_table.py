@@ -16,8 +16,8 @@ from ..types import Float, Vector
 from .raymarch import MAX_OPTICAL_DEPTH
 
 FRACTIONS = (1e-3, 0.1, 0.4, 0.7, 1.0)
-"""Fractions of the depth at the places of a texel; the first is where matter begins. The second is near the light, since
-dense smoke loses most light there. Equal steps follow. That is a choice and not derived."""
+"""Fractions of the depth at the places of a texel; the first is where matter begins. The second is near the light,
+since dense smoke loses most light there. Equal steps follow. That is a choice and not derived."""
 FAINTEST = 1e-4
 """Optical depth of a whole ray below which it is clear."""
 SHORTEST = 1e-6

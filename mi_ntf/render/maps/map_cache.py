@@ -33,10 +33,10 @@ _used: set[str] = set()
 
 def description(medium: NRFMedium, options: Options) -> dict[str, object]:
     """Return the inputs of a map apart from its lights, as a map file records them."""
-    return {"texel_format": FORMAT, "field": medium.field.digest, "representation": medium.representation,
+    return {"field": medium.field.digest, "representation": medium.representation,
             "grid": medium.field.grid.resolution, "map_resolution": options.map_resolution,
             "map_source": options.map_source, "map_components": components(medium, options),
-            "samples": 2 / options.step}
+            "samples": 2 / options.step, "texel_format": FORMAT}
 
 
 def components(medium: NRFMedium, options: Options) -> int:
