@@ -1,6 +1,8 @@
 """Fixtures shared by all tests."""
 
 import os
+import sys
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -19,3 +21,14 @@ def rng() -> np.random.Generator:
 def shared_bakes() -> None:
     """Bake equal fields of different tests once."""
     bakes.share()
+
+
+@pytest.fixture(autouse=True)
+def kept_log_levels() -> Iterator[None]:
+    """Give Mitsuba and Dr.Jit the levels back that a render by its command has set for the whole process."""
+    packages = [sys.modules[name] for name in ("mitsuba", "drjit") if name in sys.modules]
+    packages = [package for package in packages if hasattr(package, "log_level")]
+    levels = [package.log_level() for package in packages]
+    yield
+    for package, level in zip(packages, levels):
+        package.set_log_level(level)
