@@ -1,7 +1,9 @@
 """The ``nrf`` integrator against stock ``volpath``, analytic fields and meshes."""
 
 import dataclasses
+import gc
 import time
+import weakref
 
 import mitsuba as mi
 import numpy as np
@@ -12,6 +14,7 @@ from helpers.scenes import nrf
 from mi_ntf.core import field_file
 from mi_ntf.core.architecture import FAST, Encoding, Header
 from mi_ntf.render.scene import loaded
+from mi_ntf.render.scene.media import find_media
 
 SEEDS = 4
 
@@ -64,6 +67,27 @@ def test_map_and_network_field_agree_with_grid(blobs):
     assert relative(tmap) < 0.08
     # Two renders of 64 spp differ by some 2 % in noise; trilinear voxels of ln σ add little.
     assert relative(network) < 0.04
+
+
+@pytest.mark.parametrize("options", [
+    {"visibility": "transmittance_map", "map_memory": 0.0025}, {"visibility": "transmittance_atlas", "max_depth": 3},
+    {"visibility": "auto", "max_error": 0.5}, {"visibility": "raymarch", "aovs": "depth,visibility"}])
+def test_a_scene_is_freed_when_it_is_let_go(blobs, options):
+    """Neither maps nor plugins, whose numbers are part of kernels' code, wait for Python's collector of cycles."""
+    floor = {"floor": {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0.4, -3.5, 0.3])
+                       .rotate([1, 0, 0], -90).scale(12)}}
+    lights = {kind: scenes.light(kind) for kind in ("directional", "point")}
+    gc.collect()
+    gc.disable()
+    try:
+        scene = scenes.scene(blobs, nrf(map_resolution=16, environment_lights=4, **options), lights, shapes=floor,
+                             size=8, spp=1, medium={"resolution": 64})
+        mi.render(scene)
+        parts = [weakref.ref(part) for part in (scene.integrator(), *find_media(scene))]
+        del scene
+        assert len(parts) == 2 and not any(part() for part in parts)
+    finally:
+        gc.enable()
 
 
 def test_empty_field_is_black_and_clear(tmp_path):

@@ -5,6 +5,7 @@ from a map file or from the cache if possible.
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import cast
@@ -128,20 +129,18 @@ def build(name: str, medium: NRFMedium, table: LightTable | None, options: Optio
             return make(map_file.read(Path(log.resolve(options.map_file)), medium, lights, options, channels))
         if not options.cache:
             return make()
-        field = medium.field
-        if isinstance(field, ChangedField) and field.digest != field.original.digest and user_cache.mode() == "on":
-            # A density that was set in the scene has a name in this process alone.
-            with user_cache.switched("memory"):
-                return keep(make, channels=channels, step=step, directions=directions, options=options,
-                            make_part=make_part)
         # A run of several gets all of the memory, and its maps are not needed again in this picture.
         limit = options.map_memory * 2**20 if lights.count == lights.total else 0
         split = make_part is not None and limit and lights.count > 1
-        return map_cache.cached(
-            map_cache.key(medium, lights, options, channels, step), make,
-            lights.count * options.map_resolution**2 * channels, limit,
-            light_keys=map_cache.light_keys(medium, lights, options, channels, step) if split else None,
-            make_part=make_part, dtype=np.dtype(DTYPES[options.half]), placed=directions is None)
+        field = medium.field
+        # A density that was set in the scene has a name in this process alone.
+        local = isinstance(field, ChangedField) and field.digest != field.original.digest
+        with user_cache.switched("memory") if local and user_cache.mode() == "on" else nullcontext():
+            return map_cache.cached(
+                map_cache.key(medium, lights, options, channels, step), make,
+                lights.count * options.map_resolution**2 * channels, limit,
+                light_keys=map_cache.light_keys(medium, lights, options, channels, step) if split else None,
+                make_part=make_part, dtype=np.dtype(DTYPES[options.half]), placed=directions is None)
 
     method = REGISTRY[name]
     constant = getattr(medium.source, "constant", None)

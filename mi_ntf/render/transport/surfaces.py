@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from typing import Protocol
-from weakref import WeakKeyDictionary
+from weakref import WeakKeyDictionary, WeakMethod
 
 import drjit as dr
 import mitsuba as mi
@@ -35,7 +35,7 @@ class Surfaces:
 
     shapes         those shapes
     hide_emitters  the camera does not see shapes that emit light
-    transmittance  transmittance of the fields
+    transmittance  transmittance of the fields, a method of the composition that owns these surfaces
     transmitting   light may cross a shape
     shining        the camera sees a shape that emits light
     """
@@ -43,7 +43,8 @@ class Surfaces:
     def __init__(self, scene: mi.Scene, shapes: Sequence[mi.Shape], hide_emitters: bool,
                  transmittance: Transmittance) -> None:
         environment.check_unscaled(scene.environment())
-        self.scene, self.transmittance = scene, transmittance
+        # A strong reference would be a cycle, which keeps scene and maps in memory until Python's collector runs.
+        self.scene, self._transmittance = scene, WeakMethod(transmittance)
         groups = shape_groups(scene)
         self._all = _scene_of([*groups, *shapes], scene.integrator())
         visible = [s for s in shapes if not (hide_emitters and s.is_emitter())]
@@ -54,6 +55,13 @@ class Surfaces:
         self.shining = any(s.is_emitter() for s in visible)
         deltas = (mi.has_flag(e.flags(), mi.EmitterFlags.Delta) for e in scene.emitters())
         self.lights_can_be_hit = not all(deltas)
+
+    @property
+    def transmittance(self) -> Transmittance:
+        """Transmittance of the fields."""
+        method = self._transmittance()
+        assert method
+        return method
 
     def first(self, ray: Ray) -> Array:
         """Return the first intersection of camera rays, a PreliminaryIntersection3f."""
