@@ -30,5 +30,5 @@ def kept_log_levels() -> Iterator[None]:
     packages = [package for package in packages if hasattr(package, "log_level")]
     levels = [package.log_level() for package in packages]
     yield
-    for package, level in zip(packages, levels):
+    for package, level in zip(packages, levels, strict=True):
         package.set_log_level(level)
