@@ -60,9 +60,9 @@ def camera_samples(strands: Sequence[Strand], maxt: Float, offset: Float, depth:
     size, the last one smaller. A sample stands for a portion and lies where the ray has lost a `depth` of it. So
     quantities that vary along the ray, above all the light's own transmittance, are averaged with the right weights. In
     its cell a sample lies where free flight through the pieces would end: the expectation over `depth` is right for
-    densities exponential across each piece. If several portions end in one cell, one sample stands for all that have
-    none yet. Samples follow the march continuously: rounding moves a sample slightly but does not choose among cells,
-    except in the last portion.
+    densities exponential across each piece. Samples follow the march continuously: rounding moves a sample slightly but
+    does not choose among cells, except in the last portion. So their places depend on the light alone, not on how cells
+    lie, and `depth` stratifies them over the samples of a pixel.
     """
     bundle = Bundle(strands, maxt, offset)
     uint = dr.uint32_array_t(type(bundle.base))
@@ -108,8 +108,14 @@ def _gather(bundle: Bundle, depth: Float, channels: int, size: Float,
             dr.scatter(target, value, count * rays + ray, room)
         return count + dr.select(room, uint(1), 0)
 
-    def put_here(count: UInt32, ray: UInt32, here: "_Here", light: Float, weight: Float) -> UInt32:
-        return put(count, ray, here.sample(here.quantile(light)), weight)
+    def put_portions(count: UInt32, ray: UInt32, depth: Float, here: "_Here", number: Float, end: Float) -> UInt32:
+        def body(count: UInt32, number: Float) -> tuple[UInt32, Float]:
+            light = (number + _place(depth, number)) * size
+            return put(count, ray, here.sample(here.quantile(light)), size), number + 1
+
+        after: UInt32 = ops.while_loop(state=(count, number), cond=lambda count, number: number < end, body=body,
+                                       label="samples of a cell")[0]
+        return after
 
     def none(count: UInt32, *rest: Array) -> UInt32:
         return count
@@ -117,11 +123,11 @@ def _gather(bundle: Bundle, depth: Float, channels: int, size: Float,
     def look(count: UInt32, ray: UInt32, depth: Float, here: "_Here", last: Mask, *open_sample: Float) -> State:
         # The light that is lost before the cell and after it, in portions.
         begin, end = ((1 - light) * per_light for light in (here.transmittance, here.transmittance - here.weight))
-        now = dr.floor(end)
-        early, number, place = _closing(depth, begin, now)
-        count = ops.if_stmt((count, ray, open_sample, dr.select(early, size, 0)), early, put, none,
-                           label="earlier sample")
-        count = ops.if_stmt((count, ray, here, place * size, number * size), number > 0, put_here, none, label="sample")
+        first, now = dr.floor(begin), dr.floor(end)
+        early = (now > first) & (_place(depth, first) < begin - first)
+        count = ops.if_stmt((count, ray, open_sample, size), early, put, none, label="earlier sample")
+        first = first + dr.select(early, 1, 0)
+        count = ops.if_stmt((count, ray, depth, here, first, now), first < now, put_portions, none, label="sample")
         # The portion that is still open: until its own place is reached, a sample is chosen by weight.
         aim, rest, low = now + _place(depth, now), end - now, dr.maximum(now, begin)
         reached, chance = aim < end, _uniform(depth, here.number) * rest
@@ -143,23 +149,6 @@ def _gather(bundle: Bundle, depth: Float, channels: int, size: Float,
     state: State = dr.zeros(uint, n), *(type(zero)(zero) for _ in range(len(bundle.strands) + 2))
     transmittance, (count, *_) = _walk(bundle, gather, state)
     return transmittance, count, samples
-
-
-def _closing(depth: Float, begin: Float, now: Float) -> tuple[Mask, Float, Float]:
-    """Return ``(early, number, place)`` of the portions that end in a cell.
-
-    The cell begins after `begin` portions and ends in portion `now`. `early`: one of these portions has its sample in
-    an earlier cell. `number`: of the other portions. `place`: light that is lost where the one sample lies that stands
-    for them, in portions. It is uniform, spread over the samples of a pixel as evenly as `depth`, and lies at the
-    cell's begin where rounding decides on `early`.
-    """
-    first = dr.floor(begin)
-    place, passed = _place(depth, first), begin - first
-    early = (now > first) & (place < passed)
-    number = now - first - dr.select(early, 1, 0)
-    # Since `early` tells if `place` is less than `passed`, it is uniform on one side.
-    uniform = dr.abs(place - passed) * dr.rcp(dr.maximum(dr.select(early, passed, 1 - passed), 1e-6))
-    return early, number, begin + dr.minimum(uniform, 1) * (now - begin)
 
 
 def _place(depth: Float, number: Float) -> Float:
