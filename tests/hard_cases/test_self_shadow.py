@@ -109,9 +109,12 @@ def shipped(name: str):
     strand = Strand(medium.source, arrays(o), d, mi.Float(2 / 384))
     random = [mi.Float(rng.random(count)) for _ in range(2)]
     with mock.patch.object(tuning, "SAMPLE_FRACTION", 1e-3):
-        samples = march.camera_samples([strand], mi.Float(np.full(count, 1e9)), *random, view=True)
-    faint = 1 / np.array(samples.view, np.float64)  # points in the faint depths of skins, too
-    kept = rng.choice(len(faint), 1200, replace=False, p=faint / faint.sum())
+        samples = march.camera_samples([strand], mi.Float(np.full(count, 1e9)), *random)
+    # One of each cell: points in the faint depths of skins, too.
+    cell = np.floor((np.array(samples.t) - np.array(samples.bundle.begin)[np.array(samples.ray)]) * (384 / 2))
+    order = rng.permutation(len(cell))
+    _, first = np.unique(np.stack([np.array(samples.ray), cell])[:, order], axis=1, return_index=True)
+    kept = rng.permutation(order[first])[:1200]
     x = np.array(samples.place(0, samples.ray, samples.t)[0], np.float64).T[kept]
     normals = np.array(medium.source.reflectance(arrays(x))[0]).T
     lights = rng.normal(size=(4, 3))
