@@ -83,6 +83,7 @@ def test_submitit_leaves_nothing_where_all_went_well(tmp_path):
 
 def test_workers_are_processes_with_their_threads_and_a_gpu_each(monkeypatch):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5")
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     results = jobs.run(chores.place, range(8), jobs.Workers("local", 2, threads=3))
     gpus = {pid: about.pop("CUDA_VISIBLE_DEVICES") for pid, about in results}
     assert sorted(gpus.values()) == ["3", "5"] and os.getpid() not in gpus
