@@ -25,10 +25,13 @@ def shared_bakes() -> None:
 
 @pytest.fixture(autouse=True)
 def kept_log_levels() -> Iterator[None]:
-    """Give Mitsuba and Dr.Jit the levels back that a render by its command has set for the whole process."""
-    packages = [sys.modules[name] for name in ("mitsuba", "drjit") if name in sys.modules]
-    packages = [package for package in packages if hasattr(package, "log_level")]
-    levels = [package.log_level() for package in packages]
+    """Restore the log levels of Mitsuba and Dr.Jit, which ``mi-ntf render`` sets for the whole process.
+
+    A package that the test itself imports gets its own default, ``Warn``.
+    """
+    names = ("mitsuba", "drjit")
+    levels = {name: sys.modules[name].log_level() for name in names if name in sys.modules}
     yield
-    for package, level in zip(packages, levels, strict=True):
-        package.set_log_level(level)
+    for name in names:
+        if name in sys.modules:
+            sys.modules[name].set_log_level(levels.get(name, sys.modules[name].LogLevel.Warn))

@@ -186,8 +186,7 @@ def test_the_command_needs_neither_mitsuba_nor_torch(tmp_path: Path):
             "print(code, {'mitsuba', 'torch'} & set(sys.modules))")
     done = run_program("python", "-c", code, "export", STATUE, "-o", "m.ply", "--resolution", "64", cwd=tmp_path)
     mesh, _, following, modules = done.stdout.splitlines()
-    told = re.sub(r"making m\.ply: \d+%, \d+ s (so far|left)\n", "", done.stderr)  # on a busy machine
-    assert modules == "0 set()" and told == "starting export\nmaking m.ply\n"
+    assert modules == "0 set()" and done.stderr == "starting export\nmaking m.ply\n"
     assert mesh.startswith("mesh: m.ply (") and following == "next: import m.ply in Blender or another program"
     assert (tmp_path / "m.ply").stat().st_size > 100_000
 

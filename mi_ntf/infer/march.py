@@ -109,6 +109,7 @@ def _gather(bundle: Bundle, depth: Float, channels: int, size: Float,
         return count + dr.select(room, uint(1), 0)
 
     def put_portions(count: UInt32, ray: UInt32, depth: Float, here: "_Here", number: Float, end: Float) -> UInt32:
+        # One sample for each of the portions from `number` to `end`.
         def body(count: UInt32, number: Float) -> tuple[UInt32, Float]:
             light = (number + _place(depth, number)) * size
             return put(count, ray, here.sample(here.quantile(light)), size), number + 1
@@ -124,6 +125,7 @@ def _gather(bundle: Bundle, depth: Float, channels: int, size: Float,
         # The light that is lost before the cell and after it, in portions.
         begin, end = ((1 - light) * per_light for light in (here.transmittance, here.transmittance - here.weight))
         first, now = dr.floor(begin), dr.floor(end)
+        # Of the portions that end in this cell, the first may have its sample in an earlier one.
         early = (now > first) & (_place(depth, first) < begin - first)
         count = ops.if_stmt((count, ray, open_sample, size), early, put, none, label="earlier sample")
         first = first + dr.select(early, 1, 0)

@@ -108,12 +108,12 @@ def shipped(name: str):
     d = arrays(np.tile(-view, (count, 1)))
     strand = Strand(medium.source, arrays(o), d, mi.Float(2 / 384))
     random = [mi.Float(rng.random(count)) for _ in range(2)]
-    with mock.patch.object(tuning, "SAMPLE_FRACTION", 1e-3):
+    with mock.patch.object(tuning, "SAMPLE_FRACTION", 1e-4):  # points in the faint depths of skins, too
         samples = march.camera_samples([strand], mi.Float(np.full(count, 1e9)), *random)
-    # One of each cell: points in the faint depths of skins, too.
-    cell = np.floor((np.array(samples.t) - np.array(samples.bundle.begin)[np.array(samples.ray)]) * (384 / 2))
-    order = rng.permutation(len(cell))
-    _, first = np.unique(np.stack([np.array(samples.ray), cell])[:, order], axis=1, return_index=True)
+    ray = np.array(samples.ray, np.int64)
+    cell = np.floor((np.array(samples.t) - np.array(samples.bundle.begin)[ray]) * (384 / 2)).astype(np.int64)
+    order = rng.permutation(len(ray))
+    _, first = np.unique((ray * 1024 + cell)[order], return_index=True)  # one sample of each cell
     kept = rng.permutation(order[first])[:1200]
     x = np.array(samples.place(0, samples.ray, samples.t)[0], np.float64).T[kept]
     normals = np.array(medium.source.reflectance(arrays(x))[0]).T

@@ -366,7 +366,7 @@ def test_rays_from_afar(slab, distance):
 
 @pytest.mark.parametrize("step", [2 / 16, 2 / 400])
 def test_each_portion_of_the_light_has_a_sample_at_its_place(rng, step):
-    """Whether a cell is longer than the skin or many cells lie in it: samples differ by no rounding of cells."""
+    """The samples lie at the same depths whether one cell takes all of the light or many cells share it."""
     sigma, n, fraction = 30.0, 2000, 1 / 6
     dense = baked(NetworkField(*fields.uniform(sigma), mi), 64, mi)
     o, d = np.tile([[0.1, 0.2, 3.0]], (n, 1)), np.tile([[0, 0, -1.0]], (n, 1))

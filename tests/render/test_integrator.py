@@ -72,8 +72,8 @@ def test_map_and_network_field_agree_with_grid(blobs):
 @pytest.mark.parametrize("options", [
     {"visibility": "transmittance_map", "map_memory": 0.0025}, {"visibility": "transmittance_atlas", "max_depth": 3},
     {"visibility": "auto", "max_error": 0.5}, {"visibility": "raymarch", "aovs": "depth,visibility"}])
-def test_a_scene_is_freed_when_it_is_let_go(blobs, options):
-    """Neither maps nor plugins, whose numbers are part of kernels' code, wait for Python's collector of cycles."""
+def test_a_scene_is_freed_when_nothing_refers_to_it(blobs, options):
+    """Maps take memory until then, and the number of living plugins is part of the code of kernels."""
     floor = {"floor": {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0.4, -3.5, 0.3])
                        .rotate([1, 0, 0], -90).scale(12)}}
     lights = {kind: scenes.light(kind) for kind in ("directional", "point")}

@@ -35,7 +35,7 @@ def spoilt(monkeypatch):
 def pictures(field, visibility, light, unbiased=False, **shapes):
     loaded = scenes.scene(field, scenes.nrf(visibility, unbiased=unbiased, environment_lights=16, samples=96,
                                             map_resolution=64), {"light": scenes.light(light)},
-                          size=16, spp=144, shapes=shapes or None)
+                          size=16, spp=64, shapes=shapes or None)
     return [scenes.render(loaded, seed)[..., :3] for seed in range(SEEDS)]
 
 

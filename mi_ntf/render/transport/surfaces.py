@@ -43,7 +43,7 @@ class Surfaces:
     def __init__(self, scene: mi.Scene, shapes: Sequence[mi.Shape], hide_emitters: bool,
                  transmittance: Transmittance) -> None:
         environment.check_unscaled(scene.environment())
-        # A strong reference would be a cycle, which keeps scene and maps in memory until Python's collector runs.
+        # A strong reference would be a cycle, and keep scene and maps in memory until the garbage collector runs.
         self.scene, self._transmittance = scene, WeakMethod(transmittance)
         groups = shape_groups(scene)
         self._all = _scene_of([*groups, *shapes], scene.integrator())
