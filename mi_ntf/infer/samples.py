@@ -1,6 +1,6 @@
 """Shading points along camera rays (:mod:`mi_ntf.infer.march`)."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import drjit as dr
@@ -8,6 +8,7 @@ import drjit as dr
 from . import ops
 from .bundle import Bundle
 from .types import Array, Float, Mask, UInt32, Vector
+from .visibility.attached_shadow import AttachedDepth
 
 
 @dataclass(frozen=True)
@@ -47,45 +48,33 @@ class Samples:
         line = self.line(i, ray)
         return self.along(i, line, t), line[1]
 
-    def attached(self, log_densities: Sequence[Callable[[Vector], Float] | None]) -> "Samples":
+    def attached(self, depths: Sequence[AttachedDepth | None]) -> "Samples":
         """Return the samples with weights and transmittances that carry the gradients of densities.
 
         Parameters
         ----------
-        log_densities
-            For each field a function of its points to ln σ, attached; None for fields without gradients.
+        depths
+            For each field its optical depths, attached; None for fields without gradients.
 
         Notes
         -----
-        The light L = ∫ T σ h dt of a ray changes by dL = ∫ T σ (h(t) − R(t)/T(t)) d(ln σ)(t) dt, where R(t) is the
-        light from behind t. Sums over the samples estimate both integrals. A sample stands for its portion of lost
-        light; of this portion, the part behind the sample itself is as bright as the sample. Places and radiance of
-        the samples are fixed.
+        The light L = ∫ T σ h dt of a ray, where h is the radiance at t, changes by ∫ T σ h (d(ln σ) − dD) dt, where D
+        is the optical depth from the camera to t. Places and radiance of the samples are fixed.
         """
-        assert self.view is not None
-        uint, zero = type(self.ray), dr.zeros(type(self.t), dr.width(self.t))
-        slopes, weight = [], sum(self.weights, zero)
-        for i, log_density in enumerate(log_densities):
-            value = None if log_density is None else log_density(self.place(i, self.ray, self.t)[0])
-            slopes.append(zero if value is None else value - dr.detach(value))
-        each = sum((w * s for w, s in zip(self.weights, slopes, strict=True)), zero)
-        absorbed = each * dr.rcp(dr.maximum(self.view, 1e-6))  # change of the optical depth by each portion
-        index = dr.arange(uint, dr.width(self.t))
-        ordinal = index - dr.gather(uint, self.first, self.ray)
-
-        def body(k: UInt32, lost: Float, depth: Float) -> tuple[Array, ...]:
-            before = k <= ordinal
-            return (k + 1, lost + dr.gather(type(lost), weight, index - k, before),
-                    depth + dr.gather(type(depth), absorbed, index - k, before))
-
-        _, lost, depth = ops.while_loop(
-            state=(dr.ones(uint, dr.width(self.t)), zero, zero), cond=lambda k, lost, depth: k <= ordinal, body=body,
-            label="samples before", max_iterations=-1)
-        behind = dr.clip(dr.detach(lost) + weight - (1 - self.view), 0, weight) * dr.rcp(dr.maximum(weight, 1e-30))
-        weights = tuple(w * (1 + s - depth - absorbed * behind)
-                        for w, s in zip(self.weights, slopes, strict=True))
-        (total,) = self.totals([absorbed], True)
-        return replace(self, weights=weights, transmittance=self.transmittance * (1 - total))
+        change = dr.zeros(type(self.t), dr.width(self.t))
+        whole = dr.zeros(type(self.t), dr.width(self.transmittance))
+        weights = []
+        for i, (depth, strand, weight) in enumerate(zip(depths, self.bundle.strands, self.weights, strict=True)):
+            if depth is None:
+                weights.append(weight)
+                continue
+            rate = 1 if strand.rate is None else strand.rate
+            x, d = self.place(i, self.ray, self.t)
+            change += depth.along(x, tuple(-c for c in d), self.t * rate, True)[1]
+            whole += depth.along(strand.o, strand.d, self.bundle.end * rate, self.bundle.active)[1]
+            weights.append(weight * (1 + depth.relative_change(x)))
+        weights = [weight * (1 - change) for weight in weights]
+        return replace(self, weights=tuple(weights), transmittance=self.transmittance * (1 - whole))
 
     def totals(self, values: list[Float], gradients: bool = False) -> list[Float]:
         """Return the sum of each of `values` over each ray's points, always in the same order, unlike atomic sums.

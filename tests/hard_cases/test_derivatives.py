@@ -12,14 +12,15 @@ from helpers.derivatives import backward, differences
 
 from mi_ntf.field import Field
 
-STEPS = {"density": 0.1, "albedo": 0.05, "roughness": 0.03}
+STEPS = {"density": 0.1, "albedo": 0.05, "roughness": 0.01}
 """Steps of the differences; that of density is a fraction of the mean where the parameter is no logarithm."""
 KINDS = ("surface", "smoke", "voxels")
 LIGHTS = ("point", "env", "area")
 METHODS = ("raymarch", "transmittance_map", "transmittance_atlas")
 AREA = {"type": "sphere", "center": [3.4, 3.0, 2.5], "radius": 0.5, "emitter": {"type": "area", "radiance": 60.0}}
 MEDIUM = "ball.interior_medium."
-QUICK = {("surface", "area", "transmittance_atlas", "albedo"), ("voxels", "point", "transmittance_map", "density")}
+QUICK = {("surface", "area", "transmittance_atlas", "albedo"), ("smoke", "point", "raymarch", "density"),
+         ("voxels", "point", "transmittance_map", "density")}
 """Combinations that also run outside of the catalogue."""
 ALL = [(kind, light, method, name) for kind in KINDS for light in LIGHTS for method in METHODS for name in STEPS
        if name != "roughness" or kind == "surface"]

@@ -55,6 +55,27 @@ def test_density(blobs, by_density, light, part):
     assert backward(*case(blobs, "log_density", light, part)) == pytest.approx(by_density(light, part), rel=0.05)
 
 
+def test_density_of_an_opaque_skin(tmp_path):
+    """Camera and lamp see into the same skin: gain and loss nearly cancel, so errors of the march count more."""
+    file = scenes.write_blobs(tmp_path / "opaque", log_density=5.0, roughness=0.6)
+    this = case(file, "log_density", part=False)
+    assert backward(*this) == pytest.approx(differences(*this, STEPS["log_density"]), rel=0.1)
+
+
+def test_density_of_two_fields(blobs, tmp_path):
+    """The density of each field dims the light of the other, which is smaller."""
+    near = scenes.Similarity(tuple(c + o for c, o in zip(scenes.SIMILARITY.center, (0.5, 0.3, 0.4), strict=True)), 1.05)
+    header, tensors = fields.blobs(scenes.CENTERS, scenes.RADII, similarity=near, log_density=2.0, roughness=0.6)
+    field_file.save(tmp_path / "near.safetensors", header, tensors, np.float32)
+    scene = scenes.scene(blobs, scenes.nrf(samples=256), {"light": scenes.light("point")}, size=12, spp=16,
+                         shapes={"near": scenes.ball(tmp_path / "near.safetensors", near)})
+    parameters = mi.traverse(scene)
+    for shape in ("ball", "near"):
+        key = f"{shape}.interior_medium.log_density"
+        this = scene, parameters, key, np.ones(parameters[key].shape, np.float32), mi.TensorXf
+        assert backward(*this) == pytest.approx(differences(*this, STEPS["log_density"]), rel=0.05)
+
+
 def test_density_without_shadows(blobs):
     """The camera's visibility alone, where the estimate has little noise; shadows have the larger derivative."""
     this = case(blobs, "log_density", visibility="none")

@@ -219,7 +219,6 @@ def medium_class(phase_class: type) -> type:
                 self._parameters.traverse(callback)
 
         def parameters_changed(self, keys: Sequence[str] = ()) -> None:
-            mi.Medium.parameters_changed(self, keys)
             parameters = self._parameters
             changed = parameters is not None and parameters.changed(keys)
             if parameters and changed:

@@ -155,9 +155,9 @@ class _CameraLight:
         strands, unit = self.scene.strands(self.ray, parts)
         maxt = (dr.minimum(self.ray.maxt, self.hit.t) if self.hit is not None else self.ray.maxt) / unit
         shining = effects.lit or effects.emission
-        densities = [p.medium.attached_log_density for p in parts]
-        attached = any(densities)
-        options = shining or attached or bool(self.sums and self.sums.needs_points), effects.collocated or attached
+        depths = [p.depth for p in parts]
+        attached = any(depths)
+        options = shining or attached or bool(self.sums and self.sums.needs_points), effects.collocated
         samples = self.cache.samples.get(options) if self.cache else None
         if samples is None:
             samples = march.camera_samples(
@@ -166,7 +166,7 @@ class _CameraLight:
             if self.cache:
                 self.cache.samples[options] = samples
         if attached and dr.width(samples.t):
-            samples = samples.attached(densities)
+            samples = samples.attached(depths)
         self.field_samples = _FieldSamples(samples, unit)
         light = [dr.zeros(mi.Float, dr.width(samples.t)) for _ in range(3)]
         for i, part in enumerate(parts):

@@ -20,7 +20,7 @@ from ...infer.bundle import Strand
 from ...infer.phase_function import HenyeyGreenstein, smoke
 from ...infer.types import Float, Mask, Ray, UInt32, Vector3, Visibility
 from ...infer.visibility import REGISTRY
-from ...infer.visibility.attached_shadow import AttachedShadow
+from ...infer.visibility.attached_shadow import AttachedDepth, AttachedShadow
 from ...infer.visibility.raymarch import RayMarch
 from ...infer.visibility.unbiased import Unbiased
 from .. import log, timing
@@ -145,12 +145,16 @@ class Composition:
         """Return the medium with the visibility of its lights, attached if its density is."""
         part = self._detached_part(medium)
         log_density = medium.attached_log_density
-        if log_density is None or self.settings.shadow_gradients == "none" or not part.for_run:
+        if log_density is None:
             return part
         march = cast(RayMarch, building.march(medium, part.table, building.options(self.settings, medium)))
+        depth = AttachedDepth(march, log_density)
+        part = replace(part, depth=depth)
+        if self.settings.shadow_gradients == "none" or not part.for_run:
+            return part
 
         def attach(method: Visibility | None) -> Visibility | None:
-            return AttachedShadow(method, march, log_density) if method else None
+            return AttachedShadow(method, depth) if method else None
 
         return replace(part, for_run=attach(part.for_run), for_sampled=attach(part.for_sampled),
                        for_all=attach(part.for_all))

@@ -12,6 +12,7 @@ from ...infer.grid import Density
 from ...infer.lights import LightTable
 from ...infer.types import Array, Float, Mask, UInt32, Vector, Vector3, Visibility
 from ...infer.visibility import outside
+from ...infer.visibility.attached_shadow import AttachedDepth
 from ..scene.frame import Frame
 from ..scene.media import NRFMedium
 from .surfaces import Surfaces
@@ -26,6 +27,7 @@ class Part:
     for_run      visibility of the lights of the present run
     for_sampled  visibility of sampled lights, and of any other rays
     for_all      visibility of all lights of the table
+    depth        optical depths with the gradients of the density; None where it has none
     """
 
     medium: NRFMedium
@@ -34,6 +36,7 @@ class Part:
     for_run: Visibility | None = None
     for_sampled: Visibility | None = None
     for_all: Visibility | None = None
+    depth: AttachedDepth | None = None
 
     @property
     def frame(self) -> Frame:
