@@ -193,12 +193,15 @@ def test_the_camera_sees_what_is_wrapped(blobs):
         np.testing.assert_allclose(image, scenes.render(bare), rtol=1e-5)
 
 
-def test_parameters_reach_the_nested_light(blobs):
-    """What is changed in the wrapped light changes the picture, its maps included."""
+def test_parameters_reach_the_nested_light(blobs, monkeypatch):
+    """What is changed in the wrapped light changes the picture. An update makes its map once."""
     loaded = scenes.floor({"type": "direct"}, light("point", blobs, "transmittance_map"), {"type": "diffuse"}, 8)
     parameters = mi.traverse(loaded)
     parameters["light.emitter.position"] = mi.Point3f(2.4, 3.0, -1.0)
+    build, built = emitter.building.build, []
+    monkeypatch.setattr(emitter.building, "build", lambda name, *rest: built.append(name) or build(name, *rest))
     parameters.update()
+    assert built.count("transmittance_map") == 1
     moved = light("point", blobs, "transmittance_map")
     moved["light"]["emitter"]["position"] = [2.4, 3.0, -1.0]
     fresh = scenes.floor({"type": "direct"}, moved, {"type": "diffuse"}, 8)

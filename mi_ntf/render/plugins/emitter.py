@@ -105,7 +105,7 @@ def emitter_class() -> type:
             # An environment's flags let the camera see it; the shape that shines asks for those of its emitter.
             self.m_flags = int(self.inner.flags())
             self.m_needs_sample_2 = self.m_needs_sample_3 = False
-            self.bare = self._sampled_at_rest = False
+            self.bare = self._sampled_at_rest = self._changing = False
             self._prepare()
 
         def _prepare(self) -> None:
@@ -194,7 +194,12 @@ def emitter_class() -> type:
                 callback.put("shape", self._caster, mi.ParamFlags.NonDifferentiable)
 
         def parameters_changed(self, keys: Sequence[str] = ()) -> None:
+            if self._changing:  # the base class, when it is called from Python, calls this method once more
+                mi.Emitter.parameters_changed(self, keys)
+                return
+            self._changing = True
             mi.Emitter.parameters_changed(self, keys)
+            self._changing = False
             self._prepare()
 
         def to_string(self) -> str:
