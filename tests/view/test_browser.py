@@ -21,6 +21,13 @@ FLAGS = ["--no-sandbox", "--disable-quic", "--no-first-run", "--disable-backgrou
          "--ignore-gpu-blocklist"]
 IN_VIEW = POINT.replace('x="3.4" y="3" z="2.5"', 'x="0.9" y="0.5" z="1.8"').replace("60, 50, 40", "6, 5, 4")
 
+WATCH = """window.shown = new Set()
+new MutationObserver(() => {
+    const line = document.body?.innerText.match(/(\\d+) samples? a pixel/)
+    if (line) window.shown.add(line[1])
+}).observe(document, {subtree: true, childList: true, characterData: true})"""
+"""Script that collects the numbers of samples that a page has shown. A picture of one sample is gone in a moment."""
+
 
 @pytest.fixture(scope="module")
 def served(folder):
@@ -53,10 +60,17 @@ def browser():
 
 @pytest.fixture
 def page(browser):
-    page = browser.new_page(viewport={"width": 760, "height": 480})
-    page.set_default_timeout(60_000)
+    page = opened(browser, 760, 480)
     yield page
     page.close()
+
+
+def opened(browser, width, height):
+    """Return an empty page that collects the numbers of samples."""
+    page = browser.new_page(viewport={"width": width, "height": height})
+    page.set_default_timeout(60_000)
+    page.add_init_script(WATCH)
+    return page
 
 
 def button(page, name):
@@ -77,6 +91,11 @@ def rested(page):
     time.sleep(1.5)  # until it is painted, and the window's size was asked for once more
     page.get_by_text("4 samples a pixel").wait_for()
     return np.array(Image.open(io.BytesIO(page.locator("canvas").first.screenshot())).convert("RGB"))
+
+
+def begun(page):
+    """Wait until the page has shown a picture of one sample."""
+    page.wait_for_function("window.shown.has('1')")
 
 
 def test_a_light_is_dragged(page, served, tmp_path):
@@ -117,8 +136,9 @@ def test_the_scenes_camera_is_one_click_away_and_is_what_is_saved(page, served):
     address, path = served
     page.goto(address)
     before = rested(page)
+    page.evaluate("window.shown.clear()")
     button(page, "See all lights").click()
-    page.get_by_text("1 sample a pixel").wait_for()
+    begun(page)
     away = rested(page)
 
     def saved():
@@ -136,8 +156,9 @@ def test_the_scenes_camera_is_one_click_away_and_is_what_is_saved(page, served):
     page.get_by_role("checkbox").check()
     assert np.linalg.norm(np.subtract(saved().origin, own.origin)) > 1
     page.get_by_role("checkbox").uncheck()
+    page.evaluate("window.shown.clear()")
     button(page, "Scene's camera").click()
-    page.get_by_text("1 sample a pixel").wait_for()
+    begun(page)
     after = rested(page)
     assert np.abs(before.astype(float) - away).mean() > 4 * np.abs(before.astype(float) - after).mean()
 
@@ -154,8 +175,9 @@ def test_errors_have_names_and_move_no_control(page, served):
 @pytest.mark.parametrize(("width", "height"), [(390, 800), (1400, 800)])
 def test_a_page_opens_with_a_picture_of_its_windows_shape(browser, served, width, height):
     for _ in range(2):
-        page = browser.new_page(viewport={"width": width, "height": height})
+        page = opened(browser, width, height)
         page.goto(served[0])
+        begun(page)  # until then it shows the picture of the page before
         rested(page)
         text = page.get_by_text("4 samples a pixel").inner_text(timeout=60_000)
         shown, canvas = re.search(r"(\d+)×(\d+)", text), page.locator("canvas").first.bounding_box()

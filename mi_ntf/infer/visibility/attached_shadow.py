@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import drjit as dr
 
-from ..types import Float, Mask, UInt32, Vector, Visibility
+from ..types import Float, Mask, UInt32, Vector
 from .raymarch import MAX_OPTICAL_DEPTH, RayMarch, drawn_depth
 
 
@@ -26,7 +26,7 @@ class AttachedDepth:
     """
 
     def __init__(self, march: RayMarch, log_density: Callable[[Vector], Float]):
-        self._march, self._log_density = march, log_density
+        self.march, self._log_density = march, log_density
 
     def relative_change(self, x: Vector) -> Float:
         """Return 0 with the gradients of ln σ at `x`."""
@@ -39,25 +39,21 @@ class AttachedDepth:
         Rays that are blocked have no gradients.
         """
         x, wi = tuple(dr.detach(c) for c in x), tuple(dr.detach(c) for c in wi)
-        depth, t = drawn_depth(self._march.volume, x, wi, dr.detach(distance), self._march.steps, active)
+        depth, t = drawn_depth(self.march.volume, x, wi, dr.detach(distance), self.march.steps, active)
         change = self.relative_change(tuple(a + t * b for a, b in zip(x, wi, strict=True)))
         return depth, dr.select(active & (depth < MAX_OPTICAL_DEPTH) & (depth > 0), depth * change, 0)
 
 
 class AttachedShadow:
-    """The visibility `looked_up`, whose transmittance carries the gradients of the optical `depth`: dτ = −e^(−D) dD."""
+    """Visibility by a march, whose transmittance carries the gradients of the optical `depth`: dτ = −τ dD."""
 
-    def __init__(self, looked_up: Visibility, depth: AttachedDepth):
-        self.looked_up, self._depth = looked_up, depth
+    def __init__(self, depth: AttachedDepth):
+        self._depth = depth
 
     def tau(self, x: Vector, wi: Vector, distance: Float, index: UInt32, active: Mask, sun: Mask = None) -> Float:
-        """Return the transmittance of the method, attached."""
-        if isinstance(self.looked_up, RayMarch) and not dr.grad_enabled(x, wi, distance):
-            return self.attach(None, x, wi, distance, active)
-        return self.attach(self.looked_up.tau(x, wi, distance, index, active, sun), x, wi, distance, active)
-
-    def attach(self, tau: Float | None, x: Vector, wi: Vector, distance: Float, active: Mask) -> Float:
-        """Return the transmittance `tau` of rays, None for that of the march, with the gradients of the density."""
+        """Return the transmittance of rays, attached. `x` may lie outside the sphere."""
         depth, change = self._depth.along(x, wi, distance, active)
-        marched = dr.select(depth < MAX_OPTICAL_DEPTH, dr.exp(-depth), 0)
-        return (marched if tau is None else tau) - marched * change
+        tau: Float = dr.select(depth < MAX_OPTICAL_DEPTH, dr.exp(-depth), 0)
+        if dr.grad_enabled(x, wi, distance):
+            tau = self._depth.march.tau(x, wi, distance, index, active)
+        return tau * (1 - change)

@@ -16,8 +16,7 @@ def tau(method: Visibility, x: Vector, wi: Vector, distance: Float, index: UInt3
     a logistic that fits smoke would fall to 0. Rays that miss the sphere evaluate no method.
     """
     if isinstance(method, AttachedShadow):  # Dr.Jit loses the gradients of a field within a branch
-        through_field = tau(method.looked_up, x, wi, distance, index, active, sun)
-        return method.attach(through_field, x, wi, distance, active)
+        return method.tau(x, wi, distance, index, active, sun)
     hit, m, h = spheres.chord(ops, x, wi)
     here = spheres.coordinate(x, wi)
     way = dr.select(hit, dr.maximum(-h - here, 0), 0)

@@ -92,15 +92,7 @@ def emitter_class() -> type:
             read = properties.Reader(props, "ntf emitter", properties.EMITTER, nested=True)
             self.visibility = read.choice("visibility", "auto", names())
             read.number("sampling_weight", 1.0, 0.0, 1e30)
-            nested = [value for _, value in props.objects()]
-            lights = [o for o in nested if isinstance(o, mi.Emitter)]
-            casters = [o for o in nested if getattr(o, "is_nrf", False) or isinstance(o, mi.Shape)]
-            other = [o for o in nested if o not in lights + casters]
-            if other:
-                raise MiNtfError(f"ntf emitter: it has no place for a nested {other[0].class_name()}; it takes a light "
-                                 "and an nrf medium, or a light and a shape with a medium inside")
-            self.inner: mi.Emitter = _single(lights, "emitter", "a light to wrap")
-            self._caster = _single(casters, "medium or shape", "an nrf medium, or a shape with a medium inside")
+            self.inner, self._caster = _nested([value for _, value in props.objects()])
             mi.Emitter.__init__(self, props)
             # An environment's flags let the camera see it; the shape that shines asks for those of its emitter.
             self.m_flags = int(self.inner.flags())
@@ -111,8 +103,7 @@ def emitter_class() -> type:
         def _prepare(self) -> None:
             light_checks.check(self.inner, scene_lights.kind(self.inner), sampled=True)
             environment.check_unscaled(self.inner)
-            self.medium = (medium_inside(self._caster) if isinstance(self._caster, mi.Shape)
-                           else cast(NRFMedium, self._caster))
+            self.medium = medium_inside(self._caster) if isinstance(self._caster, mi.Shape) else self._caster
             if not self.sampling_weight() and not mi.has_flag(self.inner.flags(), mi.EmitterFlags.Delta):
                 raise MiNtfError("ntf emitter: sampling_weight is 0, so that BSDF samples alone would find the light, "
                                  "which know nothing of the field's shadow; give it a weight above 0")
@@ -251,6 +242,19 @@ def _attached_place(inner: mi.Emitter) -> str:
 def _is_far(emitter: mi.Emitter) -> bool:
     """Return True for lights at infinity: environments and directional lights."""
     return bool(mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite))
+
+
+def _nested(objects: Sequence[mi.Object]) -> tuple[mi.Emitter, NRFMedium | mi.Shape]:
+    """Return the light to wrap and what casts its shadow: a medium, or a shape with a medium inside."""
+    lights = [o for o in objects if isinstance(o, mi.Emitter)]
+    casters = [o for o in objects if getattr(o, "is_nrf", False) or isinstance(o, mi.Shape)]
+    other = [o for o in objects if o not in lights + casters]
+    if other:
+        raise MiNtfError(f"ntf emitter: it has no place for a nested {other[0].class_name()}; it takes a light and an "
+                         "nrf medium, or a light and a shape with a medium inside")
+    light = _single(lights, "emitter", "a light to wrap")
+    caster = _single(casters, "medium or shape", "an nrf medium, or a shape with a medium inside")
+    return light, cast("NRFMedium | mi.Shape", caster)
 
 
 def _single(objects: Sequence[T], kind: str, role: str) -> T:

@@ -96,7 +96,6 @@ from ...infer.grid import Density, NetworkVolume
 from ...infer.phase_function import HenyeyGreenstein, smoke
 from ...infer.shade import Reflectance
 from ...infer.types import Color3, Float, Mask, Ray, Reflected, Vector, Vector3
-from ...infer.volume import VoxelVolume
 from .. import log
 from ..scene import loaded, traversal
 from ..scene.field_parameters import FieldParameters
@@ -143,6 +142,16 @@ def _reflectance(source: Reflects, field: LoadedField | VolumeField | ChangedFie
     return reflectance
 
 
+def _density(field: LoadedField | VolumeField, representation: str) -> Density:
+    """Return the density of `field` in a `representation`, one of ``REPRESENTATIONS``."""
+    if representation == "grid":
+        return field.grid
+    if isinstance(field, VolumeField):
+        raise MiNtfError(f'nrf medium: representation is "network", but {field.name} is a field of voxels, which has '
+                         "no networks; choose grid")
+    return NetworkVolume(field.network, field.grid, math.exp(MAX_LOG_DENSITY))  # clipping alone bounds the networks
+
+
 def medium_class(phase_class: type) -> type:
     """Return the plugin class for the current variant; `phase_class`: the variant's ``nrf`` phase function."""
 
@@ -171,15 +180,7 @@ def medium_class(phase_class: type) -> type:
                 raise MiNtfError(f"nrf medium: shadow_catcher is true, but {path} emits no light of its own; leave it "
                                  "out, or import the splats with --emissive")
             self._parameters: FieldParameters | None = None
-            grid, bound = self.field.grid, math.exp(MAX_LOG_DENSITY)  # clipping alone bounds the networks
-            if isinstance(grid, VoxelVolume):
-                if self.representation != "grid":
-                    raise MiNtfError(f'nrf medium: representation is "network", but {path} is a field of voxels, which '
-                                     "has no networks; choose grid")
-                self.source: Density = grid
-            else:
-                self.source = (
-                    grid if self.representation == "grid" else NetworkVolume(self.field.network, grid, bound))
+            self.source: Density = _density(self._read, self.representation)
             self.reflectance = _reflectance(self.source, self.field)
             self.to_world = mi.Transform4f(mi.ScalarTransform4f(to_world))
             self.path = path
@@ -213,12 +214,11 @@ def medium_class(phase_class: type) -> type:
                 for name, tensor in self.field.network.tensors().items():
                     callback.put(name, tensor, mi.ParamFlags.NonDifferentiable | mi.ParamFlags.ReadOnly)
                 return
-            if self._parameters is None and not traversal.is_quiet() and self.source.majorant > 0:
-                self._parameters = FieldParameters(self._read)
-            if self._parameters:
-                self._parameters.traverse(callback)
+            if self._parameters or (not traversal.is_quiet() and self.source.majorant > 0):
+                self.parameters.traverse(callback)
 
         def parameters_changed(self, keys: Sequence[str] = ()) -> None:
+            # The method of the base class is empty, and would call this one a second time.
             parameters = self._parameters
             changed = parameters is not None and parameters.changed(keys)
             if parameters and changed:

@@ -17,6 +17,7 @@ from ...core.errors import MiNtfError
 from ...infer import march, shade
 from ...infer.backend import module_of
 from ...infer.bundle import Strand
+from ...infer.lights import LightTable
 from ...infer.phase_function import HenyeyGreenstein, smoke
 from ...infer.types import Float, Mask, Ray, UInt32, Vector3, Visibility
 from ...infer.visibility import REGISTRY
@@ -142,28 +143,26 @@ class Composition:
                     medium.visibility([p.for_sampled for p in parts]), medium.visibility([p.for_all for p in parts]))
 
     def _part_of(self, medium: NRFMedium) -> Part:
-        """Return the medium with the visibility of its lights, attached if its density is."""
-        part = self._detached_part(medium)
+        """Return the medium with the visibility of its lights; one that carries gradients is marched."""
         log_density = medium.attached_log_density
         if log_density is None:
-            return part
-        march = cast(RayMarch, building.march(medium, part.table, building.options(self.settings, medium)))
+            return self._detached_part(medium)
+        march = cast(RayMarch, building.march(medium, None, building.options(self.settings, medium)))
         depth = AttachedDepth(march, log_density)
-        part = replace(part, depth=depth)
-        if self.settings.shadow_gradients == "none" or not part.for_run:
-            return part
+        if not self.effects.lit or self.effects.visibility == "none" or self.settings.shadow_gradients == "none":
+            return replace(self._detached_part(medium), depth=depth)
+        shadow = AttachedShadow(depth)
+        return Part(medium, *self._tables(medium), shadow, shadow, shadow, depth)
 
-        def attach(method: Visibility | None) -> Visibility | None:
-            return AttachedShadow(method, depth) if method else None
-
-        return replace(part, for_run=attach(part.for_run), for_sampled=attach(part.for_sampled),
-                       for_all=attach(part.for_all))
+    def _tables(self, medium: NRFMedium) -> tuple[LightTable, LightTable]:
+        """Return the table of all lights in the medium's field coordinates, and its rows of the present run."""
+        all_lights, run = self.lights.table(medium.frame), self.runs[self.run]
+        return all_lights, all_lights.part(*run) if run and len(self.runs) > 1 else all_lights
 
     def _detached_part(self, medium: NRFMedium) -> Part:
-        all_lights, run = self.lights.table(medium.frame), self.runs[self.run]
+        all_lights, table = self._tables(medium)
         if not self.effects.lit or not self.effects.needs_visibility:
             return Part(medium, all_lights, all_lights)
-        table = all_lights.part(*run) if run and len(self.runs) > 1 else all_lights
         options = building.options(self.settings, medium)
         for_sampled = REGISTRY[self.effects.visibility].for_sampled
         if table.moving and not REGISTRY[for_sampled].derivatives:
