@@ -140,22 +140,33 @@ def test_kinds_of_files_hold_the_same_surface(tmp_path: Path, suffix: str):
                                    atol=0.6)
 
 
-def shell(n=48) -> np.ndarray:
-    """Return ln σ of a hollow ball with a thin spot, and of a small separate part."""
+def shell(n=48, spot=4.0) -> np.ndarray:
+    """Return ln σ of a hollow ball with a thin spot of density `spot`, and of a small separate part."""
     z, y, x = np.mgrid[:n, :n, :n] - n / 2
     radii = np.sqrt(x * x + y * y + z * z)
     values = np.where((radii > 10) & (radii < 14), np.log(100), -6).astype(np.float32)
-    values[(radii > 10) & (radii < 14) & (abs(x) < 2) & (abs(y) < 2) & (z > 0)] = np.log(4)
+    values[(radii > 10) & (radii < 14) & (abs(x) < 2) & (abs(y) < 2) & (z > 0)] = np.log(spot)
     values[3, 3, 3] = np.log(100)
     return values
 
 
 def test_hollows_are_filled_behind_thin_spots_too_and_crumbs_are_left_out():
     values, level = shell(), np.log(surface.LEVEL)
-    solid = surface._solid(values, surface.LEVEL) > level
+    solid = surface._solid(values, surface.LEVEL, 1) > level
     n = len(values)
     assert solid[n // 2, n // 2, n // 2] and not solid[3, 3, 3] and not solid[0, 0, 0]
     assert (solid >= (values > level))[5:].all()
+
+
+def test_hollows_are_filled_behind_gaps():
+    """The gap is 3 voxels wide: it is closed, and the surface beside it stays where it was."""
+    values, level = shell(spot=0.01), np.log(surface.LEVEL)
+    n = len(values)
+    closed, open_wide = (surface._solid(values, surface.LEVEL, gap) > level for gap in (2, 0))
+    assert closed[n // 2, n // 2, n // 2] and not open_wide[n // 2, n // 2, n // 2]
+    z, y, x = np.mgrid[:n, :n, :n] - n / 2
+    outside = np.sqrt(x * x + y * y + z * z) >= 14
+    assert not closed[outside].any()
 
 
 def test_thin_matter_has_a_surface_too(tmp_path: Path):

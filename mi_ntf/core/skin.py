@@ -9,6 +9,8 @@ outwards, inwards and along the skin.
 
 import math
 
+import numpy as np
+
 from .ops import Array, Ops, Vector, cross, normalize
 
 CHAPMAN = 5.3
@@ -23,6 +25,10 @@ FLATTEST = 40.0
 """Ratio of the optical depths along the skin and along its normal above which the skin counts as flat."""
 SMOKE, SOLID = 3.0, 6.0
 """Optical depths across matter: below the first it has no skin, above the second it is opaque."""
+SEEN = 0.3, 3.0
+"""Optical depths to the outside between which a skin's scale height is read: cameras see 70 % of their light there."""
+THIN = 0.25
+"""Quantile of the scale heights that stands for a field's skins: the thinner ones need the finest steps."""
 
 
 TURNS = tuple((math.cos(2 * math.pi * k / AZIMUTHS), math.sin(2 * math.pi * k / AZIMUTHS)) for k in range(AZIMUTHS))
@@ -56,3 +62,13 @@ def softness(ops: Ops, squared: Array, out: Array, inward: Array) -> Array:
     """
     solid = (out + inward - SMOKE) * (1 / (SOLID - SMOKE))
     return CHAPMAN * squared * ops.minimum(ops.maximum(solid, 0.0), 1.0)
+
+
+def thickness(out: np.ndarray, inward: np.ndarray, sigma: np.ndarray) -> float:
+    """Return the scale height of the thinner skins, the quantile THIN; infinity where nothing is opaque.
+
+    In an exponential skin it is the depth to the outside over the density. `out`, `inward`: optical depths along the
+    normal; `sigma`: density there.
+    """
+    skins = (out > SEEN[0]) & (out < SEEN[1]) & (out + inward > SOLID) & (sigma > 0)
+    return float(np.quantile(out[skins] / sigma[skins], THIN)) if skins.any() else math.inf

@@ -15,7 +15,7 @@ from .bricks import SIDE, any_between, bricks_per_side, grown
 from .network import LOG_MIN_DENSITY, NetworkField
 from .types import Float, Reflected, Vector
 
-VERSION = 1
+VERSION = 2
 """Version of the arrays; arrays of other versions in field files are not read."""
 SURVEY = 192
 """Largest number of voxels per side of the first, dense sampling. Bricks are sampled only near its density."""

@@ -1,5 +1,6 @@
-"""Softness of a field's skins (:mod:`mi_ntf.core.skin`), measured by marches through the field."""
+"""Softness and thickness of a field's skins (:mod:`mi_ntf.core.skin`), measured by marches through the field."""
 
+import math
 from types import ModuleType
 
 import drjit as dr
@@ -22,11 +23,13 @@ OPAQUE = 0.5
 class Softness:
     """Softness of a field's skins at any point, trilinear; 0 for flat skins, in smoke and far from matter.
 
-    `arrays`: result of :func:`measure`. `solid`: fraction of the skins that are opaque; `opaque`: True if most are.
+    `arrays`: result of :func:`measure`. `solid`: fraction of the skins that are opaque; `opaque`: True if most are;
+    `thickness`: scale height of the thinner quarter of them (:data:`mi_ntf.core.skin.THIN`), field units.
     """
 
     def __init__(self, arrays: dict[str, np.ndarray], dj: ModuleType):
-        self._bricks, self.solid = bricks_of(arrays, "softness", dj), float(arrays["solid"][0])
+        self._bricks = bricks_of(arrays, "softness", dj)
+        self.solid, self.thickness = (float(arrays[name][0]) for name in ("solid", "thickness"))
         self.opaque = self.solid >= OPAQUE
 
     def __call__(self, p: Vector) -> Float:
@@ -37,7 +40,7 @@ class Softness:
 class Smoke:
     """Softness of matter without skins."""
 
-    opaque, solid = False, 0.0
+    opaque, solid, thickness = False, 0.0, math.inf
 
     def __call__(self, p: Vector) -> Float:
         """Return 0 at the points `p`."""
@@ -51,14 +54,15 @@ def measured(grid: GridField, dj: ModuleType) -> Softness:
 
 def measure(grid: Density, dj: ModuleType, progress: Progress = lambda done: None) -> dict[str, np.ndarray]:
     """Return the arrays of a :class:`Softness` of `grid`; `progress` receives the fraction of the work that is done."""
-    values, solid = _measure(grid, min(grid.resolution, REFLECTANCE_RESOLUTION), dj, progress)
+    values, solid, thickness = _measure(grid, min(grid.resolution, REFLECTANCE_RESOLUTION), dj, progress)
     arrays = of_dense(values[..., None], values > 0)
-    return {f"softness.{name}": array for name, array in arrays.items()} | {"solid": np.array([solid])}
+    return ({f"softness.{name}": array for name, array in arrays.items()}
+            | {"solid": np.array([solid]), "thickness": np.array([thickness])})
 
 
-def _measure(grid: Density, n: int, dj: ModuleType, progress: Progress) -> tuple[np.ndarray, float]:
-    """Return the softness (z, y, x), float32, and the fraction of skins that are opaque."""
-    solid = 0.0
+def _measure(grid: Density, n: int, dj: ModuleType, progress: Progress) -> tuple[np.ndarray, float, float]:
+    """Return the softness (z, y, x), float32, the fraction of skins that are opaque, and their thickness."""
+    solid, thickness = 0.0, math.inf
     result, known = np.zeros((n, n, n), np.float32), np.zeros((n, n, n), bool)
     index = np.flatnonzero(_occupied(grid, n, dj))
     normals = at_voxels(lambda p: list(grid.reflectance(p)[0]), 3, index, n, dj)
@@ -84,13 +88,25 @@ def _measure(grid: Density, n: int, dj: ModuleType, progress: Progress) -> tuple
         x, normal = _centres(index, n, dj), tuple(floats(c, dj) for c in normals.T)
         out, inward = floats(out, dj), floats(inward, dj)
         sigma, total = grid.density(x), dj.Float(0)
+        thickness = _thickness(grid, x, normal, inward, 2 / n, dj)
         for number, turn in enumerate(skin.TURNS):
             progress((2 + number) / (2 + len(skin.TURNS)))
             d = skin.across(ops, normal, tuple(dr.opaque(dj.Float, c) for c in turn))
             total = total + skin.squared_horizon(ops, out, _depth(grid, x, d, skin.FLATTEST * out), sigma)
             dr.eval(total)
         result.ravel()[index] = skin.softness(ops, total / skin.AZIMUTHS, out, inward).numpy()
-    return spread(result, known), solid
+    return spread(result, known), solid, thickness
+
+
+def _thickness(grid: Density, x: Vector, normal: Vector, inward: Float, width: float, dj: ModuleType) -> float:
+    """Return the thickness of skins at random points of the voxels around `x`, of a `width` in field units.
+
+    Centres would not do: they may lie at the nodes of a finer grid.
+    """
+    rng = np.random.default_rng(0)
+    p = tuple(c + floats(rng.uniform(-width / 2, width / 2, dr.width(c)), dj) for c in x)
+    out = _depth(grid, p, normal, skin.DEEPEST)
+    return skin.thickness(out.numpy(), inward.numpy(), grid.density(p).numpy())
 
 
 def _centres(index: np.ndarray, n: int, dj: ModuleType) -> tuple[Float, ...]:

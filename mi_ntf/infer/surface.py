@@ -24,6 +24,9 @@ LEVEL = 10.0
 lower levels lie outside of them, higher ones tear skins open."""
 TIGHT = 0.3
 """Fraction of the level at which a skin counts as closed when the space that it encloses is filled."""
+GAP = 0.02
+"""Width of the gaps in a skin, field units, that count as closed when the space that it encloses is filled: skins are
+torn where few photographs look."""
 CRUMB = 1e-4
 """Number of voxels, over those of the largest part, below which a part is removed."""
 RESOLUTIONS = (32, 512)
@@ -66,8 +69,9 @@ def surface(field: NetworkField | VoxelVolume, resolution: int, level: float | N
     level = min(LEVEL, highest / 2) if level is None else level
     if not level < highest:
         raise MiNtfError(f"no density of {level:g} in the field, the highest is {highest:.3g}; give a lower --level")
-    values, corner = _cropped(values, np.log(TIGHT * level))
-    values = _solid(values, level)
+    gap = round(GAP * resolution / 4)
+    values, corner = _cropped(values, np.log(TIGHT * level), gap + 1)
+    values = _solid(values, level, gap)
     places, faces, _, _ = marching_cubes(values, np.log(level))
     del values
     vertices = (places[:, ::-1] + corner[::-1] + 0.5) * (2 / resolution) - 1
@@ -90,26 +94,42 @@ def _log_density(field: NetworkField | VoxelVolume, n: int, dj: ModuleType, prog
     return values
 
 
-def _cropped(values: np.ndarray, threshold: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the part of `values` (z, y, x) above `threshold`, with an empty border, and its first voxel's index."""
+def _cropped(values: np.ndarray, threshold: float, border: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the part of `values` (z, y, x) above `threshold`, in an empty `border`, and its first voxel's index."""
     dense = values > threshold
     sides = [np.flatnonzero(dense.any(tuple({0, 1, 2} - {axis}))) for axis in range(3)]
     inner = values[tuple(slice(s[0], s[-1] + 1) for s in sides)]
-    return np.pad(inner, 1, constant_values=values.min()), np.array([s[0] - 1 for s in sides])
+    return np.pad(inner, border, constant_values=values.min()), np.array([s[0] - border for s in sides])
 
 
-def _solid(values: np.ndarray, level: float) -> np.ndarray:
-    """Return ln σ with enclosed space filled, and without small parts."""
-    from scipy.ndimage import label
+def _solid(values: np.ndarray, level: float, gap: int) -> np.ndarray:
+    """Return ln σ with enclosed space filled, and without small parts.
 
-    for fraction in (TIGHT, 1.0):
-        empty, _ = label(values <= np.log(fraction * level), output=np.int32)
-        values = np.where((empty > 0) & (empty != empty[0, 0, 0]), np.float32(MAX_LOG_DENSITY), values)
+    Space is also enclosed if it opens outward only by gaps of at most 2 `gap` voxels. Inside and outside meet at
+    the highest density of the skin between them.
+    """
+    from scipy.ndimage import binary_erosion, label
+    from skimage.segmentation import watershed
+
+    empty = values <= np.log(TIGHT * level)
+    wide = binary_erosion(empty, iterations=gap, border_value=1) if gap else empty
+    within = _enclosed(wide) | _enclosed(empty)
+    values = np.where(watershed(values, np.where(within, 2, wide)) == 2, np.float32(MAX_LOG_DENSITY), values)
+    values = np.where(_enclosed(values <= np.log(level)), np.float32(MAX_LOG_DENSITY), values)
     parts, count = label(values > np.log(level), output=np.int32)
     sizes = np.bincount(parts.ravel(), minlength=count + 1)
     small = sizes < CRUMB * sizes[1:].max()
     small[0] = False
     return np.where(small[parts], values.min(), values)
+
+
+def _enclosed(empty: np.ndarray) -> np.ndarray:
+    """Return a mask of the `empty` voxels that are not connected with the first one, which lies outside."""
+    from scipy.ndimage import label
+
+    parts, _ = label(empty, output=np.int32)
+    mask: np.ndarray = empty & (parts != parts[0, 0, 0])
+    return mask
 
 
 def _from_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

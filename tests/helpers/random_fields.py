@@ -3,6 +3,7 @@
 Every example is a batch drawn from a seed, of the same widths and the same code each time: one compilation a method.
 """
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from types import SimpleNamespace
@@ -139,7 +140,8 @@ class Exact:
         corners = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), -1).reshape(-1, 3)
         volume = Formula(self.density, corners)
         network = Balls(0).medium().field.network
-        field = SimpleNamespace(network=network, grid=volume, softness=SimpleNamespace(opaque=True), trained=True)
+        softness = SimpleNamespace(opaque=True, thickness=math.inf)
+        field = SimpleNamespace(network=network, grid=volume, softness=softness, trained=True)
         volume.reflectance = self.reflectance
         return SimpleNamespace(source=volume, field=field)
 

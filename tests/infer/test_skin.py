@@ -11,13 +11,16 @@ from mi_ntf.core import ops
 from mi_ntf.core import skin as formulas
 from mi_ntf.infer.grid import baked
 from mi_ntf.infer.network import NetworkField
-from mi_ntf.infer.skin import measured, spread
+from mi_ntf.infer.skin import Softness, measured, spread
+
+
+def of(header, tensors) -> Softness:
+    mi.set_variant(VARIANT)
+    return measured(baked(NetworkField(header, tensors, mi), 192, mi), mi)
 
 
 def softness(header, tensors, x) -> np.ndarray:
-    mi.set_variant(VARIANT)
-    grid = baked(NetworkField(header, tensors, mi), 192, mi)
-    return np.array(measured(grid, mi)(arrays(x)))
+    return np.array(of(header, tensors)(arrays(x)))
 
 
 def at_depths(kind: str, heights, n: int = 400) -> np.ndarray:
@@ -46,6 +49,17 @@ def test_sphere(voxels):
     np.testing.assert_allclose(actual, expected, rtol=0.25)
     assert actual.mean() == pytest.approx(expected.mean(), rel=0.05)
     assert actual.mean() == pytest.approx(formulas.CHAPMAN * 2 * skin.scale / (np.pi * 0.5), rel=0.25)
+
+
+@pytest.mark.parametrize("scale", [0.01, 0.02])
+def test_thickness_is_the_scale_height(scale):
+    """As in float64; the density falls with the square of the radius, so it is a little less than `scale`."""
+    skin = fields.skin("sphere", 3 - np.log(scale), scale)
+    x = at_depths("sphere", (0, 6 * scale), 5000)
+    out = skin.depth(x, x / np.linalg.norm(x, axis=1, keepdims=True), np.full(len(x), formulas.LENGTH))
+    expected = formulas.thickness(out, np.full(len(x), formulas.SOLID), skin.density(x))
+    assert of(skin.header, skin.tensors).thickness == pytest.approx(expected, rel=0.03)
+    assert expected == pytest.approx(scale, rel=0.2)
 
 
 def test_plane_is_flat():

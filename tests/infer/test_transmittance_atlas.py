@@ -58,7 +58,7 @@ def statue(variant):
 @functools.cache
 def captured():
     medium = hard_cases.baked(*field_file.load(SCENES / "statue" / "field.safetensors"))
-    return medium, building.build("transmittance_atlas", medium, None, Options(2 / 384))
+    return medium, building.build("transmittance_atlas", medium, None, Options(2 / building.samples(medium)))
 
 
 def skin(medium, n: int, seed: int) -> np.ndarray:
@@ -79,7 +79,7 @@ def test_close_to_marches_on_a_captured_object(statue):
     medium, atlas = statue
     x = skin(medium, 60_000, 1)
     d = unit(x.shape[1], 3)
-    steps = tuple(mi.Float(s / 4) for s in raymarch.default_steps(2 / 384))
+    steps = tuple(mi.Float(s / 4) for s in raymarch.default_steps(2 / building.samples(medium)))
     truth = tau(raymarch.RayMarch(medium.source, steps), x, d)
     error = tau(atlas, x, d) - truth
     print(f"mean {error.mean() / truth.mean():+.2%}, RMS {np.sqrt((error**2).mean()):.3f}")
@@ -148,12 +148,12 @@ def test_lights_inside_are_marched(statue, monkeypatch):
     """Lights inside are marched even if the light table has none: sampled lights use the same atlas."""
     medium, atlas = statue
     x, d = 0.3 * unit(3000, 9), unit(3000, 10)
-    expected = tau(building.build("raymarch", medium, None, Options(2 / 384)), x, d, 0.3)
+    expected = tau(building.build("raymarch", medium, None, Options(2 / building.samples(medium))), x, d, 0.3)
     np.testing.assert_array_equal(tau(atlas, x, d, 0.3), expected)
     monkeypatch.setattr(tuning, "ATLAS_SIDE", 4)
     monkeypatch.setattr(tuning, "ATLAS_RESOLUTION", 8)
     sun = LightTable(np.array([[0.6, 0.0, 0.8]]), np.ones((1, 3)), np.array([False]), 1.0, mi)
-    shared = building.build("transmittance_atlas", medium, sun, Options(2 / 384))
+    shared = building.build("transmittance_atlas", medium, sun, Options(2 / building.samples(medium)))
     np.testing.assert_array_equal(tau(shared, x, d, 0.3), expected)
 
 
@@ -174,7 +174,7 @@ def test_depth_close_by_is_right_on_average(variant):
                 def density(p, top=top, shape=shape):
                     return top * shape(p[1] / 0.6, exp=dr.exp)
 
-                actual = np.array(transmittance_atlas.close_by(density, x, wi, v), np.float64)
+                actual = np.array(transmittance_atlas.close_by(density, x, wi, v, 4), np.float64)
                 np.testing.assert_allclose(-np.log(actual).mean(), depth, rtol=2e-3)
                 deviation.append(actual.mean() - np.exp(-depth))
     print(f"RMS {np.sqrt(np.mean(np.square(deviation))):.4f}, most {np.abs(deviation).max():.4f}")

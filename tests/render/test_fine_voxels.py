@@ -1,5 +1,6 @@
 """Default steps follow voxels that are finer than the steps of trained fields."""
 
+import math
 from types import SimpleNamespace
 
 import mitsuba as mi
@@ -59,10 +60,21 @@ def test_steps_of_paths_follow_the_voxels(layer):
 
 
 def test_other_fields_keep_their_steps():
-    """Coarse voxels, and trained fields however fine their voxels are, have 384."""
+    """Coarse voxels, and trained fields of thick skins however fine their voxels are, have 384."""
     coarse = medium(Field.from_grid(np.ones((4, 4, 4))))
-    trained = SimpleNamespace(field=SimpleNamespace(trained=True, grid=SimpleNamespace(resolution=512)))
-    assert [building.samples(m) for m in (coarse, trained)] == [384, 384]
+    assert [building.samples(m) for m in (coarse, trained(0.01))] == [384, 384]
+
+
+def test_thin_skins_have_finer_steps_and_texels():
+    """Steps and texels shrink in proportion to skins; those of thick ones are as fine as the voxels."""
+    assert [building.samples(trained(t)) for t in (0.002, 0.001)] == [770, 1539]
+    assert [building.texels(trained(t)) for t in (0.01, 0.002, math.inf)] == [512, 770, 512]
+
+
+def trained(thickness: float):
+    """Return a stand-in of the medium of a trained field of 512³ voxels."""
+    return SimpleNamespace(field=SimpleNamespace(trained=True, grid=SimpleNamespace(resolution=512),
+                                                 softness=SimpleNamespace(thickness=thickness)))
 
 
 def medium(field: Field):

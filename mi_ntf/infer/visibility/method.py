@@ -23,14 +23,14 @@ if TYPE_CHECKING:
     from .transmittance_map import TransmittanceMap
 
 
-def resolution_for(lights: int, voxels: int) -> int:
+def resolution_for(lights: int, texels: int) -> int:
     """Return the default number of texels along a side of the maps of so many lights.
 
-    Texels are as fine as the field's voxels, of which there are `voxels` across its sphere, for up to ``FINE_MAPS``
-    lights: coarser texels show as ribs beside shadows. More lights share as many texels, but at least the square of
+    Texels are as fine as the field's voxels and skins, `texels` across its sphere, for up to ``FINE_MAPS`` lights:
+    coarser ones show as ribs beside shadows. More lights share as many texels, but at least the square of
     ``MIN_MAP_RESOLUTION`` each.
     """
-    return max(MIN_MAP_RESOLUTION, int(voxels * min(1, FINE_MAPS / max(lights, 1)) ** 0.5))
+    return max(MIN_MAP_RESOLUTION, int(texels * min(1, FINE_MAPS / max(lights, 1)) ** 0.5))
 
 
 @dataclass(frozen=True)

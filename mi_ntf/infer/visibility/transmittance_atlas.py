@@ -71,6 +71,7 @@ class TransmittanceAtlas:
         self.density, self.maps, self.march, self.options, self.dj = density, maps, march, options, dj
         self._begin, self._skin = dr.opaque(dj.Float, begin), begin > 0
         self._side = dr.opaque(dj.Float, maps.count**0.5)
+        self._strata = max(1, round(tuning.REACH / (tuning.STRATUM * options.step)))
         self.stream = dr.opaque(dj.UInt32, 0)
 
     def tau(self, x: Vector, wi: Vector, distance: Float, index: UInt32, active: Mask, sun: Mask = None) -> Float:
@@ -110,7 +111,7 @@ class TransmittanceAtlas:
         far = self._far(x, wi, here, outside, u)
 
         def near(far: Float, x: Vector, wi: Vector, v: Float) -> Float:
-            return far * close_by(self.density, x, wi, v)
+            return far * close_by(self.density, x, wi, v, self._strata)
 
         def dark(far: Float, x: Vector, wi: Vector, v: Float) -> Float:
             return far
@@ -131,18 +132,18 @@ class TransmittanceAtlas:
         return self.dj.UInt32(iv * self._side + iu), octahedral.direction(iu, iv, self._side)
 
 
-def close_by(density: Callable[[Vector], Float], x: Vector, wi: Vector, v: Float) -> Float:
+def close_by(density: Callable[[Vector], Float], x: Vector, wi: Vector, v: Float, strata: int) -> Float:
     """Return an estimate of τ(x, ω) as far as ``REACH``, whose optical depth is right on average.
 
-    σ is summed at one place in each stratum of √t, t = REACH ((v + i)/STRATA)², by one uniform number `v` per ray:
+    σ is summed at one place in each stratum of √t, t = REACH ((v + i)/strata)², by one uniform number `v` per ray:
     skins thin out away from x, and strata of √t see each of their parts.
     """
     depth: Array = 0
-    for i in range(tuning.STRATA):
-        root = (v + i) * (1 / tuning.STRATA)
+    for i in range(strata):
+        root = (v + i) * (1 / strata)
         t = tuning.REACH * root * root
         depth += root * density(tuple(a + t * b for a, b in zip(x, wi, strict=True)))
-    return dr.exp((-2 * tuning.REACH / tuning.STRATA) * depth)
+    return dr.exp((-2 * tuning.REACH / strata) * depth)
 
 
 def _uniforms(dj: ModuleType, stream: UInt32, x: Vector, wi: Vector, count: int = 5) -> list[Float]:

@@ -106,6 +106,6 @@ METHOD = Method(
     rays=lambda lights, resolution: lights * resolution**2,
     numbers=lambda medium, table, options: depths(options),
     dials=("map_resolution", "map_memory"),
-    resolution=lambda lights, voxels: MIN_MAP_RESOLUTION,  # memory grows with the third power
+    resolution=lambda lights, texels: max(MIN_MAP_RESOLUTION, texels // 2),  # memory grows with the third power
     sampled="raymarch",
 )

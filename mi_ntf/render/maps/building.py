@@ -4,6 +4,7 @@ Methods that store a table for each light are built in runs of lights that fit i
 from a map file or from the cache if possible.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
@@ -17,7 +18,7 @@ from ...core.errors import MiNtfError
 from ...infer.backend import module_of
 from ...infer.lights import LightTable
 from ...infer.texels import DTYPES
-from ...infer.tuning import ATLAS_RESOLUTION
+from ...infer.tuning import ATLAS_RESOLUTION, SKIN_CELL
 from ...infer.types import Visibility
 from ...infer.visibility import REGISTRY
 from ...infer.visibility.closed_form import ClosedForm
@@ -33,7 +34,7 @@ from ..scene.settings import Settings
 from . import map_cache
 
 SAMPLES = 384
-"""Default steps across the diameter of the unit sphere, which resolve the skins of trained fields."""
+"""Default steps across the diameter of the unit sphere, if skins are not so thin that they need more."""
 DENSE_TEXELS = 2
 """Length, in texels, of the marched part of a ray through dense smoke, whose mean free path is shorter than a texel."""
 UNTRAINED = ("raymarch", "transmittance_map", "transmittance_volume", "transmittance_atlas")
@@ -50,16 +51,25 @@ def resolved(settings: Settings, lights: int, media: Sequence[NRFMedium]) -> Set
     if settings.map_resolution:
         return settings
     method = REGISTRY["transmittance_map" if settings.visibility == "auto" else settings.visibility]
-    voxels = max(m.field.grid.resolution for m in media)
-    return replace(settings, map_resolution=method.resolution(lights, voxels))
+    return replace(settings, map_resolution=method.resolution(lights, max(map(texels, media))))
 
 
 def samples(medium: NRFMedium) -> int:
-    """Return the default number of steps across the unit sphere of `medium`: at least one for each of its voxels.
+    """Return the default number of steps across the unit sphere of `medium`, which follow its skins.
 
-    The voxels of trained fields do not count, whose networks are smoother than they are.
+    A field without networks has at least one for each voxel.
     """
-    return SAMPLES if medium.field.trained else max(SAMPLES, medium.field.grid.resolution)
+    return max(SAMPLES, _skin_cells(medium) if medium.field.trained else medium.field.grid.resolution)
+
+
+def texels(medium: NRFMedium) -> int:
+    """Return the number of texels across the unit sphere that are as fine as the voxels and skins of `medium`."""
+    return max(_skin_cells(medium) if medium.field.trained else 0, medium.field.grid.resolution)
+
+
+def _skin_cells(medium: NRFMedium) -> int:
+    """Return the number of cells across the unit sphere that resolve the skins of `medium`."""
+    return math.ceil(2 / (SKIN_CELL * medium.field.softness.thickness))
 
 
 def fewer_samples(settings: Settings, medium: NRFMedium, most: int) -> int:

@@ -210,7 +210,7 @@ def _visibility(name: str, inner: mi.Emitter, medium: NRFMedium) -> Visibility |
                 "places; choose raymarch or transmittance_atlas"
             )
         table = scene_lights.rows([(inner, kind)], 1).table(medium.frame)
-    options = Options(2 / building.samples(medium), resolution_for(1, medium.field.grid.resolution), cache=True,
+    options = Options(2 / building.samples(medium), resolution_for(1, building.texels(medium)), cache=True,
                       map_components=1 if medium.field.softness.opaque else 2)
     visibility = building.build(method, medium, table, options)
     if visibility and REGISTRY[method].per_field and not one:

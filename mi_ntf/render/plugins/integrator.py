@@ -9,9 +9,11 @@ visibility         string  auto    see meaning    visibility method of shadow ra
                                                   ``auto`` takes ``transmittance_atlas`` if camera rays times lights per
                                                   point times `frames` exceed the 3.4 million rays that fill an atlas,
                                                   else ``raymarch``. Under `max_error` or `time_budget` a pilot decides.
-samples            integer 0       0, 8 to 8192   steps across the diameter of the unit sphere. 0: 384, and one for each
-                                                  voxel of fields without networks. Paths of further bounces take at
-                                                  most a third of this default, light between patches two thirds.
+samples            integer 0       0, 8 to 8192   steps across the diameter of the unit sphere. 0: 384, more where steps
+                                                  would be longer than 1.3 scale heights of a field's thin skins, and
+                                                  one for each voxel of fields without networks. Paths of further
+                                                  bounces take at most a third of this default, light between patches
+                                                  two thirds.
 light_samples      integer 0       0 to 65536     sampled lights per shading point, of all emitters together. 0: sum
                                                   over point, spot and directional lights and environment cells, and two
                                                   samples of each other emitter (one of a projector or textured spot).
@@ -19,8 +21,8 @@ light_samples      integer 0       0 to 65536     sampled lights per shading poi
                                                   are marched.
 environment_lights integer 512     1 to 65536     largest number of directional lights that represent an environment
 map_resolution     integer 0       0 to 4096      texels along a side of a light's map. 0: as fine as the field's voxels
-                                                  for up to 16 lights, whose number of texels more lights share, but at
-                                                  least 192.
+                                                  and thin skins for up to 16 lights, whose number of texels more lights
+                                                  share, but at least 192.
 map_source         string  field   field, network ``field``: a texel is marched; ``network``: it is one query of the ray
                                                   network
 map_components     integer 0       0, 1, 2        logistics per texel of a marched map; 0: one for fields with opaque
