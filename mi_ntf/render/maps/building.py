@@ -68,8 +68,8 @@ def texels(medium: NRFMedium) -> int:
 
 
 def _skin_cells(medium: NRFMedium) -> int:
-    """Return the number of cells across the unit sphere that resolve the skins of `medium`."""
-    return math.ceil(2 / (SKIN_CELL * medium.field.softness.thickness))
+    """Return the number of cells across the unit sphere that resolve the skins of `medium`, at most two a voxel."""
+    return min(math.ceil(2 / (SKIN_CELL * medium.field.softness.thickness)), 2 * medium.field.grid.resolution)
 
 
 def fewer_samples(settings: Settings, medium: NRFMedium, most: int) -> int:
