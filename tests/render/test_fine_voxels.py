@@ -66,7 +66,7 @@ def test_other_fields_keep_their_steps():
 
 
 def test_thin_skins_have_finer_steps_and_texels():
-    """Steps and texels shrink in proportion to skins, to half a voxel; those of thick ones are as fine as the voxels."""
+    """Steps and texels shrink with skins, to half a voxel; those of thick skins are as fine as the voxels."""
     assert [building.samples(trained(t)) for t in (0.002, 0.001)] == [770, 1024]
     assert [building.texels(trained(t)) for t in (0.01, 0.002, math.inf)] == [512, 770, 512]
 
