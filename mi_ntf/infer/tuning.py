@@ -40,8 +40,6 @@ NETWORK_STEP = 0.93
 voxels' borders depend on rounding."""
 MAP_STEP = 0.97
 """Step for maps of one logistic, camera cells; maps of two take half of it."""
-VOLUME_ENTRIES = 1.5
-"""Entries of a ray of a transmittance volume per camera cell."""
 
 # Maps of lights.
 MIN_MAP_RESOLUTION, FINE_MAPS = 192, 16

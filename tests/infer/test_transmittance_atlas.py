@@ -57,7 +57,7 @@ def statue(variant):
 
 @functools.cache
 def captured():
-    medium = hard_cases.baked(*field_file.load(SCENES / "statue" / "field.safetensors"))
+    medium = hard_cases.baked(*field_file.load(SCENES / "statue" / "field.safetensors"), resolution=384)
     return medium, building.build("transmittance_atlas", medium, None, Options(2 / building.samples(medium)))
 
 

@@ -79,9 +79,8 @@ def test_auto_counts_drawn_lights(tmp_path):
 
 
 def test_maps_of_mixtures_take_four_times_the_memory(tmp_path):
-    scene = with_integrator(tmp_path, '<string name="map_source" value="network"/>'
-                            '<integer name="map_resolution" value="384"/>')
-    report = explain(scene, {"visibility": "transmittance_map", "depth": "2"})
+    scene = with_integrator(tmp_path, '<string name="map_source" value="network"/>')
+    report = explain(scene, {"visibility": "transmittance_map", "depth": "2", "map": "384"})
     assert report["memory_bytes"]["maps or volumes"] == 4 * 8 * 384**2
 
 

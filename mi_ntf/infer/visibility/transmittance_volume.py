@@ -15,19 +15,22 @@ from .. import ops
 from ..bundle import density_where, safe_inverse
 from ..grid import Density
 from ..lights import LightTable
-from ..tuning import MIN_MAP_RESOLUTION, VOLUME_ENTRIES
+from ..tuning import MIN_MAP_RESOLUTION
 from ..types import Array, Float, Mask, UInt32, Vector
 from .light_rays import LightRays
 from .method import Keep, Medium, Method, Options
 from .raymarch import MAX_OPTICAL_DEPTH
+
+FAINT = 1e-6
+"""Least transmittance that is interpolated; rays end at e⁻¹²."""
 
 
 class TransmittanceVolume:
     """Tables of τ for all lights of a table, `resolution`² rays of `depths` entries each.
 
     The entries of a ray divide t' ∈ [−R, R] evenly, R the radius of the hull of `volume`. Entry j holds τ at the *far*
-    edge of the j-th cell from the light, so light that has passed no cell yet is 1. A lookup is trilinear: τ linear
-    along each of the four nearest rays, bilinear between them. Memory: 4 m² n bytes a light.
+    edge of the j-th cell from the light, so light that has passed no cell yet is 1. A lookup is linear in the optical
+    depth along each of the four nearest rays, and bilinear in τ between them. Memory: 4 m² n bytes a light.
     """
 
     def __init__(self, lights: LightTable, resolution: int, depths: int, volume: Density, dj: ModuleType):
@@ -48,7 +51,7 @@ class TransmittanceVolume:
             dr.eval(self.values)
 
     def tau(self, x: Vector, wi: Vector, distance: Float, index: UInt32, active: Mask, sun: Mask = None) -> Float:
-        """Return trilinear τ; 1 where light meets nothing."""
+        """Return the interpolated τ; 1 where light meets nothing."""
         inside, _, nearest = self.rays.nearest(index, x, wi, distance, active)
         inverse, last = dr.rcp(self._cell), self.dj.Float(self._n) - 1
         result: Float = 0
@@ -60,7 +63,7 @@ class TransmittanceVolume:
             here = dr.select(j < 0, 1, dr.gather(self.dj.Float, self.values, first, inside))
             step = dr.select((j >= 0) & (j < last), self.dj.UInt32(1), 0)
             beyond = dr.gather(self.dj.Float, self.values, first + step, inside)
-            result += weight * dr.lerp(here, beyond, place - j)
+            result += weight * here * dr.power(dr.maximum(beyond, FAINT) / dr.maximum(here, FAINT), place - j)
         return dr.select(inside, result, 1)
 
     def _march(self, texel: UInt32, o: Vector, d: Vector, end: Float) -> None:
@@ -91,7 +94,7 @@ class TransmittanceVolume:
 
 def depths(options: Options) -> int:
     """Return the number of entries of a ray."""
-    return math.ceil(VOLUME_ENTRIES * 2 / options.step)
+    return math.ceil(2 / options.step)
 
 
 def build(medium: Medium, table: LightTable, options: Options, dj: ModuleType, keep: Keep) -> TransmittanceVolume:
