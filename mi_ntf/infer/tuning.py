@@ -54,8 +54,9 @@ ATLAS_SIDE = 36
 """Square root of the number of directions. Tuned on `globe` and `statue` under environments."""
 ATLAS_RESOLUTION = 51
 """Texels along the side of a direction's map; 51 MiB in all."""
-STRATUM = 2.75
-"""Mean length, in steps, of the strata of √t of the sum close to the point. Tuned on τ: the four opaque fields."""
+STRATA, STRATUM = 4, 2.75
+"""Least number of strata of √t of the sum close to the point, and their greatest mean length in steps. Tuned on τ: the
+four opaque fields."""
 BEGIN = 0.08
 """Distance from the point at which the map of an opaque field begins, field units; some skins of the point away."""
 REACH = 0.064

@@ -128,7 +128,7 @@ def test_lights_come_in_parts_that_fit(medium):
     assert parts(8) == [(0, 4), (4, 8), (8, 10)]
     assert parts(8, media=2) == [(0, 2), (2, 4), (4, 6), (6, 8), (8, 10)]
     assert parts(40, map_components=2) == [(0, 5), (5, 10)]
-    assert parts(960, method="transmittance_volume") == [(0, 5), (5, 10)]
+    assert parts(640, method="transmittance_volume") == [(0, 5), (5, 10)]
     assert parts(0, method="raymarch") == [(0, 10)]
     with pytest.raises(MiNtfError, match=r"map_memory is 0.0009766 MiB, but one light takes 0.001953 MiB"):
         parts(1)

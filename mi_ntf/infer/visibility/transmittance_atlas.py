@@ -71,7 +71,7 @@ class TransmittanceAtlas:
         self.density, self.maps, self.march, self.options, self.dj = density, maps, march, options, dj
         self._begin, self._skin = dr.opaque(dj.Float, begin), begin > 0
         self._side = dr.opaque(dj.Float, maps.count**0.5)
-        self._strata = max(1, round(tuning.REACH / (tuning.STRATUM * options.step)))
+        self._strata = max(tuning.STRATA, round(tuning.REACH / (tuning.STRATUM * options.step)))
         self.stream = dr.opaque(dj.UInt32, 0)
 
     def tau(self, x: Vector, wi: Vector, distance: Float, index: UInt32, active: Mask, sun: Mask = None) -> Float:
