@@ -26,7 +26,8 @@ FLATTEST = 40.0
 SMOKE, SOLID = 3.0, 6.0
 """Optical depths across matter: below the first it has no skin, above the second it is opaque."""
 SEEN = 0.3, 3.0
-"""Optical depths to the outside between which a skin's scale height is read: cameras see 70 % of their light there."""
+"""Optical depths to the outside between which a skin's scale height is read. From there come 70 % of the light that a
+camera sees along the normal."""
 THIN = 0.25
 """Quantile of the scale heights that stands for a field's skins: the thinner ones need the finest steps."""
 

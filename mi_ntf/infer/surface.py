@@ -24,15 +24,14 @@ LEVEL = 10.0
 lower levels lie outside of them, higher ones tear skins open."""
 TIGHT = 0.3
 """Fraction of the level at which a skin counts as closed when the space that it encloses is filled."""
-GAP = 0.02
-"""Width of the gaps in a skin, field units, that count as closed when the space that it encloses is filled: skins are
-torn where few photographs look."""
 CRUMB = 1e-4
 """Number of voxels, over those of the largest part, below which a part is removed."""
 RESOLUTIONS = (32, 512)
 """Least and largest number of voxels per side; 512 takes about 2 GB of memory."""
 BEFORE, BEHIND, STEP = 0.008, 0.032, 0.004
 """Begin, end and step of a camera's look along the normal, before and behind the surface, field units."""
+UNSEEN = 1e-3
+"""Opacity of a look up to which it shows no matter."""
 PART = 1 << 18
 """Vertices that are evaluated together, about 100 MB."""
 
@@ -69,7 +68,7 @@ def surface(field: NetworkField | VoxelVolume, resolution: int, level: float | N
     level = min(LEVEL, highest / 2) if level is None else level
     if not level < highest:
         raise MiNtfError(f"no density of {level:g} in the field, the highest is {highest:.3g}; give a lower --level")
-    gap = round(GAP * resolution / 4)
+    gap = round((BEFORE + BEHIND) * resolution / 4)  # a camera's look through a skin is deeper than such gaps are wide
     values, corner = _cropped(values, np.log(TIGHT * level), gap + 1)
     values = _solid(values, level, gap)
     places, faces, _, _ = marching_cubes(values, np.log(level))
@@ -105,8 +104,8 @@ def _cropped(values: np.ndarray, threshold: float, border: int) -> tuple[np.ndar
 def _solid(values: np.ndarray, level: float, gap: int) -> np.ndarray:
     """Return ln σ with enclosed space filled, and without small parts.
 
-    Space is also enclosed if it opens outward only by gaps of at most 2 `gap` voxels. Inside and outside meet at
-    the highest density of the skin between them.
+    Space is also enclosed if it opens outward only by gaps of at most 2 `gap` voxels: skins are torn where few
+    photographs look. Inside and outside meet at the highest density of the skin between them.
     """
     from scipy.ndimage import binary_erosion, label
     from skimage.segmentation import watershed
@@ -146,9 +145,12 @@ def _reflectance(field: NetworkField | VoxelVolume, vertices: np.ndarray, normal
                  progress: Progress) -> tuple[np.ndarray, ...]:
     """Return normals, albedo, roughness and specular weight, as a camera that looks along each normal sees them.
 
-    They are means weighted by opacity, as in rendering.
+    They are means weighted by opacity, as in rendering. A vertex on the closing of a gap sees nothing, and has the
+    values of the nearest one that sees matter.
     """
-    result = np.empty((len(vertices), CHANNELS), np.float32)
+    from scipy.spatial import cKDTree
+
+    result, opacity = np.empty((len(vertices), CHANNELS), np.float32), np.empty(len(vertices), np.float32)
     for first in range(0, len(vertices), PART):
         progress(first / len(vertices))
         part = slice(first, first + PART)
@@ -162,7 +164,10 @@ def _reflectance(field: NetworkField | VoxelVolume, vertices: np.ndarray, normal
             clear = after
             dr.eval(clear, sums)
         weight = dr.maximum(1 - clear, 1e-6)
-        result[part] = np.stack([(s / weight).numpy() for s in sums], axis=1)
+        result[part], opacity[part] = np.stack([(s / weight).numpy() for s in sums], axis=1), weight.numpy()
+    seen = opacity > UNSEEN
+    if seen.any():
+        result[~seen] = result[seen][cKDTree(vertices[seen]).query(vertices[~seen])[1]]
     return _outward(result[:, :3], normals), result[:, 3:6], result[:, 6], result[:, 7:]
 
 

@@ -10,10 +10,10 @@ visibility         string  auto    see meaning    visibility method of shadow ra
                                                   point times `frames` exceed the 3.4 million rays that fill an atlas,
                                                   else ``raymarch``. Under `max_error` or `time_budget` a pilot decides.
 samples            integer 0       0, 8 to 8192   steps across the diameter of the unit sphere. 0: 384, more where steps
-                                                  would be longer than 1.3 scale heights of a field's thin skins, and
-                                                  one for each voxel of fields without networks. Paths of further
-                                                  bounces take at most a third of this default, light between patches
-                                                  two thirds.
+                                                  would be longer than 1.3 scale heights of a field's thin skins, up to
+                                                  two for each voxel, and one for each voxel of fields without networks.
+                                                  Paths of further bounces take at most a third of this default, light
+                                                  between patches two thirds.
 light_samples      integer 0       0 to 65536     sampled lights per shading point, of all emitters together. 0: sum
                                                   over point, spot and directional lights and environment cells, and two
                                                   samples of each other emitter (one of a projector or textured spot).
