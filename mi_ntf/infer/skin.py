@@ -7,6 +7,7 @@ import drjit as dr
 import numpy as np
 
 from ..core import skin
+from ..core.architecture import LOG_FLOOR
 from ..core.ops import dot
 from . import ops
 from .backend import floats
@@ -14,10 +15,14 @@ from .bake import REFLECTANCE_RESOLUTION, Progress, at_voxels
 from .bricks import of_dense
 from .bundle import density_where, onward, safe_inverse
 from .grid import Density, GridField, bricks_of
+from .network import NetworkField
 from .types import Array, Float, Mask, Vector
 
 OPAQUE = 0.5
 """Fraction of opaque skins below which a field is smoke."""
+PROBES, NEAR, SLOPE = 1 << 16, 1 / 192, 1 / 1536
+"""Random points at which the networks' skins are probed; reach of points around those with matter, and half of the
+length over which slopes are taken, field units."""
 
 
 class Softness:
@@ -107,6 +112,26 @@ def _thickness(grid: Density, x: Vector, normal: Vector, inward: Float, width: f
     p = tuple(c + floats(rng.uniform(-width / 2, width / 2, dr.width(c)), dj) for c in x)
     out = _depth(grid, p, normal, skin.DEEPEST)
     return skin.thickness(out.numpy(), inward.numpy(), grid.density(p).numpy())
+
+
+def scale_height(field: NetworkField, dj: ModuleType) -> float:
+    """Return the scale height of the thinner skins of `field`, read off the slope of ln σ; infinity if it has none."""
+    rng = np.random.default_rng(0)
+
+    def log_density(p: np.ndarray) -> np.ndarray:
+        values: np.ndarray = field.log_density(tuple(floats(c, dj) for c in p)).numpy().astype(np.float64)
+        return values
+
+    p = rng.uniform(-1, 1, (3, PROBES))
+    p = p[:, log_density(p) > LOG_FLOOR]
+    if not p.shape[1]:
+        return math.inf
+    p = np.repeat(p, -(-PROBES // p.shape[1]), 1)
+    p += rng.uniform(-NEAR, NEAR, p.shape)
+    slope = [log_density(p + h) - log_density(p - h) for h in SLOPE * np.eye(3)[:, :, None]]
+    height = 2 * SLOPE / np.maximum(np.linalg.norm(slope, axis=0), 1e-9)
+    sigma = np.exp(log_density(p))
+    return skin.thickness(sigma * height, np.full(len(height), skin.SOLID), sigma)
 
 
 def _centres(index: np.ndarray, n: int, dj: ModuleType) -> tuple[Float, ...]:

@@ -220,7 +220,7 @@ def check_demo(folder: Path, ssim: float, rmse: float, to_march: float) -> None:
         assert (folder / "tradeoff" / name).stat().st_size > 0
 
 
-COARSE = (('<default name="resolution" value="512"/>', '<default name="resolution" value="96"/>'),
+COARSE = (('name="interior">', 'name="interior"><integer name="resolution" value="96"/>'),
           ('<default name="map" value="0"/>', '<default name="map" value="64"/>'))
 """What makes the statue's scene quick to load: most of a render on few pixels is the field's grid and the maps."""
 

@@ -11,7 +11,7 @@ from mi_ntf.core import ops
 from mi_ntf.core import skin as formulas
 from mi_ntf.infer.grid import baked
 from mi_ntf.infer.network import NetworkField
-from mi_ntf.infer.skin import Softness, measured, spread
+from mi_ntf.infer.skin import Softness, measured, scale_height, spread
 
 
 def of(header, tensors) -> Softness:
@@ -60,6 +60,18 @@ def test_thickness_is_the_scale_height(scale):
     expected = formulas.thickness(out, np.full(len(x), formulas.SOLID), skin.density(x))
     assert of(skin.header, skin.tensors).thickness == pytest.approx(expected, rel=0.03)
     assert expected == pytest.approx(scale, rel=0.2)
+
+
+@pytest.mark.parametrize("scale", [0.002, 0.005, 0.02])
+def test_networks_tell_the_scale_height(scale):
+    """As above, without a bake."""
+    skin = fields.skin("sphere", 3 - np.log(scale), scale)
+    x = at_depths("sphere", (0, 6 * scale), 5000)
+    sigma = skin.density(x)
+    height = scale / (2 * np.linalg.norm(x, axis=1))
+    expected = formulas.thickness(sigma * height, np.full(len(x), formulas.SOLID), sigma)
+    mi.set_variant(VARIANT)
+    assert scale_height(NetworkField(skin.header, skin.tensors, mi), mi) == pytest.approx(expected, rel=0.02)
 
 
 def test_plane_is_flat():

@@ -13,6 +13,8 @@ from helpers.scenes import nrf
 
 from mi_ntf.core import field_file
 from mi_ntf.core.architecture import FAST, Encoding, Header
+from mi_ntf.infer import backend
+from mi_ntf.infer.network import NetworkField
 from mi_ntf.render.scene import loaded
 from mi_ntf.render.scene.media import find_media
 
@@ -281,12 +283,18 @@ def test_placement_by_to_world_and_scale(tmp_path):
     assert np.abs(scenes.render(moved) - plain).mean() < 1e-4
 
 
-@pytest.mark.parametrize(("planes", "voxels"), [((), 192), ((64, 90), 192), ((192, 64), 384), ((1024,), 512)])
-def test_voxels_follow_the_finest_planes(planes, voxels):
-    """There are two voxels per texel, 192 to 512."""
+@pytest.mark.parametrize(("planes", "height", "phase", "voxels"), [
+    ((), 0.02, None, 192), ((64, 90), 0.02, None, 192), ((192, 64), 0.02, None, 384), ((1024,), 0.02, None, 512),
+    ((192, 64), 0.005, None, 448), ((), 0.008, None, 280), ((192, 64), 0.001, None, 512), ((192, 64), 0.005, 0.3, 384)])
+def test_voxels_follow_planes_and_skins(planes, height, phase, voxels):
+    """There are two voxels per texel of planes, and one for each 0.9 scale heights of a skin, 192 to 512."""
     kind = "planes" if planes else "frequency"
     network = dataclasses.replace(FAST.density, encoding=Encoding(kind, planes, 1 if planes else 0))
-    assert loaded.voxels(Header(dataclasses.replace(FAST, density=network))) == voxels
+    header = Header(dataclasses.replace(FAST, density=network, phase=phase))
+    skin = fields.skin("sphere", 3 - np.log(height), height)
+    dj = backend.module(mi.variant())
+    # Skins are a little thinner than their nominal height, by which the number is larger.
+    assert 0 <= loaded.voxels(header, NetworkField(skin.header, skin.tensors, dj), dj) - voxels <= 16
 
 
 def test_a_scene_may_name_the_voxels(blobs):

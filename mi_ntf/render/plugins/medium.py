@@ -7,8 +7,8 @@ filename        string    required a path        field file (``.safetensors``, o
 to_world        transform identity similarity    placement after `scale`: rotation, translation, uniform scale
 scale           float     1        10⁻¹² to 10¹² scene units per capture unit
 representation  string    grid     grid, network ``grid``: baked voxels; ``network``: the networks, exact and slower
-resolution      integer   by field 16 to 1024    voxels per side of the baked grid; by default twice the finest density
-                                                 plane, 192 to 512
+resolution      integer   by field 16 to 1024    voxels per side of the baked grid; by default 192 to 512, two for each
+                                                 texel of the density's planes, and more where skins are thinner
 shadow_catcher  boolean   false                  the lights' shadows darken what the field emits; for fields of
                                                  ``mi-ntf import --emissive``
 sample_emitters boolean   true                   as for any medium; for stock volumetric integrators

@@ -20,9 +20,11 @@ from ...core.architecture import Header, Similarity
 from ...core.errors import MiNtfError
 from ...infer.backend import module
 from ...infer.bake import VERSION, bake
+from ...infer.bricks import SIDE
 from ...infer.grid import GridField
 from ...infer.network import NetworkField
-from ...infer.skin import Smoke, Softness, measure
+from ...infer.skin import Smoke, Softness, measure, scale_height
+from ...infer.tuning import VOXEL
 from ...infer.volume import VoxelVolume, of_file
 from .. import log, user_cache
 
@@ -192,13 +194,15 @@ def is_in_memory(name: str) -> bool:
     return name.startswith("memory:")
 
 
-def voxels(header: Header) -> int:
-    """Return the default number of voxels per side: two for each texel of the finest density planes, 192 to 512.
+def voxels(header: Header, network: NetworkField, dj: ModuleType) -> int:
+    """Return the default number of voxels per side, 192 to 512.
 
-    The product of three planes has finer detail than a single plane.
+    There are two for each texel of the finest density planes, since the product of three planes has finer detail than a
+    single plane; and more where skins are thinner than that.
     """
-    finest = max(header.architecture.density.encoding.resolutions, default=0)
-    return min(max(192, 2 * finest), 512)
+    planes = 2 * max(header.architecture.density.encoding.resolutions, default=0)
+    skins = 2 / (VOXEL * scale_height(network, dj)) if header.architecture.phase is None else 0
+    return min(max(192, planes, -(-round(skins) // SIDE) * SIDE), 512)
 
 
 def load(path: str, resolution: int | None) -> LoadedField | VolumeField:
@@ -246,15 +250,15 @@ def _load(path: str, _identity: tuple[int, int, int] | None, resolution: int | N
     header, tensors = field_file.load(path)
     with log.Work("nrf medium", f"reading {path}"):
         network, digest = NetworkField(header, tensors, dj), _digest(header, tensors)
-        n = resolution or voxels(header)
-        stored = field_file.load_baked(path, _stamp(digest, n))
+        stored = field_file.load_baked(path, _stamp(digest, resolution))
         if stored is not None:
             try:
                 return LoadedField(header, network, GridField(stored, network, dj), _softness(header, stored, dj),
                                    digest)
             except (KeyError, ValueError):
                 log.info(f"nrf medium: the voxels in {path} are damaged")
-        arrays = user_cache.cached("fields", user_cache.key(digest, n), lambda: _baked(path, header, network, n, dj))
+        arrays = user_cache.cached("fields", user_cache.key(digest, resolution),
+                                   lambda: _baked(path, header, network, resolution, dj))
         return LoadedField(header, network, GridField(arrays, network, dj), _softness(header, arrays, dj), digest)
 
 
@@ -295,13 +299,16 @@ def add_baked(path: Path, resolution: int | None = None) -> dict[str, str | int]
     """
     header, tensors = field_file.load(path)
     dj = module(str(mi.variant()))
-    n = resolution or voxels(header)
-    arrays = _baked(str(path), header, NetworkField(header, tensors, dj), n, dj)
-    field_file.add_baked(path, arrays, _stamp(_digest(header, tensors), n))
-    return {"file": str(path), "voxels": n, "bytes": Path(path).stat().st_size}
+    network = NetworkField(header, tensors, dj)
+    arrays = _baked(str(path), header, network, resolution, dj)
+    field_file.add_baked(path, arrays, _stamp(_digest(header, tensors), resolution))
+    grid = GridField(arrays, network, dj)
+    return {"file": str(path), "voxels": grid.resolution, "bytes": Path(path).stat().st_size}
 
 
-def _baked(path: str, header: Header, network: NetworkField, n: int, dj: ModuleType) -> dict[str, np.ndarray]:
+def _baked(path: str, header: Header, network: NetworkField, resolution: int | None, dj: ModuleType
+           ) -> dict[str, np.ndarray]:
+    n = resolution or voxels(header, network, dj)
     with log.Work("nrf medium", f"baking {Path(path).name}, {n}³ voxels") as work:
         arrays = bake(network, n, dj, lambda done: work.update(0.75 * done))
         if header.architecture.phase is not None:
@@ -309,9 +316,9 @@ def _baked(path: str, header: Header, network: NetworkField, n: int, dj: ModuleT
         return arrays | measure(GridField(arrays, network, dj), dj, lambda done: work.update(0.75 + 0.25 * done))
 
 
-def _stamp(digest: str, n: int) -> str:
-    """Return a text that identifies arrays baked by this version at n³ voxels from the tensors with this digest."""
-    return f"{VERSION} {n} {digest}"
+def _stamp(digest: str, resolution: int | None) -> str:
+    """Return a text that identifies arrays which this version bakes from the tensors with this digest."""
+    return f"{VERSION} {resolution or 'default'} {digest}"
 
 
 def _digest(header: Header, tensors: dict[str, np.ndarray]) -> str:
