@@ -12,7 +12,7 @@ from mi_ntf.core import extras, files
 
 @dataclass
 class Refine:
-    """Refine a field's reflectance by photographs under a known light."""
+    """Refine a field by photographs under a known light."""
 
     scene: Annotated[Positional[Path], options.named(
         "SCENE.xml|FIELD", "Scene with the field and the light of the photographs; a field file alone is lit by each "
@@ -22,7 +22,8 @@ class Refine:
     output: options.Output
     """Field file to write."""
     parameters: Annotated[str, options.named("NAMES")] = "albedo"
-    """What may change: albedo, specular or both, as albedo,specular; in fields that emit light, emission."""
+    """What may change, as albedo,log_density: albedo, specular, roughness, log_density (of imported fields density), or
+    emission in fields that emit light."""
     minutes: options.OptionalNumber = None
     """Stop after this many minutes. The default is 2."""
     steps: options.OptionalCount = None

@@ -15,10 +15,11 @@ from .ops import Tensors
 
 _BAKED = "baked."
 """Prefix of the names of arrays that were baked from the tensors (:func:`add_baked`), and their key in the metadata."""
-_REFINED = "refined."
-"""Prefix of the names of arrays that refine the reflectance (:func:`add_refinement`)."""
+_REFINED = {"reflectance": "refined.", "density": "refined_density."}
+"""Quantity → prefix of the names of arrays that refine it (:func:`add_refinement`)."""
+_PREFIXES = tuple(_REFINED.values())
 REFINED_CHANNELS = {"albedo": 3, "roughness": 1, "specular": 3}
-"""Channels of a refinement by quantity, in their order; there is the albedo alone, or there are all."""
+"""Channels of a reflectance's refinement, in their order; there is the albedo alone, or there are all."""
 _LARGEST = 1e36
 """Upper bound of a network's sums, below which no order of summation overflows single precision."""
 
@@ -36,7 +37,7 @@ def save(path: str | Path, header: Header, tensors: Tensors, dtype: type = np.fl
 def rounded(tensors: Tensors, dtype: type = np.float16) -> Tensors:
     """Return `tensors` in the number formats in which :func:`save` stores them."""
     return {k: np.ascontiguousarray(v, _fitting(v, dtype) if ".planes." in k else
-                                    v.dtype if k.startswith(_REFINED) else np.float32) for k, v in tensors.items()}
+                                    v.dtype if k.startswith(_PREFIXES) else np.float32) for k, v in tensors.items()}
 
 
 def load(path: str | Path) -> tuple[Header, Tensors]:
@@ -53,15 +54,19 @@ def load(path: str | Path) -> tuple[Header, Tensors]:
     except (safetensors.SafetensorError, TypeError, AttributeError) as error:  # the last two: types that NumPy lacks
         raise MiNtfError(f"{path} is no field file ({str(error)[:200]}); make it anew with `mi-ntf train`") from None
     _check(str(path), header, tensors)
-    return header, {k: v if k.startswith(_REFINED) else v.astype(np.float32) for k, v in tensors.items()}
+    return header, {k: v if k.startswith(_PREFIXES) else v.astype(np.float32) for k, v in tensors.items()}
 
 
-def refinement(tensors: Tensors) -> Tensors:
-    """Return the arrays of the refinement among the tensors of a field, by their names in its bricks; {} if none."""
-    return {k.removeprefix(_REFINED): v for k, v in tensors.items() if k.startswith(_REFINED)}
+def refinement(tensors: Tensors, quantity: str) -> Tensors:
+    """Return the arrays that refine ``reflectance`` or ``density`` among a field's tensors, named as in bricks.
+
+    The result is empty if none do.
+    """
+    prefix = _REFINED[quantity]
+    return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
 
 
-def add_refinement(path: str | Path, output: str | Path, arrays: Tensors, record: Json) -> None:
+def add_refinement(path: str | Path, output: str | Path, arrays: dict[str, Tensors], record: Json) -> None:
     """Write the field file `path` as `output` with a refinement, in place of any older one.
 
     Parameters
@@ -69,15 +74,16 @@ def add_refinement(path: str | Path, output: str | Path, arrays: Tensors, record
     path, output
         Field files, which may be the same.
     arrays
-        Differences of the reflectance from the networks' own, the arrays of a :class:`mi_ntf.infer.bricks.Bricks` with
-        the channels of ``REFINED_CHANNELS``.
+        By quantity, differences from what the networks give, as arrays of a :class:`mi_ntf.infer.bricks.Bricks`.
+        ``reflectance`` has the channels of ``REFINED_CHANNELS``, ``density`` the difference of ln σ.
     record
         Entry ``refined`` of the provenance.
     """
     header, _ = load(path)
     with safetensors.safe_open(path, "np") as file:
-        data = {k: file.get_tensor(k) for k in file.keys() if not k.startswith((_BAKED, _REFINED))}
-    data |= {_REFINED + k: np.ascontiguousarray(v) for k, v in arrays.items()}
+        data = {k: file.get_tensor(k) for k in file.keys() if not k.startswith((_BAKED, *_PREFIXES))}
+    for quantity, differences in arrays.items():
+        data |= {_REFINED[quantity] + k: np.ascontiguousarray(v) for k, v in differences.items()}
     _check(str(output), header, data)
     described = header.to_json()
     described["provenance"] = described["provenance"] | {"refined": record}
@@ -182,11 +188,11 @@ def _number(data: object, *keys: str) -> float | None:
 def _check(source: str, header: Header, tensors: Tensors) -> None:
     skeleton = header.architecture.skeleton()
     faults = [f"missing tensor {k}" for k in skeleton if k not in tensors]
-    faults += [f"unknown tensor {k[:80]}" for k in tensors if k not in skeleton and not k.startswith(_REFINED)]
-    refined = refinement(tensors)
-    if refined:
-        counts = np.cumsum(list(REFINED_CHANNELS.values())).tolist()
-        faults += voxels.brick_faults(_REFINED.removesuffix("."), refined, (counts[0], counts[-1]))
+    faults += [f"unknown tensor {k[:80]}" for k in tensors if k not in skeleton and not k.startswith(_PREFIXES)]
+    counts = np.cumsum(list(REFINED_CHANNELS.values())).tolist()
+    for quantity, channels in (("reflectance", (counts[0], counts[-1])), ("density", (1,))):
+        if refined := refinement(tensors, quantity):
+            faults += voxels.brick_faults(_REFINED[quantity].removesuffix("."), refined, channels)
     for name, shape in skeleton.items():
         if name not in tensors:
             continue

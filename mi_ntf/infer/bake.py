@@ -69,7 +69,7 @@ def _density(field: NetworkField, n: int, dj: ModuleType, progress: Progress) ->
     """Return the places (bricks, 3), z first, and voxels (bricks, 9, 9, 9) of all bricks that hold density."""
     parts = [(np.zeros((0, 3), int), np.zeros((0,) + (SIDE + 1,) * 3, np.float32))]
     highest = LOG_FLOOR
-    for places, samples in sampled_bricks(field, n, (-1, SIDE + 2), dj, progress):
+    for places, samples in sampled_bricks(field, n, (-1, SIDE + 2), dj, progress, field.learned_log_density):
         highest = max(highest, float(samples.max()))
         for axis in (1, 2, 3):
             inner, before, after = (samples[(slice(None),) * axis + (slice(k, k + samples.shape[axis] - 2),)]
@@ -78,15 +78,19 @@ def _density(field: NetworkField, n: int, dj: ModuleType, progress: Progress) ->
         dense = (samples > LOG_MIN_DENSITY).any((1, 2, 3))
         parts.append((places[dense], samples[dense]))
     places, values = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    return places, np.minimum(values, np.float32(highest), out=values)
+    np.minimum(values, np.float32(highest), out=values)
+    if field.refined_density:  # by differences of such coefficients, within the bricks of the networks
+        values += at_bricks(field.refined_density.at, places, (0, SIDE + 1), n, dj)
+        np.maximum(values, LOG_FLOOR, out=values)
+    return places, values
 
 
 def sampled_bricks(field: NetworkField, n: int, reach: tuple[int, int], dj: ModuleType,
-                   progress: Progress = lambda done: None) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+                   progress: Progress = lambda done: None, log_density: Callable[[Vector], Float] | None = None
+                   ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield parts of all bricks near density: places (k, 3), z first, and ln σ of their voxels, at least `LOG_FLOOR`.
 
-    `reach`: the first voxel of an edge and the one behind its last, counted from the brick's first. Voxels outside the
-    volume are those of its border.
+    `reach`: as in :func:`at_bricks`. `log_density`: function to sample in place of the field's own.
     """
     survey = min(n, SURVEY)
     coarse = at_voxels(lambda p: [field.log_density(p)], 1, None, survey, dj,
@@ -97,10 +101,21 @@ def sampled_bricks(field: NetworkField, n: int, reach: tuple[int, int], dj: Modu
     parts = -(-len(places) * edge**3 // PART)
     for number, part in enumerate(np.array_split(places, parts) if parts else ()):
         progress((1 + number / parts) / 2)
-        voxels = np.clip(SIDE * part[..., None] + np.arange(*reach), 0, n - 1).astype(np.uint32)
-        z, y, x = voxels[:, 0, :, None, None], voxels[:, 1, None, :, None], voxels[:, 2, None, None, :]
-        samples = at_voxels(lambda p: [field.log_density(p)], 1, ((z * n + y) * n + x).ravel(), n, dj)
-        yield part, np.maximum(samples, LOG_FLOOR).reshape(len(part), edge, edge, edge)
+        samples = at_bricks(lambda p: [(log_density or field.log_density)(p)], part, reach, n, dj)
+        yield part, np.maximum(samples, LOG_FLOOR)
+
+
+def at_bricks(function: Callable[[Vector], Sequence[Float]], places: np.ndarray, reach: tuple[int, int], n: int,
+              dj: ModuleType) -> np.ndarray:
+    """Return ``function(p)``, a list of one array, at the voxels of bricks; (bricks, edge, edge, edge), z first.
+
+    `places`: (bricks, 3), z first. `reach`: the first voxel of an edge and the one behind its last, counted from the
+    brick's first. Voxels outside the volume are those of its border.
+    """
+    voxels = np.clip(SIDE * places[..., None] + np.arange(*reach), 0, n - 1).astype(np.uint32)
+    z, y, x = voxels[:, 0, :, None, None], voxels[:, 1, None, :, None], voxels[:, 2, None, None, :]
+    edge = reach[1] - reach[0]
+    return at_voxels(function, 1, ((z * n + y) * n + x).ravel(), n, dj).reshape(-1, edge, edge, edge)
 
 
 def at_voxels(function: Callable[[Vector], Sequence[Float]], count: int, index: np.ndarray | None, n: int,

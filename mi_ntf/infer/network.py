@@ -85,8 +85,9 @@ class NetworkField:
         """Tail of the specular lobe (:mod:`mi_ntf.core.microfacet`), None for GGX."""
         self.quick = arch.reflectance.encoding.kind == "planes"
         """True if a reflectance costs no more than a few fetches."""
-        refined = refinement(tensors)
-        self._refinement = Refinement(refined, dj) if refined else None
+        self._refined_reflectance, self.refined_density = (
+            Refinement(arrays, dj) if (arrays := refinement(tensors, quantity)) else None
+            for quantity in ("reflectance", "density"))
 
     def tensors(self) -> dict[str, Array]:
         """Return the planes and the packed weights of the density and reflectance networks, by name."""
@@ -99,6 +100,13 @@ class NetworkField:
 
     def log_density(self, p: Vector) -> Float:
         """Return ln σ at `p`, clipped to the legal range, without the cuts of :meth:`density`."""
+        value = self.learned_log_density(p)
+        if not self.refined_density:
+            return value
+        return dr.clip(value + self.refined_density.at(p)[0], MIN_LOG_DENSITY, MAX_LOG_DENSITY)
+
+    def learned_log_density(self, p: Vector) -> Float:
+        """Return ln σ at `p` by the network alone, without a refinement."""
         (raw,) = self._density.layers(self._density.encode(p))
         return dr.clip(raw, MIN_LOG_DENSITY, MAX_LOG_DENSITY)
 
@@ -109,7 +117,7 @@ class NetworkField:
     def reflectance(self, p: Vector) -> Reflected:
         """Return normal, albedo, roughness and specular weight at `p`; of smoke 0, its albedo, 1 and 0."""
         reflected = self.learned_reflectance(p)
-        return self._refinement.apply(reflected, p) if self._refinement else reflected
+        return self._refined_reflectance.apply(reflected, p) if self._refined_reflectance else reflected
 
     def learned_reflectance(self, p: Vector) -> Reflected:
         """Return the reflectance of the networks alone, without a refinement."""

@@ -1,4 +1,4 @@
-"""Refinement of a field: differences of its reflectance at voxels, which are added to the values of its networks."""
+"""Refinement of a field: differences at voxels, which are added to what its networks give."""
 
 from collections.abc import Mapping
 from types import ModuleType
@@ -30,10 +30,10 @@ def changed(reflected: Reflected, change: Mapping[str, list[Float]]) -> Reflecte
 
 
 class Refinement:
-    """Differences of a reflectance, trilinear between the voxels of bricks.
+    """Differences of a field's quantities, trilinear between the voxels of bricks.
 
-    `arrays`: those of the bricks, with 3 channels (albedo) or 7 (albedo, roughness, specular weight). Raises MiNtfError
-    if they cannot be that.
+    `arrays`: those of the bricks. A reflectance has 3 channels (albedo) or 7 (albedo, roughness, specular weight), a
+    density one, that of ln σ. Raises MiNtfError if they cannot be bricks.
     """
 
     def __init__(self, arrays: dict[str, np.ndarray], dj: ModuleType):
@@ -42,9 +42,13 @@ class Refinement:
         except ValueError:
             raise MiNtfError("the field's refinement is damaged; make the file anew with `mi-ntf refine`") from None
 
+    def at(self, p: Vector) -> list[Float]:
+        """Return the differences at `p` by channels."""
+        return self._bricks.at(self._bricks.place(p))
+
     def apply(self, reflected: Reflected, p: Vector) -> Reflected:
         """Return `reflected`, the networks' reflectance at `p`, with the differences there."""
-        values = self._bricks.at(self._bricks.place(p))
+        values = self.at(p)
         change, first = {}, 0
         for name, count in REFINED_CHANNELS.items():
             if first < len(values):

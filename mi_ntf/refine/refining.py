@@ -23,12 +23,14 @@ from .comparison import Comparison, compare, difference
 from .gains import Gains, products
 from .photographs import Camera, Photographs, joined
 from .subject import Subject
-from .voxels import Voxels
+from .voxels import HIGHEST, Descended, Linear, Voxels
 
 TILE = 64
 """Side of the parts of photographs that steps compare, in pixels."""
 RAYS, GRADIENT_RAYS = 1 << 14, 1 << 12
 """Camera rays of the picture that is compared, and of the one that is differentiated."""
+DENSE_TILE, DENSE_RAYS = 256, 1 << 18
+"""The same where the density changes, whose voxels take about a second a step, whatever is compared."""
 DARK = 0.05
 """Brightness, relative to the bright parts of the photographs, below which errors count absolutely."""
 INTERVAL = 50.0
@@ -122,9 +124,15 @@ class Run:
         to_scene = subject.to_scene()
         self._pool = Photographs(joined(splits["train"], splits["val"]), to_scene, subject.solid)
         self._held = Photographs(splits["test"], to_scene, subject.solid)
-        self._voxels = {name: Voxels(name, subject.get(name), subject.lattice) for name in names}
+        self._voxels: dict[str, Voxels] = {
+            name: (Linear if name in HIGHEST else Descended)(name, subject.get(name), subject.lattice(name))
+            for name in names}
+        self._linear = [name for name in names if name in HIGHEST]
         self._gains, self._with_gains = Gains(self._pool.views, not gains), gains
-        side = min(TILE, self._pool.height, self._pool.width)
+        dense = any("density" in name for name in names)
+        side = min(DENSE_TILE if dense else TILE, self._pool.height, self._pool.width)
+        self._spp, self._gradient_spp = (max(1, rays // side**2) for rays in (
+            (DENSE_RAYS, DENSE_RAYS) if dense else (RAYS, GRADIENT_RAYS)))
         self._camera, self._side = Camera(side, side), side
         self._covered = [self._pool.covered(view) for view in range(self._pool.views)]
         self._exposure = self._bright()
@@ -209,12 +217,10 @@ class Run:
         view = int(rng.integers(self._pool.views))
         corner = self._aim(view, rng)
         target, weight = self._pool.part(view, corner, (self._side, self._side))
-        self._subject.set({name: 0 * voxels.tensor() for name, voxels in self._voxels.items()})
-        without = self._render(3 * self.step)
         self._subject.set({name: voxels.attach() for name, voxels in self._voxels.items()})
         one = self._render(3 * self.step)
-        seed = self._seeded(3 * self.step + 1)
-        direct = self._subject.render_direct(self._camera.sensor, seed, max(1, GRADIENT_RAYS // self._side**2))
+        without = self._without(3 * self.step) if self._linear else one
+        direct = self._subject.render_direct(self._camera.sensor, self._seeded(3 * self.step + 1), self._gradient_spp)
         other = self._render(3 * self.step + 2) if self._subject.bounces else direct.numpy()
         self._gains.add(view, products(one, other, target, weight))
         gain = self._gains.all()[view].astype(np.float32)
@@ -224,13 +230,21 @@ class Run:
         weight = gain * weight / (self._exposure * np.maximum(target, 0) + DARK)
         light = gain * np.maximum(one - without, 0)
         # The graph of derivatives is needed twice.
-        projections = [self._back_projected(direct, weight * each, flags) for each, flags in (
-            (error, dr.ADFlag.ClearVertices), (light, dr.ADFlag.Default))]
+        errors = self._back_projected(direct, weight * error,
+                                      dr.ADFlag.ClearVertices if self._linear else dr.ADFlag.Default)
+        lights = self._back_projected(direct, weight * light, dr.ADFlag.Default) if self._linear else errors
         rate = max(min(2 - 2 * self.progress, 1.0), 0.0)
         for name, voxels in self._voxels.items():
-            voxels.step(projections[0][name], projections[1][name], rate)
+            voxels.step(errors[name], lights[name], rate)
         self.step += 1
         self.trace.append((self.step, math.sqrt(max(self._sums[0], 0) / max(self._sums[1], 1e-30))))
+
+    def _without(self, number: int) -> np.ndarray:
+        """Return a picture with the linear parameters at 0."""
+        self._subject.set({name: 0 * self._voxels[name].tensor() for name in self._linear})
+        picture = self._render(number)
+        self._subject.set({name: self._voxels[name].attach() for name in self._linear})
+        return picture
 
     def _back_projected(self, picture: Array, values: np.ndarray, flags: dr.ADFlag) -> dict[str, Float]:
         """Return Jᵀ `values` (h, w, 3) by parameter, J being the derivative of `picture`."""
@@ -258,8 +272,7 @@ class Run:
         self._gains.add(view, products(one, other, target, weight))
 
     def _render(self, number: int) -> np.ndarray:
-        picture: np.ndarray = self._subject.render(self._camera.sensor, self._seeded(number),
-                                                  max(1, RAYS // self._side**2)).numpy()
+        picture: np.ndarray = self._subject.render(self._camera.sensor, self._seeded(number), self._spp).numpy()
         return picture
 
     def _seeded(self, number: int) -> int:

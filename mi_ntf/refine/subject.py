@@ -14,9 +14,10 @@ import numpy as np
 
 from ..core import field_file
 from ..core.errors import MiNtfError
+from ..core.voxels import Voxels
 from ..infer import ops
 from ..infer.types import Array
-from ..infer.voxel_parameters import Lattice
+from ..infer.voxel_parameters import Lattice, VoxelParameters
 from ..render.plugins import properties
 from ..render.scene import scene_file
 from ..render.scene.environment_option import Environment
@@ -24,7 +25,7 @@ from ..render.scene.field_parameters import FieldParameters
 from ..render.scene.media import NRFMedium, find_media
 from ..render.scene.settings import Settings
 from .photographs import Photographs
-from .voxels import HIGHEST
+from .voxels import HIGHEST, RATES
 
 LIGHT_SAMPLES = 4
 """Sampled lights per shading point under an environment."""
@@ -53,8 +54,8 @@ class Subject:
     ----------
     flash
         True if the light is that of the photographs' flash.
-    medium
-        The field's medium.
+    medium, original
+        The field's medium, and its field without changes.
     digest
         Hash of the scene's file and options.
     bounces
@@ -74,6 +75,7 @@ class Subject:
             raise MiNtfError(f"{path}: the scene has {len(media)} nrf media, and photographs refine one field; give a "
                              "scene with one")
         self.medium: NRFMedium = media[0]
+        self.original = self.medium.field
         self._parameters = mi.traverse(self._scene)
         keys = [key for key, _ in self._parameters if key.endswith("reflectance_blocks")]
         if not keys:
@@ -100,7 +102,7 @@ class Subject:
 
     def names(self, requested: tuple[str, ...]) -> list[str]:
         """Return the field's names of the parameters `requested`. Raises MiNtfError."""
-        known = [name for name in HIGHEST if self.has(name)]
+        known = [name for name in (*HIGHEST, *RATES) if self.has(name)]
         for name in requested:
             if name not in known:
                 raise MiNtfError(f"--parameters: {name!r} cannot be refined; this field has {', '.join(known)}")
@@ -110,11 +112,14 @@ class Subject:
         """Return True if the field has a parameter of this name."""
         return self._prefix + name in self._parameters
 
-    @property
-    def lattice(self) -> Lattice:
-        """Places of the voxels of the reflectance."""
+    def lattice(self, name: str) -> Lattice:
+        """Return the places of the voxels of a parameter."""
+        voxels = self._voxels()
+        return voxels.density_lattice if name == voxels.density_name else voxels.reflectance_lattice
+
+    def _voxels(self) -> VoxelParameters:
         parameters: FieldParameters = getattr(self.medium, "parameters")  # noqa: B009  only this kind has them
-        return parameters.voxels.reflectance_lattice
+        return parameters.voxels
 
     def get(self, name: str) -> Array:
         """Return the tensor of a parameter."""
@@ -148,10 +153,14 @@ class Subject:
 
 
 def _flash_scene(path: Path) -> mi.Scene:
-    """Return a scene of a field file and a point light called ``lamp``."""
-    sphere = field_file.load_header(path).similarity
+    """Return a scene of a field file and a point light called ``lamp``.
+
+    As in training, light bounces between surfaces, and smoke scatters it once.
+    """
+    header = field_file.load_header(path)
+    sphere, phase = header.similarity, header.phase if isinstance(header, Voxels) else header.architecture.phase
     scene: mi.Scene = mi.load_dict({
-        "type": "scene", "integrator": {"type": "nrf"},
+        "type": "scene", "integrator": {"type": "nrf", "max_depth": -1 if phase is None else 2},
         "lamp": {"type": "point", "position": [0, 0, 0], "intensity": {"type": "rgb", "value": [1.0, 1.0, 1.0]}},
         "field": {"type": "sphere", "center": list(sphere.center), "radius": sphere.radius, "bsdf": {"type": "null"},
                   "interior": {"type": "nrf", "filename": str(path)}}})

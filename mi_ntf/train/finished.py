@@ -34,7 +34,7 @@ class FinishedField:
     def load(cls, path: Path, further: bool = False) -> "FinishedField":
         """Read the field file `path`. Raises MiNtfError."""
         header, tensors = field_file.load(path)
-        if field_file.refinement(tensors):
+        if any(field_file.refinement(tensors, quantity) for quantity in ("reflectance", "density")):
             raise MiNtfError(f"{path} was refined with `mi-ntf refine`, which training would undo; train the field "
                              "that it was made of, and refine the result again")
         return cls(path, header, tensors, further)

@@ -67,7 +67,7 @@ def photograph(of: Subject, folder: Path, counts: dict[str, int], spp=64, lamp=F
 
 def with_patch(of: Subject, path: Path, factor=0.8) -> np.ndarray:
     """Write the field with its albedo times `factor` on the left of a plane; return a mask of the voxels there."""
-    x = np.array(of.lattice.centres()[0])
+    x = np.array(of.lattice("albedo").centres()[0])
     values = of.get("albedo").numpy()
     patch = (x < -0.3).reshape(values.shape[:4])
     of.set({"albedo": mi.TensorXf(np.where(patch[..., None], factor * values, values))})

@@ -17,7 +17,7 @@ from mi_ntf.core.errors import MiNtfError
 from mi_ntf.data import grids, schema
 from mi_ntf.importing import of_grid
 from mi_ntf.infer.refined import Refinement, packed
-from mi_ntf.refine import comparison, refine, refining
+from mi_ntf.refine import comparison, refine, refining, saving
 from mi_ntf.refine.gains import Gains, products
 from mi_ntf.refine.photographs import Camera
 
@@ -58,6 +58,69 @@ def test_a_patch_is_found_again(case, tmp_path):
     page = (tmp_path / "out.html").read_text()
     assert "closer to the photographs" in page
     assert {p.suffix for p in tmp_path.iterdir()} == {".safetensors", ".html"}
+
+
+@pytest.fixture(scope="module")
+def thin(tmp_path_factory):
+    """Scene of smoke with half of its density on the left, photographs of the right one, and both at voxels."""
+    mi.set_variant(VARIANT)
+    mi_ntf.register()
+    folder = tmp_path_factory.mktemp("thin")
+    subject = shots.subject(shots.write_scene(folder, scenes.write_blobs(folder, log_density=1.5, phase=0.0)))
+    photographs = shots.photograph(subject, folder / "photographs", {"train": 8, "val": 1, "test": 3})
+    true = subject.get("log_density").numpy()
+    left = (np.array(subject.lattice("log_density").centres()[0]) < -0.1).reshape(true.shape)
+    wrong = np.where(left, true - np.log(2), true)
+    subject.set({"log_density": mi.TensorXf(wrong)})
+    saving.save(subject, folder / "thin.safetensors", {"made": "by a test"})
+    return shots.write_scene(folder, folder / "thin.safetensors"), photographs, true, wrong
+
+
+def test_a_density_comes_back_from_the_file(thin):
+    """Baked voxels have the values that were set, and the networks change by the difference."""
+    scene, _, true, wrong = thin
+    subject = shots.subject(scene)
+    again, matter = subject.get("log_density").numpy(), wrong > 0
+    np.testing.assert_allclose(again[matter], wrong[matter], atol=2e-3)
+    network, centres = subject.original.network, subject.lattice("log_density").centres()
+    change = np.array(network.log_density(centres) - network.learned_log_density(centres)).reshape(true.shape)
+    np.testing.assert_allclose(change[matter], (wrong - true)[matter], atol=2e-3)
+
+
+def test_a_refined_field_is_refined_again(thin, tmp_path):
+    """A second refinement takes the place of the first, and holds both."""
+    scene, _, true, _ = thin
+    subject = shots.subject(scene)
+    subject.set({"log_density": mi.TensorXf(true)})
+    saving.save(subject, tmp_path / "again.safetensors", {"made": "by a test"})
+    again = shots.subject(shots.write_scene(tmp_path, tmp_path / "again.safetensors")).get("log_density").numpy()
+    np.testing.assert_allclose(again[true > 0], true[true > 0], atol=3e-3)
+
+
+def test_a_density_is_found_again(thin, tmp_path, monkeypatch):
+    """Pictures come closer; the density rises on the left, and less than half as far on the right.
+
+    Eight small photographs tell how much a ray meets, not where on it.
+    """
+    monkeypatch.setattr(refining, "DENSE_RAYS", 1 << 12)
+    scene, photographs, true, wrong = thin
+    report = refine(scene, photographs, tmp_path / "out.safetensors", steps=40, gains=False,
+                    parameters=("log_density",))
+    assert report.improved and report.after < 0.6 * report.before
+    after = shots.subject(shots.write_scene(tmp_path, tmp_path / "out.safetensors")).get("log_density").numpy()
+    left, matter = wrong < true, true > 0
+    rise = (after - wrong)[left & matter].mean()
+    assert 0.4 * np.log(2) < rise < 1.2 * np.log(2)
+    assert abs((after - true)[~left & matter].mean()) < 0.4 * rise
+
+
+def test_roughness_is_refined_with_the_albedo(case, tmp_path):
+    """Both are parameters of one run, and the file holds both."""
+    scene, photographs, *_ = case
+    report = refine(scene, photographs, tmp_path / "out.safetensors", steps=2, parameters=("albedo", "roughness"))
+    assert report.parameters == ["albedo", "roughness"]
+    _, tensors = field_file.load(tmp_path / "out.safetensors")
+    assert tensors["refined.range"].shape == (2, 7) and "refined_density.range" not in tensors
 
 
 def test_an_interrupted_run_goes_on(case, tmp_path, monkeypatch):
