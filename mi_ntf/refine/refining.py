@@ -23,14 +23,15 @@ from .comparison import Comparison, compare, difference
 from .gains import Gains, products
 from .photographs import Camera, Photographs, joined
 from .subject import Subject
-from .voxels import HIGHEST, Descended, Linear, Voxels
+from .voxels import LINEAR, RATES, Descended, Linear, Voxels
 
 TILE = 64
 """Side of the parts of photographs that steps compare, in pixels."""
-RAYS, GRADIENT_RAYS = 1 << 14, 1 << 12
-"""Camera rays of the picture that is compared, and of the one that is differentiated."""
-DENSE_TILE, DENSE_RAYS = 256, 1 << 18
-"""The same where the density changes, whose voxels take about a second a step, whatever is compared."""
+RAYS = {"compared": 1 << 14, "checked": 1 << 14, "differentiated": 1 << 12}
+"""Camera rays of the pictures of a step."""
+DENSE_TILE, DENSE_RAYS = 256, {"compared": 1 << 18, "checked": 1 << 16, "differentiated": 1 << 18}
+"""The same where the density changes, whose many voxels take time at each step, whatever is compared. All parameters
+descend then, which needs two pictures in place of four."""
 DARK = 0.05
 """Brightness, relative to the bright parts of the photographs, below which errors count absolutely."""
 INTERVAL = 50.0
@@ -124,15 +125,14 @@ class Run:
         to_scene = subject.to_scene()
         self._pool = Photographs(joined(splits["train"], splits["val"]), to_scene, subject.solid)
         self._held = Photographs(splits["test"], to_scene, subject.solid)
-        self._voxels: dict[str, Voxels] = {
-            name: (Linear if name in HIGHEST else Descended)(name, subject.get(name), subject.lattice(name))
-            for name in names}
-        self._linear = [name for name in names if name in HIGHEST]
-        self._gains, self._with_gains = Gains(self._pool.views, not gains), gains
         dense = any("density" in name for name in names)
+        self._linear = [name for name in names if name in LINEAR and not (dense and name in RATES)]
+        self._voxels: dict[str, Voxels] = {
+            name: (Linear if name in self._linear else Descended)(name, subject.get(name), subject.lattice(name))
+            for name in names}
+        self._gains, self._with_gains = Gains(self._pool.views, not gains), gains
         side = min(DENSE_TILE if dense else TILE, self._pool.height, self._pool.width)
-        self._spp, self._gradient_spp = (max(1, rays // side**2) for rays in (
-            (DENSE_RAYS, DENSE_RAYS) if dense else (RAYS, GRADIENT_RAYS)))
+        self._spp = {name: max(1, rays // side**2) for name, rays in (DENSE_RAYS if dense else RAYS).items()}
         self._camera, self._side = Camera(side, side), side
         self._covered = [self._pool.covered(view) for view in range(self._pool.views)]
         self._exposure = self._bright()
@@ -220,8 +220,9 @@ class Run:
         self._subject.set({name: voxels.attach() for name, voxels in self._voxels.items()})
         one = self._render(3 * self.step)
         without = self._without(3 * self.step) if self._linear else one
-        direct = self._subject.render_direct(self._camera.sensor, self._seeded(3 * self.step + 1), self._gradient_spp)
-        other = self._render(3 * self.step + 2) if self._subject.bounces else direct.numpy()
+        seed = self._seeded(3 * self.step + 1)
+        direct = self._subject.render_direct(self._camera.sensor, seed, self._spp["differentiated"])
+        other = self._render(3 * self.step + 2, "checked") if self._subject.bounces else direct.numpy()
         self._gains.add(view, products(one, other, target, weight))
         gain = self._gains.all()[view].astype(np.float32)
         error = gain * one - target
@@ -242,7 +243,7 @@ class Run:
     def _without(self, number: int) -> np.ndarray:
         """Return a picture with the linear parameters at 0."""
         self._subject.set({name: 0 * self._voxels[name].tensor() for name in self._linear})
-        picture = self._render(number)
+        picture = self._render(number, "checked")
         self._subject.set({name: self._voxels[name].attach() for name in self._linear})
         return picture
 
@@ -271,8 +272,8 @@ class Run:
         one, other = (self._render(-2 * view - k - 1) for k in range(2))
         self._gains.add(view, products(one, other, target, weight))
 
-    def _render(self, number: int) -> np.ndarray:
-        picture: np.ndarray = self._subject.render(self._camera.sensor, self._seeded(number), self._spp).numpy()
+    def _render(self, number: int, use: str = "compared") -> np.ndarray:
+        picture: np.ndarray = self._subject.render(self._camera.sensor, self._seeded(number), self._spp[use]).numpy()
         return picture
 
     def _seeded(self, number: int) -> int:

@@ -25,7 +25,7 @@ from ..render.scene.field_parameters import FieldParameters
 from ..render.scene.media import NRFMedium, find_media
 from ..render.scene.settings import Settings
 from .photographs import Photographs
-from .voxels import HIGHEST, RATES
+from .voxels import RANGES
 
 LIGHT_SAMPLES = 4
 """Sampled lights per shading point under an environment."""
@@ -102,7 +102,7 @@ class Subject:
 
     def names(self, requested: tuple[str, ...]) -> list[str]:
         """Return the field's names of the parameters `requested`. Raises MiNtfError."""
-        known = [name for name in (*HIGHEST, *RATES) if self.has(name)]
+        known = [name for name in RANGES if self.has(name)]
         for name in requested:
             if name not in known:
                 raise MiNtfError(f"--parameters: {name!r} cannot be refined; this field has {', '.join(known)}")

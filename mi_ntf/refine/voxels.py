@@ -14,14 +14,19 @@ MEMORY = 0.8
 """Decay of a voxel's accumulated light, each time that a photograph shows it."""
 PRIOR = 0.5
 """Weight of the field as it was, in photographs that show a voxel as well as the mean voxel is shown."""
-RATES = {"density": 0.15, "log_density": 0.15, "roughness": 0.02}
-"""Length of the first step by parameter; for both densities that of ln σ. Tuned on `statue` under its flash."""
+CAUTION = 3
+"""Number of typical gradients that each voxel is taken to have had before the first, whose noise is large."""
+RATES = {"albedo": 0.02, "specular": 0.02, "roughness": 0.02, "density": 0.15, "log_density": 0.15}
+"""Length of steps by parameter, before they shorten; for both densities that of ln σ. Tuned on `statue`, flash."""
+RANGES = {"albedo": (0.0, 1.0), "specular": (0.0, 1.0), "emission": (0.0, np.inf), "roughness": (MIN_ROUGHNESS, 1.0),
+          "density": (-np.inf, np.inf), "log_density": (-np.inf, np.inf)}
+"""Bounds of the values by parameter; for both densities those of ln σ."""
+LINEAR = ("albedo", "specular", "emission")
+"""Parameters to which the light of a picture is proportional."""
 LARGEST = 0.3
 """Largest relative change by one step."""
 LEAST = 0.01
 """Value below which changes are absolute, so that black voxels can become brighter."""
-HIGHEST = {"albedo": 1.0, "specular": 1.0, "emission": np.inf}
-"""Upper bounds by parameter. The light of a picture is proportional to each of these parameters."""
 DARKEST = 1e-20
 """Density below which a voxel holds nothing, and stays so."""
 
@@ -101,7 +106,7 @@ class Linear(Voxels):
         self._sum = dr.select(shown, MEMORY * self._sum + light, self._sum)
         change = dr.opaque(mi.Float, rate) * error / (self._sum + PRIOR * _mean(light) + 1e-30)
         change = dr.select(shown, dr.clip(change, -LARGEST, LARGEST), 0)
-        self.values = dr.clip(self.values - dr.maximum(self.values, LEAST) * change, 0, HIGHEST[self.name])
+        self.values = dr.clip(self.values - dr.maximum(self.values, LEAST) * change, *RANGES[self.name])
         dr.eval(self.values, self._sum)
 
 
@@ -123,11 +128,12 @@ class Descended(Voxels):
 
     def step(self, error: Float, light: Float, rate: float) -> None:
         """Change the values, see :meth:`Voxels.step`; `light` does not matter."""
-        self._sum += dr.square(error)
-        rate *= RATES[self.name]
-        self.values -= dr.opaque(mi.Float, rate) * error * dr.rsqrt(self._sum + PRIOR * _mean(self._sum) + 1e-30)
-        if self.name == "roughness":
-            self.values = dr.clip(self.values, MIN_ROUGHNESS, 1)
+        squared = dr.square(error)
+        if not dr.any(self._sum > 0):  # the first step
+            self._sum += CAUTION * _mean(squared) + 1e-30
+        self._sum += squared
+        step = dr.opaque(mi.Float, rate * RATES[self.name]) * error * dr.rsqrt(self._sum)
+        self.values = dr.clip(self.values - step, *RANGES[self.name])
         dr.eval(self.values, self._sum)
 
 

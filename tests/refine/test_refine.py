@@ -26,7 +26,9 @@ BOX = shots.CENTER + shots.RADIUS * np.array([[-0.5] * 3, [0.5] * 3])
 
 @pytest.fixture(autouse=True)
 def few_rays(monkeypatch):
-    monkeypatch.setattr(refining, "RAYS", 1 << 12)
+    few = {"compared": 1 << 12, "checked": 1 << 12, "differentiated": 1 << 12}
+    for name in ("RAYS", "DENSE_RAYS"):
+        monkeypatch.setattr(refining, name, few)
     monkeypatch.setattr(comparison, "SHOWN_RAYS", 1 << 13)
 
 
@@ -97,12 +99,11 @@ def test_a_refined_field_is_refined_again(thin, tmp_path):
     np.testing.assert_allclose(again[true > 0], true[true > 0], atol=3e-3)
 
 
-def test_a_density_is_found_again(thin, tmp_path, monkeypatch):
+def test_a_density_is_found_again(thin, tmp_path):
     """Pictures come closer; the density rises on the left, and less than half as far on the right.
 
     Eight small photographs tell how much a ray meets, not where on it.
     """
-    monkeypatch.setattr(refining, "DENSE_RAYS", 1 << 12)
     scene, photographs, true, wrong = thin
     report = refine(scene, photographs, tmp_path / "out.safetensors", steps=40, gains=False,
                     parameters=("log_density",))
@@ -169,6 +170,26 @@ def test_smoke_of_voxels_under_the_flash(tmp_path, monkeypatch):
     assert header.reflectance_counts == header.counts and header.provenance["refined"]["parameters"] == ["albedo"]
 
 
+def test_density_of_voxels(tmp_path, monkeypatch):
+    """Smoke that is twice too thin becomes denser under the flash; the file has its density, and the same albedo."""
+    monkeypatch.setattr(shots, "SIZE", 16)
+    density, fields = np.ones((12, 12, 12), np.float32), []
+    for name, factor in (("right", 1.0), ("wrong", 0.5)):
+        fields.append(tmp_path / f"{name}.safetensors")
+        voxels.save(fields[-1], *of_grid(grids.Grid(factor * density, BOX), 0.8))
+    subject = shots.subject(fields[0])
+    subject._parameters["lamp.position"] = mi.Point3f(shots.LAMP)
+    subject._parameters["lamp.intensity.value"] = mi.Color3f(40.0)
+    subject._parameters.update()
+    photographs = shots.photograph(subject, tmp_path / "set", {"train": 3, "val": 1, "test": 1}, lamp=True)
+    report = refine(fields[1], photographs, tmp_path / "out.safetensors", steps=40, parameters=("density",))
+    assert report.after < 0.5 * report.before
+    inside = shots.CENTER + shots.RADIUS * np.random.default_rng(0).uniform(-0.4, 0.4, (200, 3))
+    out = mi_ntf.Field.load(tmp_path / "out.safetensors")
+    assert 0.55 < out.density(inside).mean() < 1.1  # from 0.5; photographs by one lamp tell little of what lies deep
+    np.testing.assert_allclose(out.reflectance(inside).albedo, 0.8, atol=1e-3)
+
+
 def test_cameras_see_what_photographs_show():
     """Rays of Mitsuba's camera are those of the data set's, also of a principal point beside the middle."""
     c2w = np.eye(4)
@@ -216,7 +237,7 @@ def test_gains_follow_the_photographs_and_keep_their_mean():
     assert (Gains(2, fixed=True).all() == 1).all()
 
 
-def test_what_does_not_fit_is_refused(case, tmp_path):
+def test_what_does_not_fit_is_refused(case, thin, tmp_path):
     """Each sentence names the fault and the remedy."""
     scene, photographs, _, wrong = case
     out = tmp_path / "out.safetensors"
@@ -236,6 +257,10 @@ def test_what_does_not_fit_is_refused(case, tmp_path):
     with pytest.raises(MiNtfError, match=r"refined.range has the shape \(2, 2\), expected 2 × 3 or 7"):
         field_file.save(out, header, damaged)
     assert dataclasses.asdict(header)["provenance"]["refined"] == {"made": "by a test"}
+    header, tensors = field_file.load(thin[0].with_suffix(".safetensors"))
+    damaged = {name: value[:1] if name == "refined_density.range" else value for name, value in tensors.items()}
+    with pytest.raises(MiNtfError, match=r"refined_density.range has the shape \(1, 1\), expected 2 × 1"):
+        field_file.save(out, header, damaged)
 
 
 def test_the_command_ends_well(tmp_path, capsys):
