@@ -131,7 +131,8 @@ def scale_height(field: NetworkField, dj: ModuleType) -> float:
     slope = [log_density(p + h) - log_density(p - h) for h in SLOPE * np.eye(3)[:, :, None]]
     height = 2 * SLOPE / np.maximum(np.linalg.norm(slope, axis=0), 1e-9)
     sigma = np.exp(log_density(p))
-    return skin.thickness(sigma * height, np.full(len(height), skin.SOLID), sigma)
+    inward = np.full(len(height), skin.SOLID)  # all matter is taken to be opaque: no march tells
+    return skin.thickness(sigma * height, inward, sigma)
 
 
 def _centres(index: np.ndarray, n: int, dj: ModuleType) -> tuple[Float, ...]:

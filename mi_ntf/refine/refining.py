@@ -16,6 +16,7 @@ from ..core.errors import MiNtfError
 from ..core.json_values import Json
 from ..data.readers import load_dataset
 from ..data.schema import Split, fingerprint
+from ..infer.tuning import STEP_LENGTHS
 from ..infer.types import Array, Float
 from ..render.scene.environment_option import Environment
 from . import checkpoint, page, saving
@@ -23,15 +24,16 @@ from .comparison import Comparison, compare, difference
 from .gains import Gains, products
 from .photographs import Camera, Photographs, joined
 from .subject import Subject
-from .voxels import LINEAR, RATES, Descended, Linear, Voxels
+from .voxels import LINEAR, Descended, Linear, Voxels
 
 TILE = 64
 """Side of the parts of photographs that steps compare, in pixels."""
 RAYS = {"compared": 1 << 14, "checked": 1 << 14, "differentiated": 1 << 12}
-"""Camera rays of the pictures of a step."""
+"""Camera rays of the pictures of a step: the one that is compared with the photograph, those that check it, and the one
+that is differentiated."""
 DENSE_TILE, DENSE_RAYS = 256, {"compared": 1 << 18, "checked": 1 << 16, "differentiated": 1 << 18}
-"""The same where the density changes, whose many voxels take time at each step, whatever is compared. All parameters
-descend then, which needs two pictures in place of four."""
+"""Both for runs that change the density. Its many voxels take time at each step, however few the rays are, so each step
+has more of them."""
 DARK = 0.05
 """Brightness, relative to the bright parts of the photographs, below which errors count absolutely."""
 INTERVAL = 50.0
@@ -95,8 +97,8 @@ def refine(scene: Path, dataset: Path, output: Path, *, parameters: tuple[str, .
 
     A step compares a picture A with the photograph t, and differentiates another picture B, so that the product of
     error and derivative has no bias. The product (A − t)(B − t) has the expected value of the squared error without its
-    noise. A picture with the parameters at 0 tells how much of A is their light. Light that was scattered more than
-    once is in A, and has no derivative. That changes the way, not the end.
+    noise. For parameters to which light is proportional, a picture with these at 0 tells how much of A is their light.
+    Light that was scattered more than once is in A, and has no derivative. That changes the way, not the end.
     """
     if minutes is not None and steps is not None:
         raise MiNtfError(f"both --minutes {minutes:g} and --steps {steps} are given; a run is limited by one of them")
@@ -125,8 +127,9 @@ class Run:
         to_scene = subject.to_scene()
         self._pool = Photographs(joined(splits["train"], splits["val"]), to_scene, subject.solid)
         self._held = Photographs(splits["test"], to_scene, subject.solid)
-        dense = any("density" in name for name in names)
-        self._linear = [name for name in names if name in LINEAR and not (dense and name in RATES)]
+        dense = any(name in names for name in ("density", "log_density"))
+        # A picture without the linear parameters and a second projection cost more than they bring beside a density.
+        self._linear = [name for name in names if name in LINEAR and not (dense and name in STEP_LENGTHS)]
         self._voxels: dict[str, Voxels] = {
             name: (Linear if name in self._linear else Descended)(name, subject.get(name), subject.lattice(name))
             for name in names}

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ..core.microfacet import MIN_ROUGHNESS
+from ..infer.tuning import EARLIER_GRADIENTS, STEP_LENGTHS
 from ..infer.types import Array, Float
 from ..infer.voxel_parameters import Lattice
 
@@ -14,10 +17,6 @@ MEMORY = 0.8
 """Decay of a voxel's accumulated light, each time that a photograph shows it."""
 PRIOR = 0.5
 """Weight of the field as it was, in photographs that show a voxel as well as the mean voxel is shown."""
-CAUTION = 3
-"""Number of typical gradients that each voxel is taken to have had before the first, whose noise is large."""
-RATES = {"albedo": 0.02, "specular": 0.02, "roughness": 0.02, "density": 0.15, "log_density": 0.15}
-"""Length of steps by parameter, before they shorten; for both densities that of ln σ. Tuned on `statue`, flash."""
 RANGES = {"albedo": (0.0, 1.0), "specular": (0.0, 1.0), "emission": (0.0, np.inf), "roughness": (MIN_ROUGHNESS, 1.0),
           "density": (-np.inf, np.inf), "log_density": (-np.inf, np.inf)}
 """Bounds of the values by parameter; for both densities those of ln σ."""
@@ -31,7 +30,7 @@ DARKEST = 1e-20
 """Density below which a voxel holds nothing, and stays so."""
 
 
-class Voxels:
+class Voxels(ABC):
     """Values of one parameter at the voxels of a `lattice`, which the errors of pictures change.
 
     Projections onto the voxels are smoothed over neighbours, since a photograph shows each voxel by few samples.
@@ -67,9 +66,9 @@ class Voxels:
         dr.eval(result)
         return result
 
+    @abstractmethod
     def step(self, error: Float, light: Float, rate: float) -> None:
         """Change the values by the projections of a picture's error and of its light, `rate` times as far."""
-        raise NotImplementedError
 
     def state(self) -> dict[str, np.ndarray]:
         """Return all numbers that change."""
@@ -111,9 +110,10 @@ class Linear(Voxels):
 
 
 class Descended(Voxels):
-    """Values by gradient descent, whose steps shorten with the gradients that a voxel has had (Duchi et al. 2011).
+    """Values by gradient descent.
 
-    The values are ln σ for a ``density``.
+    The step of a voxel is its gradient over the root of the sum of its squared gradients so far (AdaGrad, Duchi et al.
+    2011), so steps shorten. The values are ln σ for a ``density``.
     """
 
     def __init__(self, name: str, tensor: Array, lattice: Lattice) -> None:
@@ -127,12 +127,12 @@ class Descended(Voxels):
         return values
 
     def step(self, error: Float, light: Float, rate: float) -> None:
-        """Change the values, see :meth:`Voxels.step`; `light` does not matter."""
+        """Change the values, see :meth:`Voxels.step`; `light` is not used."""
         squared = dr.square(error)
         if not dr.any(self._sum > 0):  # the first step
-            self._sum += CAUTION * _mean(squared) + 1e-30
+            self._sum += EARLIER_GRADIENTS * _mean(squared) + 1e-30
         self._sum += squared
-        step = dr.opaque(mi.Float, rate * RATES[self.name]) * error * dr.rsqrt(self._sum)
+        step = dr.opaque(mi.Float, rate * STEP_LENGTHS[self.name]) * error * dr.rsqrt(self._sum)
         self.values = dr.clip(self.values - step, *RANGES[self.name])
         dr.eval(self.values, self._sum)
 
