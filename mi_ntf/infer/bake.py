@@ -92,17 +92,36 @@ def sampled_bricks(field: NetworkField, n: int, reach: tuple[int, int], dj: Modu
 
     `reach`: as in :func:`at_bricks`. `log_density`: function to sample in place of the field's own.
     """
-    survey = min(n, SURVEY)
-    coarse = at_voxels(lambda p: [field.log_density(p)], 1, None, survey, dj,
-                       lambda done: progress(done / 2)).reshape((survey,) * 3)
-    first, last = ((SIDE * np.arange(bricks_per_side(n)) + k) * 2 + 1 for k in (0, SIDE))
-    places = np.argwhere(any_between(grown(coarse > LOG_FLOOR), first * survey // (2 * n), last * survey // (2 * n)))
-    edge = reach[1] - reach[0]
-    parts = -(-len(places) * edge**3 // PART)
-    for number, part in enumerate(np.array_split(places, parts) if parts else ()):
-        progress((1 + number / parts) / 2)
-        samples = at_bricks(lambda p: [(log_density or field.log_density)(p)], part, reach, n, dj)
+    function = log_density or field.log_density
+    places = _near_density(field, n, dj, lambda done: progress(done / 2))
+    planes = np.full((reach[1] - reach[0], n, n), np.nan, np.float32)  # those of the voxels of a layer of bricks
+    for layer in range(bricks_per_side(n)):
+        progress((1 + layer / bricks_per_side(n)) / 2)
+        planes = np.concatenate([planes[SIDE:], np.full((SIDE, n, n), np.nan, np.float32)])
+        part = places[places[:, 0] == layer]
+        if not len(part):
+            continue
+        z = np.clip(SIDE * layer + np.arange(*reach), 0, n - 1)
+        y, x = (np.clip(SIDE * part[:, axis, None] + np.arange(*reach), 0, n - 1) for axis in (1, 2))
+        read = np.zeros((n, n), bool)
+        read[y[:, :, None], x[:, None, :]] = True
+        missing = np.isnan(planes) & read
+        plane, place = np.divmod(np.flatnonzero(missing), n * n)
+        planes[missing] = at_voxels(lambda p: [function(p)], 1, z[plane] * (n * n) + place, n, dj)[:, 0]
+        samples = planes[:, y[:, :, None], x[:, None, :]].swapaxes(0, 1)
         yield part, np.maximum(samples, LOG_FLOOR)
+
+
+def _near_density(field: NetworkField, n: int, dj: ModuleType, progress: Progress) -> np.ndarray:
+    """Return the places (k, 3), z first, of all bricks of n³ voxels near density."""
+    survey = min(n, SURVEY)
+    z, y, x = np.ogrid[:survey, :survey, :survey]
+    half = (survey - 1) / 2
+    ball = np.flatnonzero((z - half) ** 2 + (y - half) ** 2 + (x - half) ** 2 < (survey / 2 + 1) ** 2)
+    matter = np.zeros((survey,) * 3, bool)
+    matter.ravel()[ball] = at_voxels(lambda p: [field.log_density(p)], 1, ball, survey, dj, progress)[:, 0] > LOG_FLOOR
+    first, last = ((SIDE * np.arange(bricks_per_side(n)) + k) * 2 + 1 for k in (0, SIDE))
+    return np.argwhere(any_between(grown(matter), first * survey // (2 * n), last * survey // (2 * n)))
 
 
 def at_bricks(function: Callable[[Vector], Sequence[Float]], places: np.ndarray, reach: tuple[int, int], n: int,
