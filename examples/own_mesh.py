@@ -3,7 +3,7 @@
     python examples/own_mesh.py [--out out/own_mesh] [--views 40] [--size 96] [--minutes 3 | --steps N]
 
 By default a scene of two boxes on a floor is written. `--scene` names another one, and `--shapes` what of it becomes
-the field. It takes 5 minutes on two cores, and needs the extra `train`.
+the field. It takes 5 minutes on two cores, and needs the extras `train` and `eval`.
 """
 
 import subprocess

@@ -63,7 +63,7 @@ class Field:
         Asymmetry g of smoke, whose phase function is that of Henyey and Greenstein; None for surfaces.
     """
 
-    def __init__(self, path: Path, field: loaded.LoadedField | loaded.VolumeField,
+    def __init__(self, path: Path, field: loaded.LoadedField,
                  memory: loaded.InMemory | None = None):
         similarity, self._memory = field.similarity, memory
         self.path = path

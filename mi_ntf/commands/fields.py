@@ -99,7 +99,7 @@ class Train:
     preset: Annotated[Literal["fast", "paper"], options.named()] = "fast"
     """Architecture and schedule."""
     minutes: options.OptionalNumber = None
-    """Stop after this many minutes."""
+    """Stop after this many minutes. The default is 10."""
     steps: options.OptionalCount = None
     """Stop after this many steps."""
     seed: options.Count = 0

@@ -207,7 +207,7 @@ FAST = Architecture(
 
 _PAPER = Network(Encoding("frequency", octaves=10), (256,) * 8)
 PAPER = Architecture(density=_PAPER, reflectance=_PAPER, transmittance=_PAPER)
-"""The paper's sizes (method.md, sections 1 and 4): 8 layers of 256 units on 10 octaves, one logistic from the two end
+"""The sizes of Shafiei et al. 2021: 8 layers of 256 units on 10 octaves, one logistic from the two end
 points of a ray. Density and reflectance, one network in the paper, are two, as in every field file, and no layer sees
 the encoding again."""
 

@@ -1,4 +1,4 @@
-"""Transmittance of a ray as one logistic (method.md, section 4; Shafiei et al. 2021, eq. 7).
+"""Transmittance of a ray as one logistic (Shafiei et al. 2021, eq. 7).
 
     τ(t) = S(a (t − b)),      S(z) = 1/(1 + e^−z)
 

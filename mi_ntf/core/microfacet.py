@@ -1,4 +1,4 @@
-"""The field's reflectance: Lambert plus microfacets (method.md, section 1; Walter et al. 2007, eqs. 33, 34, 20).
+"""The field's reflectance: Lambert plus microfacets (Walter et al. 2007, eqs. 33, 34, 20).
 
     ρ = (1 − s) k/π + s D(h; α) G1(ω_i) G1(ω_o) / (4 ⟨n,ω_i⟩ ⟨n,ω_o⟩),        α = roughness²
 

@@ -1,4 +1,4 @@
-"""Rays as ordered pairs of points on the unit sphere (method.md, section 3; Shafiei et al. 2021, section 3.1).
+"""Rays as ordered pairs of points on the unit sphere (Shafiei et al. 2021, section 3.1).
 
 Symbols, used everywhere in this project:
 

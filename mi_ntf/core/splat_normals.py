@@ -37,7 +37,7 @@ def outward(splats: Splats, low: Array, high: Array) -> Array:
     shortest = splats.normals()
 
     def openness(offset: Array) -> Array:
-        return _interpolated(open_sky, place + AWAY * offset)
+        return interpolated(open_sky, place + AWAY * offset)
 
     towards = openness(shortest) - openness(-shortest)
     gradient = np.stack([openness(axis) - openness(-axis) for axis in np.eye(3)], 1)
@@ -90,8 +90,8 @@ def _shifted(layer: Array, offset: list[int]) -> Array:
     return shifted
 
 
-def _interpolated(values: Array, place: Array) -> Array:
-    """Return trilinear `values` (z, y, x) at places (k, 3), x first, in cells from the first centre."""
+def interpolated(values: Array, place: Array) -> Array:
+    """Return trilinear `values` (z, y, x), two an axis at least, at places (k, 3), x first, in cells from the first."""
     last = np.array(values.shape[::-1]) - 1
     place = np.clip(place, 0, last)
     cell = np.minimum(place.astype(int), last - 1)

@@ -55,14 +55,14 @@ def camera_samples(strands: Sequence[Strand], maxt: Float, offset: Float, depth:
 
     Notes
     -----
-    Quadrature of method.md, section 1: α_j = 1 − e^(−σ_j Δ), w_j = T_j α_j, σ_j the mean density of cell j, the sum
-    over the fields, evaluated at the ends of its pieces. The light that a ray loses is divided into portions of equal
-    size, the last one smaller. A sample stands for a portion and lies where the ray has lost a `depth` of it. So
-    quantities that vary along the ray, above all the light's own transmittance, are averaged with the right weights. In
-    its cell a sample lies where free flight through the pieces would end: the expectation over `depth` is right for
-    densities exponential across each piece. Samples follow the march continuously: rounding moves a sample slightly but
-    does not choose among cells, except in the last portion. So their places depend on the light alone, not on how cells
-    lie, and `depth` stratifies them over the samples of a pixel.
+    Quadrature of emission and absorption (Max 1995): α_j = 1 − e^(−σ_j Δ), w_j = T_j α_j, σ_j the mean density of
+    cell j, the sum over the fields, evaluated at the ends of its pieces. The light that a ray loses is divided into
+    portions of equal size, the last one smaller. A sample stands for a portion and lies where the ray has lost a
+    `depth` of it. So quantities that vary along the ray, above all the light's own transmittance, are averaged with
+    the right weights. In its cell a sample lies where free flight through the pieces would end: the expectation
+    over `depth` is right for densities exponential across each piece. Samples follow the march continuously:
+    rounding moves a sample slightly but does not choose among cells, except in the last portion. So their places
+    depend on the light alone, not on how cells lie, and `depth` stratifies them over the samples of a pixel.
     """
     bundle = Bundle(strands, maxt, offset)
     uint = dr.uint32_array_t(type(bundle.base))

@@ -78,7 +78,8 @@ def reflect(points: Points, lights: LightSource, visibility: Visibility | None, 
             gradients: bool = False, skin: bool = True) -> tuple[Float, Float, Float]:
     """Return the radiance that `points` reflect from all lights: Σ of irradiance · τ · f.
 
-    f is the phase function of :func:`mi_ntf.core.microfacet.scattering`; the sum is h(x, ω_o) of method.md, section 1.
+    f is the phase function of :func:`mi_ntf.core.microfacet.scattering`; the sum is the light that a
+    point scatters to the viewer.
 
     Parameters
     ----------

@@ -95,7 +95,7 @@ class FastConfig:
 
 @dataclass(frozen=True)
 class HierarchicalConfig:
-    """Settings of the paper's recipe (method.md, section 5), see :mod:`mi_ntf.train.hierarchical`; days of training."""
+    """Settings of the recipe of Shafiei et al. 2021, see :mod:`mi_ntf.train.hierarchical`; days of training."""
 
     architecture: Architecture = PAPER
     coarse: int = 64

@@ -1,4 +1,4 @@
-"""The paper's recipe (method.md, sections 1 and 5): coarse and fine networks on samples along whole chords.
+"""The recipe of Shafiei et al. 2021: coarse and fine networks on samples along whole chords.
 
 It uses nothing of the photographs but their colours: no mask, no visual hull. 64 stratified samples of each ray go
 through the coarse networks, 128 more are placed where those find matter, and the fine networks see all 192. The coarse

@@ -1,4 +1,4 @@
-"""Loss terms (method.md, section 5). Each is a mean over rays, samples or points, a 0-d tensor."""
+"""Loss terms (Shafiei et al. 2021). Each is a mean over rays, samples or points, a 0-d tensor."""
 
 from dataclasses import dataclass
 
@@ -125,7 +125,7 @@ class Targets:
     tau: torch.Tensor  # Transmittance (n, 33) there
 
     def error(self, predicted: torch.Tensor) -> torch.Tensor:
-        """Return Σ (τ_nrf − τ_nt)² (method.md, section 5) of `predicted` (n, 33), with means of the three kinds."""
+        """Return Σ (τ_nrf − τ_nt)² of `predicted` (n, 33), with means of the three kinds."""
         error = (predicted - self.tau) ** 2
         return error[:, :16].mean() + error[:, 16:32].mean() + error[:, 32].mean()
 
@@ -158,7 +158,7 @@ def training_rays(marched: TransmittanceTargets, rays: Rays, count: int, augment
                   ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return ``(o, d)`` of about `count` rays towards the light, on which transmittance is learned.
 
-    With augmentation (method.md, section 5, "AG") half of them are random chords, and half leave shading points in
+    With augmentation (the paper's "AG") half of them are random chords, and half leave shading points in
     random directions. Without, they all are camera rays, backwards, through shading points. Shading points lie along
     camera rays where free flight ends, as the renderer's do.
     """
@@ -177,7 +177,7 @@ def training_rays(marched: TransmittanceTargets, rays: Rays, count: int, augment
 
 def transmittance_color(networks: Networks, marched: TransmittanceTargets, image: Image, rays: Rays, exposure: float,
                         count: int, gain: torch.Tensor | float = 1.0) -> torch.Tensor:
-    """Return ‖I_nt − I‖² of the first `count` rays (method.md, section 5).
+    """Return ‖I_nt − I‖² of the first `count` rays.
 
     I_nt are pixels lit by τ_nt instead of the marched light, times `gain` (count, 3).
     """

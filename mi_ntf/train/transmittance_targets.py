@@ -81,7 +81,7 @@ def uniform_directions(n: int, generator: torch.Generator) -> torch.Tensor:
 def random_chords(n: int, reach: float, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
     """Return a point and the direction, (n, 3) each, of random chords that meet the ball of radius `reach`.
 
-    They are distributed as chords of two uniform points on the sphere (method.md, section 5): directions are uniform,
+    They are distributed as chords of two uniform points on the sphere (Shafiei et al. 2021): directions are uniform,
     and so is the square of the distance from the centre. So no sample has to be rejected.
     """
     d = uniform_directions(n, generator)

@@ -1,4 +1,4 @@
-"""Volume rendering of collocated photographs (method.md, section 2), on packed samples.
+"""Volume rendering of collocated photographs (Bi et al. 2020), on packed samples.
 
 Within a cell of length Δ and constant σ_j, with T_j the transmittance to its front,
 

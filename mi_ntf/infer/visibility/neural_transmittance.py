@@ -1,6 +1,6 @@
 """``neural_transmittance``: the ray network, evaluated once for each ray of an atlas.
 
-The network gives the transmittance along any whole ray as logistics (Shafiei et al. 2021; method.md, section 4). Its
+The network gives the transmittance along any whole ray as logistics (Shafiei et al. 2021). Its
 outputs for the three million rays of :mod:`mi_ntf.infer.visibility.transmittance_atlas` are stored once per field. A
 point and light then cost a lookup in the atlas.
 """

@@ -1,4 +1,4 @@
-"""``ray_network``: one query of the ray network per point and light (Shafiei et al. 2021; method.md, section 4)."""
+"""``ray_network``: one query of the ray network per point and light (Shafiei et al. 2021)."""
 
 from types import ModuleType
 

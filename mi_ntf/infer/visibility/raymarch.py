@@ -1,4 +1,4 @@
-"""``raymarch``: one march per point and light, the reference (method.md, section 7)."""
+"""``raymarch``: one march per point and light, the reference."""
 
 from collections.abc import Callable
 from types import ModuleType

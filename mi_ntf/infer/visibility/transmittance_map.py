@@ -1,6 +1,6 @@
 """``transmittance_map``: per light, a 2-D table of the logistics of its rays.
 
-Source: method.md, section 6; Shafiei et al. 2021, section 3.3, with the slips of its algorithms corrected.
+Source: Shafiei et al. 2021, section 3.3, with the slips of its algorithms corrected.
 
 A texel holds the parameters (a, b) of one of the light's rays (:mod:`mi_ntf.infer.visibility.light_rays`), or those of
 a mixture. A lookup evaluates the four nearest rays, on a surface at equal depth in its skin, and interpolates the four

@@ -28,7 +28,6 @@ from ...infer.visibility.method import Options
 from ...infer.visibility.raymarch import RayMarch
 from ...infer.visibility.transmittance_map import TransmittanceMap
 from .. import log, timing, user_cache
-from ..scene.loaded import ChangedField
 from ..scene.media import NRFMedium
 from ..scene.settings import Settings
 from . import map_cache
@@ -144,8 +143,7 @@ def build(name: str, medium: NRFMedium, table: LightTable | None, options: Optio
         split = make_part is not None and limit and lights.count > 1
         field = medium.field
         # A density that was set in the scene has a name in this process alone.
-        local = isinstance(field, ChangedField) and field.digest != field.original.digest
-        with user_cache.switched("memory") if local and user_cache.mode() == "on" else nullcontext():
+        with user_cache.switched("memory") if field.density_set and user_cache.mode() == "on" else nullcontext():
             return map_cache.cached(
                 map_cache.key(medium, lights, options, channels, step), make,
                 lights.count * options.map_resolution**2 * channels, limit,

@@ -17,12 +17,13 @@ samples            integer 0       0, 8 to 8192   steps across the diameter of t
 light_samples      integer 0       0 to 65536     sampled lights per shading point, of all emitters together. 0: sum
                                                   over point, spot and directional lights and environment cells, and two
                                                   samples of each other emitter (one of a projector or textured spot).
-                                                  Sampled lights have no maps; under ``transmittance_map`` their shadows
-                                                  are marched.
+                                                  ``transmittance_map`` and ``transmittance_volume`` refuse other values
+                                                  than 0; with 0 they march the shadows of emitters that are always
+                                                  sampled.
 environment_lights integer 512     1 to 65536     largest number of directional lights that represent an environment
-map_resolution     integer 0       0 to 4096      texels along a side of a light's map. 0: as fine as the field's voxels
-                                                  and thin skins for up to 16 lights, whose number of texels more lights
-                                                  share, but at least 192.
+map_resolution     integer 0       0 to 4096      texels along a side of a light's map. 0: as many as the field has
+                                                  voxels along a side, or more for thin skins. More than 16 lights share
+                                                  the texels of 16 such maps, but each has 192 a side at least.
 map_source         string  field   field, network ``field``: a texel is marched; ``network``: it is one query of the ray
                                                   network
 map_components     integer 0       0, 1, 2        logistics per texel of a marched map; 0: one for fields with opaque

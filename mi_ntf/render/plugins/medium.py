@@ -35,7 +35,8 @@ reflectance_blocks blocks, 3             R     likewise of the reflectance
 The voxels of a block have z first and x last. Density can be set where the field has bricks with matter. Reflectance
 that is set is added to the field's own as a difference, trilinear between voxels. The softness of skins stays that of
 the file. Derivatives by a density are those of the matter that is there: cells whose voxels are all empty have none,
-although matter that is set there would be seen. Visibility methods of trained networks refuse a density that was set.
+although matter that is set there would be seen. Visibility methods of trained networks refuse a density that was set in
+the scene.
 Maps and atlases of such a density are made anew. Values are computed when they are read, or by the first ``update()``.
 With ``representation`` ``network``, the tensors of the networks are shown, read-only.
 
@@ -92,7 +93,7 @@ import numpy as np
 from ...core.architecture import MAX_LOG_DENSITY
 from ...core.errors import MiNtfError
 from ...infer.backend import module_of
-from ...infer.grid import Density, NetworkVolume
+from ...infer.grid import Density, GridField, NetworkVolume
 from ...infer.phase_function import HenyeyGreenstein, smoke
 from ...infer.shade import Reflectance
 from ...infer.types import Color3, Float, Mask, Ray, Reflected, Vector, Vector3
@@ -100,7 +101,7 @@ from .. import log
 from ..scene import loaded, traversal
 from ..scene.field_parameters import FieldParameters
 from ..scene.frame import SCALES, Frame
-from ..scene.loaded import ChangedField, LoadedField, VolumeField
+from ..scene.loaded import LoadedField
 from . import properties
 
 REPRESENTATIONS = ("grid", "network")
@@ -120,8 +121,7 @@ class Reflects(Protocol):
         """Return normal, albedo, roughness and specular weight."""
 
 
-def _reflectance(source: Reflects, field: LoadedField | VolumeField | ChangedField
-                 ) -> Callable[[Vector], Reflectance]:
+def _reflectance(source: Reflects, field: LoadedField) -> Callable[[Vector], Reflectance]:
     """Return the reflectance of field points as a function.
 
     The phase function holds it rather than the medium, which holds the phase function. The two would never be freed.
@@ -142,11 +142,11 @@ def _reflectance(source: Reflects, field: LoadedField | VolumeField | ChangedFie
     return reflectance
 
 
-def _density(field: LoadedField | VolumeField, representation: str) -> Density:
+def _density(field: LoadedField, representation: str) -> Density:
     """Return the density of `field` in a `representation`, one of ``REPRESENTATIONS``."""
     if representation == "grid":
         return field.grid
-    if isinstance(field, VolumeField):
+    if not isinstance(field.grid, GridField):
         raise MiNtfError(f'nrf medium: representation is "network", but {field.name} is a field of voxels, which has '
                          "no networks; choose grid")
     return NetworkVolume(field.network, field.grid, math.exp(MAX_LOG_DENSITY))  # clipping alone bounds the networks
@@ -174,13 +174,12 @@ def medium_class(phase_class: type) -> type:
             resolution = read.whole("resolution", 0, 16, 1024) or None
             read.flag("sample_emitters", True)
             self.shadow_catcher = read.flag("shadow_catcher", False)
-            self._read = loaded.load(path, resolution)
-            self.field: LoadedField | VolumeField | ChangedField = self._read
+            self.field: LoadedField = loaded.load(path, resolution)
             if self.shadow_catcher and not self.field.emissive:
                 raise MiNtfError(f"nrf medium: shadow_catcher is true, but {path} emits no light of its own; leave it "
                                  "out, or import the splats with --emissive")
             self._parameters: FieldParameters | None = None
-            self.source: Density = _density(self._read, self.representation)
+            self.source: Density = _density(self.field, self.representation)
             self.reflectance = _reflectance(self.source, self.field)
             self.to_world = mi.Transform4f(mi.ScalarTransform4f(to_world))
             self.path = path
@@ -234,7 +233,7 @@ def medium_class(phase_class: type) -> type:
         def parameters(self) -> FieldParameters:
             """Density and reflectance at voxels."""
             if self._parameters is None:
-                self._parameters = FieldParameters(self._read)
+                self._parameters = FieldParameters(self.field)
             return self._parameters
 
         @property

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import itertools
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -17,7 +18,7 @@ from ...infer.grid import GridField
 from ...infer.types import Array, Float, Reflected, Vector
 from ...infer.volume import VoxelVolume
 from ...infer.voxel_parameters import CHANNELS, Lattice, VoxelParameters
-from .loaded import ChangedField, LoadedField, VolumeField
+from .loaded import LoadedField
 
 _changes = itertools.count(1)
 """Numbers of values that were set, in place of a hash of all voxels."""
@@ -37,9 +38,9 @@ class FieldParameters:
         The field with the values that were set.
     """
 
-    def __init__(self, field: LoadedField | VolumeField) -> None:
+    def __init__(self, field: LoadedField) -> None:
         self._read, dj = field, module_of(mi.Float)
-        self.field: LoadedField | VolumeField | ChangedField = field
+        self.field: LoadedField = field
         colour_alone = field.phase is not None or field.emissive
         self.voxels = voxels = VoxelParameters(field.grid, colour_alone, field.similarity.radius, dj)
         self._names = {("emission" if field.emissive else name): name for name in voxels.reflectance}
@@ -62,7 +63,7 @@ class FieldParameters:
     def changed(self, keys: Sequence[str]) -> bool:
         """Take over the tensors called `keys`; return True if any of them is a parameter of the field."""
         mine = [key for key in self.tensors if key in keys]
-        voxels, grid, digest = self.voxels, self.field.grid, self.field.digest
+        voxels, grid, digest, density_set = self.voxels, self.field.grid, self.field.digest, self.field.density_set
         for key in mine:
             tensor = self.tensors[key]
             if key == voxels.density_name:
@@ -75,14 +76,15 @@ class FieldParameters:
             if key == voxels.density_name:
                 voxels.density = tensor.array
                 grid = voxels.changed_grid()
-                digest = f"{self._read.digest} changed {next(_changes)}"
+                digest, density_set = f"{self._read.digest} changed {next(_changes)}", True
             else:
                 voxels.reflectance[self._names[key]] = tensor.array
                 self._set.add(self._names[key])
         if self._set & {"roughness", "specular"}:
             grid = _with_gloss(grid, voxels.gloss())
         if mine:
-            self.field = ChangedField(self._read, grid, digest, f"{self._read.digest} changed {next(_changes)}")
+            self.field = replace(self._read, grid=grid, digest=digest, density_set=density_set,
+                                 appearance=f"{self._read.digest} changed {next(_changes)}")
         return bool(mine)
 
     def reflectance(self, source: GridField | VoxelVolume) -> Reflecting:

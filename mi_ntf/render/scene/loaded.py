@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from types import ModuleType
-from typing import NoReturn
 from weakref import WeakValueDictionary
 
 import drjit as dr
@@ -37,142 +36,63 @@ _one_at_a_time = threading.RLock()
 
 @dataclass(frozen=True)
 class LoadedField:
-    """A field file in both representations, with the softness of its skins.
+    """The field of a medium: of a trained field file, of a file of voxels, or of a medium of Mitsuba.
 
-    `digest`: hash of the networks as they were read, even if the file has changed since.
+    - name: field file or medium, for messages
+    - grid: density and reflectance
+    - digest: hash of the density, and of the networks as they were read, even if the file has changed since
+    - appearance: hash of density and reflectance; another one than `digest` if any was set in the scene
+    - similarity: transform from the capture to the field
+    - softness: softness of the skins, that of the file
+    - networks: header and networks of a trained field
+    - phase: asymmetry of the phase function, None for surfaces
+    - emissive: the matter emits light
+    - density_set: the density was set in the scene, so the networks do not know it
     """
 
-    header: Header
-    network: NetworkField
-    grid: GridField
-    softness: Softness | Smoke
-    digest: str
-    trained = True
-    emissive = False
-
-    @property
-    def appearance(self) -> str:
-        """Hash of density and reflectance."""
-        return self.digest
-
-    @property
-    def similarity(self) -> Similarity:
-        """Transform from the capture to the field."""
-        return self.header.similarity
-
-    @property
-    def phase(self) -> float | None:
-        """Asymmetry of the phase function, None for surfaces."""
-        return self.header.architecture.phase
-
-    @property
-    def retro(self) -> float | None:
-        """Retro-reflection of :mod:`mi_ntf.core.fresnel`, None if the specular weight is the same at all angles."""
-        return self.network.retro
-
-    @property
-    def tail(self) -> float | None:
-        """Tail of the specular lobe (:mod:`mi_ntf.core.microfacet`), None for GGX."""
-        return self.network.tail
-
-
-@dataclass(frozen=True)
-class VolumeField:
-    """A field without networks: that of a file of voxels, or of a medium of Mitsuba called `name`."""
-
-    grid: VoxelVolume
     name: str
-    similarity: Similarity = field(default_factory=Similarity)
-    phase: float | None = None
-    softness: Softness | Smoke = field(default_factory=Smoke)
-    emissive: bool = False
-    retro: float | None = None
-    tail: float | None = None
-    trained = False
-
-    @property
-    def digest(self) -> str:
-        """Hash of the voxels and of the body that they fill."""
-        return self.grid.digest
-
-    @property
-    def appearance(self) -> str:
-        """Hash of density and reflectance."""
-        return self.digest
-
-    @property
-    def header(self) -> NoReturn:
-        """Raise MiNtfError, since there is no trained field."""
-        raise MiNtfError(f"{self.name} is no trained field, so it has no networks; choose "
-                         "visibility=raymarch, transmittance_map, transmittance_volume or transmittance_atlas, and "
-                         "map_source=field")
-
-    network = header
-
-
-@dataclass(frozen=True)
-class ChangedField:
-    """The field `original` with voxels that were set in the scene.
-
-    `digest` is another one for each density, and `appearance` for each density or reflectance, of this process alone.
-    """
-
-    original: LoadedField | VolumeField
     grid: GridField | VoxelVolume
     digest: str
     appearance: str
+    similarity: Similarity = field(default_factory=Similarity)
+    softness: Softness | Smoke = field(default_factory=Smoke)
+    networks: tuple[Header, NetworkField] | None = None
+    phase: float | None = None
+    emissive: bool = False
+    density_set: bool = False
 
     @property
-    def similarity(self) -> Similarity:
-        """Transform from the capture to the field."""
-        return self.original.similarity
+    def trained(self) -> bool:
+        """True if there are networks that know the density."""
+        return self.networks is not None and not self.density_set
 
     @property
-    def phase(self) -> float | None:
-        """Asymmetry of the phase function, None for surfaces."""
-        return self.original.phase
+    def header(self) -> Header:
+        """Header of the field file. Raises MiNtfError if there are no networks that know the density."""
+        return self._trained()[0]
 
     @property
-    def softness(self) -> Softness | Smoke:
-        """Softness of the skins, that of the file."""
-        return self.original.softness
+    def network(self) -> NetworkField:
+        """Networks of the field file. Raises MiNtfError if there are none that know the density."""
+        return self._trained()[1]
 
     @property
     def retro(self) -> float | None:
         """Retro-reflection of :mod:`mi_ntf.core.fresnel`, None if the specular weight is the same at all angles."""
-        return self.original.retro
+        return self.networks and self.networks[1].retro
 
     @property
     def tail(self) -> float | None:
         """Tail of the specular lobe (:mod:`mi_ntf.core.microfacet`), None for GGX."""
-        return self.original.tail
+        return self.networks and self.networks[1].tail
 
-    @property
-    def emissive(self) -> bool:
-        """True if the matter emits light."""
-        return self.original.emissive
-
-    @property
-    def trained(self) -> bool:
-        """True if the trained networks still know the density."""
-        return self.original.trained and self.digest == self.original.digest
-
-    @property
-    def header(self) -> Header:
-        """Header of the field file. Raises MiNtfError if its networks do not know the density."""
-        return self._original().header
-
-    @property
-    def network(self) -> NetworkField:
-        """Networks of the field file. Raises MiNtfError if they do not know the density."""
-        return self._original().network
-
-    def _original(self) -> LoadedField | VolumeField:
-        if self.digest != self.original.digest:
-            raise MiNtfError("nrf medium: its density was set in the scene, which its trained networks do not know; "
-                             "choose visibility=raymarch, transmittance_map, transmittance_volume or "
-                             "transmittance_atlas, and map_source=field")
-        return self.original
+    def _trained(self) -> tuple[Header, NetworkField]:
+        if self.networks is not None and not self.density_set:
+            return self.networks
+        why = ("nrf medium: its density was set in the scene, which its trained networks do not know"
+               if self.density_set else f"{self.name} is no trained field, so it has no networks")
+        raise MiNtfError(f"{why}; choose visibility=raymarch, transmittance_map, transmittance_volume or "
+                         "transmittance_atlas, and map_source=field")
 
 
 class InMemory:
@@ -205,7 +125,7 @@ def voxels(header: Header, network: NetworkField, dj: ModuleType) -> int:
     return min(max(192, planes, -(-round(skins) // SIDE) * SIDE), 512)
 
 
-def load(path: str, resolution: int | None) -> LoadedField | VolumeField:
+def load(path: str, resolution: int | None) -> LoadedField:
     """Read the field file `path` and bake it at `resolution`³ voxels, None for :func:`voxels`.
 
     A file of voxels, or the name of an :class:`InMemory`, is read as it is.
@@ -239,7 +159,7 @@ def _begin_other_media(variant: str) -> None:
 
 @lru_cache(maxsize=4)
 def _load(path: str, _identity: tuple[int, int, int] | None, resolution: int | None, variant: str
-          ) -> LoadedField | VolumeField:
+          ) -> LoadedField:
     dj = module(variant)
     volume = _stored_voxels(path)
     if volume is not None:
@@ -253,13 +173,12 @@ def _load(path: str, _identity: tuple[int, int, int] | None, resolution: int | N
         stored = field_file.load_baked(path, _stamp(digest, resolution))
         if stored is not None:
             try:
-                return LoadedField(header, network, GridField(stored, network, dj), _softness(header, stored, dj),
-                                   digest)
+                return _trained_field(path, header, network, stored, digest, dj)
             except (KeyError, ValueError):
                 log.info(f"nrf medium: the voxels in {path} are damaged")
         arrays = user_cache.cached("fields", user_cache.key(digest, resolution),
                                    lambda: _baked(path, header, network, resolution, dj))
-        return LoadedField(header, network, GridField(arrays, network, dj), _softness(header, arrays, dj), digest)
+        return _trained_field(path, header, network, arrays, digest, dj)
 
 
 def _stored_voxels(path: str) -> tuple[voxel_file.Voxels, dict[str, np.ndarray]] | None:
@@ -273,7 +192,7 @@ def _stored_voxels(path: str) -> tuple[voxel_file.Voxels, dict[str, np.ndarray]]
     return (header, voxel_file.load(path, header)) if isinstance(header, voxel_file.Voxels) else None
 
 
-def _volume_field(path: str, header: voxel_file.Voxels, arrays: dict[str, np.ndarray], dj: ModuleType) -> VolumeField:
+def _volume_field(path: str, header: voxel_file.Voxels, arrays: dict[str, np.ndarray], dj: ModuleType) -> LoadedField:
     """Return a field of voxels. Raises MiNtfError if the arrays are damaged."""
     with log.Work("nrf medium", f"reading {path}") as work:
         try:
@@ -284,12 +203,16 @@ def _volume_field(path: str, header: voxel_file.Voxels, arrays: dict[str, np.nda
         if header.phase is None and volume.majorant > 0:
             softness = Softness(user_cache.cached("fields", user_cache.key(volume.digest, volume.resolution),
                                                   lambda: measure(volume, dj, work.update)), dj)
-        return VolumeField(volume, path, header.similarity, header.phase, softness, header.emissive)
+        return LoadedField(path, volume, volume.digest, volume.digest, header.similarity, softness, None, header.phase,
+                           header.emissive)
 
 
-def _softness(header: Header, arrays: dict[str, np.ndarray], dj: ModuleType) -> Softness | Smoke:
-    """Return the softness of a field's skins, which smoke does not have."""
-    return Softness(arrays, dj) if header.architecture.phase is None else Smoke()
+def _trained_field(path: str, header: Header, network: NetworkField, arrays: dict[str, np.ndarray], digest: str,
+                   dj: ModuleType) -> LoadedField:
+    """Return a trained field with its baked `arrays`. Raises KeyError or ValueError if these are damaged."""
+    phase = header.architecture.phase
+    return LoadedField(path, GridField(arrays, network, dj), digest, digest, header.similarity,
+                       Softness(arrays, dj) if phase is None else Smoke(), (header, network), phase)
 
 
 def add_baked(path: Path, resolution: int | None = None) -> dict[str, str | int]:

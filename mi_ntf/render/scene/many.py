@@ -15,7 +15,7 @@ from ...infer.instances import Copies, InstancedVisibility, Instances
 from ...infer.shade import Reflectance
 from ...infer.types import Vector, Visibility
 from .frame import Frame
-from .loaded import ChangedField, LoadedField, VolumeField
+from .loaded import LoadedField
 from .media import NRFMedium
 
 MIN_GLOSS = 0.01
@@ -43,7 +43,7 @@ class Crowd:
     def __init__(self, members: Sequence[NRFMedium]) -> None:
         self.members = members
         first = members[0]
-        self.field: LoadedField | VolumeField | ChangedField = first.field
+        self.field: LoadedField = first.field
         self.representation, self.path = first.representation, first.path
         origin = np.array([m.frame.origin for m in members])
         length = np.array([m.frame.length for m in members])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Protocol, cast
 
 import mitsuba as mi
@@ -15,7 +14,7 @@ from ...infer.grid import Density
 from ...infer.shade import Reflectance
 from ...infer.types import Float, Vector
 from .frame import Frame
-from .loaded import ChangedField, LoadedField, VolumeField
+from .loaded import LoadedField
 from .stock_medium import StockMedium
 from .traversal import traverse
 
@@ -27,7 +26,7 @@ class NRFMedium(Protocol):
     `shadow_catcher`: shadows of others darken the light that the field emits.
     """
 
-    field: LoadedField | VolumeField | ChangedField
+    field: LoadedField
     frame: Frame
     source: Density
     representation: str
@@ -46,51 +45,16 @@ class NRFMedium(Protocol):
         """Return the reflectance at field points."""
 
 
-@dataclass(frozen=True, eq=False)
 class InstancedMedium:
     """A field as an instance of a shape group places it; all but its `frame` is that of the `medium` in the group."""
 
-    medium: NRFMedium
-    frame: Frame
+    is_nrf = False
 
-    @property
-    def field(self) -> LoadedField | VolumeField | ChangedField:
-        """Field of the medium."""
-        return self.medium.field
+    def __init__(self, medium: NRFMedium, frame: Frame) -> None:
+        self.medium, self.frame = medium, frame
 
-    @property
-    def attached(self) -> Sequence[str]:
-        """Names of the medium's parameters that carry gradients."""
-        return self.medium.attached
-
-    @property
-    def attached_log_density(self) -> Callable[[Vector], Float] | None:
-        """Function of field points to ln σ with the gradients of the density; None if it has none."""
-        return self.medium.attached_log_density
-
-    @property
-    def source(self) -> Density:
-        """Density of the medium."""
-        return self.medium.source
-
-    @property
-    def representation(self) -> str:
-        """Representation of the medium."""
-        return self.medium.representation
-
-    @property
-    def path(self) -> str:
-        """Field file of the medium."""
-        return self.medium.path
-
-    @property
-    def shadow_catcher(self) -> bool:
-        """True if shadows of others darken the light that the field emits."""
-        return self.medium.shadow_catcher
-
-    def reflectance(self, x: Vector) -> Reflectance:
-        """Return the reflectance at field points."""
-        return self.medium.reflectance(x)
+    def __getattr__(self, name: str) -> object:
+        return getattr(self.medium, name)
 
 
 def find_media(scene: mi.Scene) -> list[NRFMedium]:

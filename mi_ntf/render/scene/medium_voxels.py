@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...core import splat_normals
 from ...core.errors import MiNtfError
 from ...infer.bake import PART
 
@@ -46,7 +47,7 @@ def sampled(medium: mi.Medium, low: np.ndarray, high: np.ndarray, name: str) -> 
         index = np.stack(np.meshgrid(*(np.arange(n) for n in counts[::-1]), indexing="ij"), -1)[..., ::-1]
         values = _extinction(medium, low + (index.reshape(-1, 3) + 0.5) / counts * (high - low), name)
         values = values.reshape(counts[::-1])
-        error = np.sqrt(np.mean((_interpolated(values, probe * counts - 0.5) - truth) ** 2))
+        error = np.sqrt(np.mean((splat_normals.interpolated(values, probe * counts - 0.5) - truth) ** 2))
         if error <= TOLERANCE * max(values.max(), 1e-30) or np.prod(2.0 * counts) > MOST_VOXELS:
             return values
         counts = 2 * counts
@@ -65,17 +66,4 @@ def _extinction(medium: mi.Medium, points: np.ndarray, name: str) -> np.ndarray:
                              "transmittance cannot hold; give sigma_t one number and colour the albedo, or render with "
                              "volpath")
         result[first : first + PART] = sigma[0]
-    return result
-
-
-def _interpolated(values: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Return trilinear `values` (z, y, x) at places (k, 3), x first, in voxels from the first centre."""
-    counts = np.array(values.shape[::-1])
-    cell = np.clip(np.floor(place), 0, np.maximum(counts - 2, 0)).astype(int)
-    fraction = np.clip(place - cell, 0, 1)
-    result = np.zeros(len(place))
-    for corner in np.ndindex(2, 2, 2):
-        x, y, z = np.minimum(cell + corner, counts - 1).T
-        weight = np.prod(np.where(corner, fraction, 1 - fraction), axis=1)
-        result += weight * values[z, y, x]
     return result

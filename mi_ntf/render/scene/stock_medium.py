@@ -24,7 +24,7 @@ from ...infer.volume import FAINTEST, Solid, VoxelVolume, dense
 from .. import log
 from . import medium_voxels
 from .frame import Frame
-from .loaded import VolumeField
+from .loaded import LoadedField
 from .recent import Recent, Version
 from .traversal import traverse
 
@@ -81,7 +81,7 @@ class StockMedium:
         self.source, self.frame = Version(shape).once(
             _volumes, lambda: _sampled(shape, medium, volume_box, name), str(mi.variant()), medium.class_name(),
             volume_box.tobytes())
-        self.field = VolumeField(self.source, name)
+        self.field = LoadedField(name, self.source, self.source.digest, self.source.digest)
 
     @property
     def attached(self) -> list[str]:

@@ -13,7 +13,7 @@ albedo              R, G, B          diffuse albedo of surfaces, albedo of field
 roughness           Y                of fields
 opacity             Y                1 − T: fraction of the view that something stops
 visibility          Y                of fields: τ towards a light, mean over the lights of the table
-visibility_lights   0.Y, 1.Y, …      of fields: τ towards each light of the table
+visibility_lights   0.Y, 1.Y, …      of fields: τ towards each light of the table, 128 at most
 =================== ================ ==================================================================================
 """
 

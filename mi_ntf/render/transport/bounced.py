@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -14,37 +13,18 @@ from ...infer import march, shade
 from ...infer.backend import floats, module_of, words
 from ...infer.bundle import Strand
 from ...infer.irradiance import Irradiance
-from ...infer.types import Float, Mask, Ray, UInt32, Vector, Vector3
+from ...infer.types import Float, Vector, Vector3
 from .. import log, user_cache
 from ..maps import building
-from ..scene.loaded import ChangedField
 from ..scene.media import NRFMedium
-from ..scene.settings import Settings
 from .shadow import Part
+
+if TYPE_CHECKING:
+    from .composition import Composition
 
 SEED = 7
 LIGHT_SAMPLES = 64
 """Least number of sampled lights of a patch. They are the same for all samples of a pixel."""
-
-
-class FieldScene(Protocol):
-    """Fields and lights of a scene (:class:`mi_ntf.render.transport.composition.Composition`)."""
-
-    @property
-    def parts(self) -> Sequence[Part]:
-        """Fields with their lights."""
-
-    @property
-    def settings(self) -> Settings:
-        """Settings of the render."""
-
-    def free_flight(self, ray: Ray, maxt: Float, offset: Float, depths: Sequence[Float],
-                    steps: int) -> tuple[Mask, Float, UInt32]:
-        """Return ``(hit, t, part)`` of rays that end at given optical depths."""
-
-    def reflect(self, part: Part, points: shade.Points, stream: UInt32, view: Float | None = None, *,
-                surface: bool = False, light_samples: int = 0) -> list[Float]:
-        """Return the radiance that points reflect from all lights."""
 
 
 class _Hits(NamedTuple):
@@ -65,11 +45,11 @@ class Patches:
     The patches are stored in the user's cache.
     """
 
-    def __init__(self, scene: FieldScene) -> None:
+    def __init__(self, scene: Composition) -> None:
         self._key = _key(scene)
         self.skins = [Skin(part.medium) for part in scene.parts]
         # Values that were set in the scene have a name in this process alone.
-        changed = any(isinstance(part.medium.field, ChangedField) for part in scene.parts)
+        changed = any(part.medium.field.appearance != part.medium.field.digest for part in scene.parts)
         arrays = self._search(scene) if changed else user_cache.cached(
             "patches", user_cache.key(*self._key), lambda: self._search(scene), placed=len(self.skins) > 1)
         for number, skin in enumerate(self.skins):
@@ -80,11 +60,11 @@ class Patches:
         log.info(f"nrf integrator: light bounces between {len(self.albedo)} patches of skins, which count as diffuse: "
                  "fast and biased; bounces=paths is not")
 
-    def _search(self, scene: FieldScene) -> dict[str, np.ndarray]:
+    def _search(self, scene: Composition) -> dict[str, np.ndarray]:
         with log.Work("nrf integrator", "finding the patches that light bounces between"):
             return self._arrays(scene)
 
-    def _arrays(self, scene: FieldScene) -> dict[str, np.ndarray]:
+    def _arrays(self, scene: Composition) -> dict[str, np.ndarray]:
         """Return the arrays of all skins, `first` and `hits`, computed by random rays."""
         rng = np.random.default_rng(SEED)
         self.skins[:] = [skin_of(part.medium, rng) for part in scene.parts]
@@ -100,11 +80,11 @@ class Patches:
         arrays = {f"{i}.{name}": getattr(s, name) for i, s in enumerate(self.skins) for name in Skin.ARRAYS}
         return arrays | {"first": first, "hits": hits.reshape(-1, radiosity.SIDE**2)}
 
-    def fit(self, scene: FieldScene) -> bool:
+    def fit(self, scene: Composition) -> bool:
         """Return True if `scene` has the same fields in the same places."""
         return self._key == _key(scene)
 
-    def _trace(self, scene: FieldScene, side: int, rng: np.random.Generator) -> list[_Hits]:
+    def _trace(self, scene: Composition, side: int, rng: np.random.Generator) -> list[_Hits]:
         """Trace `side`² rays from each patch; return their hits on each skin, in its own coordinates."""
         origins, directions = [], []
         for skin in self.skins:
@@ -135,7 +115,7 @@ class Patches:
         return result
 
 
-def _key(scene: FieldScene) -> tuple[object, ...]:
+def _key(scene: Composition) -> tuple[object, ...]:
     """Return all inputs of patches. The patches of a single field do not depend on its placement."""
     media = [part.medium for part in scene.parts]
     fields = [(m.field.appearance, m.representation, m.field.grid.resolution, len(media) > 1 and m.frame.placement())
@@ -149,7 +129,7 @@ class Bounced:
     Skins count as diffuse surfaces that reflect as much as both lobes. `max_depth`: longest path in edges, −1 for any.
     """
 
-    def __init__(self, scene: FieldScene, patches: Patches, max_depth: int) -> None:
+    def __init__(self, scene: Composition, patches: Patches, max_depth: int) -> None:
         self._media = [part.medium for part in scene.parts]
         pairs = zip(scene.parts, patches.skins, strict=True)
         direct = np.concatenate([_direct(scene, part, skin) for part, skin in pairs])
@@ -166,7 +146,7 @@ class Bounced:
         return [k * e * microfacet.INV_PI for k, e in zip(albedo, light, strict=True)]
 
 
-def _direct(scene: FieldScene, part: Part, skin: Skin) -> np.ndarray:
+def _direct(scene: Composition, part: Part, skin: Skin) -> np.ndarray:
     """Return the irradiance (patches, 3) of the `skin` of `part` by the lights alone."""
     n = len(skin.position)
     if not n:
