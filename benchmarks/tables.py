@@ -89,17 +89,11 @@ def demo_rows(rows: list[Values], full: bool) -> str:
 
 
 def speed(values: Values) -> str:
-    """Return the rows of the README; the first is that of `benchmarks.loops`, if it was measured."""
+    """Return the rows of the README."""
     def times(key: str) -> str:
         return f"{number(values[key]['median'])} ×"
 
-    rows = []
-    if (record.RESULTS / "loops.json").is_file():
-        whole = record.read("loops")["values"]["whole"]["statue"]
-        errors = "; ".join(percent(whole[m]["error"]) for m in METHODS[1:])
-        rows.append([f"whole picture, `raymarch` over {'; '.join(f'`{m}`' for m in METHODS[1:])} (errors {errors})",
-                     "; ".join(f"{number(whole[m]['ratio']['median'])} ×" for m in METHODS[1:])])
-    rows += [
+    rows = [
         ["transmittance of 500 lights, networks of the paper's size: volume over map, unculled (391 ×)",
          times("stage_unculled")],
         ["the same, whole picture: unculled (92 ×); culled on both sides",
