@@ -94,7 +94,7 @@ def sampled_bricks(field: NetworkField, n: int, reach: tuple[int, int], dj: Modu
     """
     function = log_density or field.log_density
     places = _near_density(field, n, dj, lambda done: progress(done / 2))
-    planes = np.full((reach[1] - reach[0], n, n), np.nan, np.float32)  # those of the voxels of a layer of bricks
+    planes = np.full((reach[1] - reach[0], n, n), np.nan, np.float32)  # of voxels that a layer of bricks reads
     for layer in range(bricks_per_side(n)):
         progress((1 + layer / bricks_per_side(n)) / 2)
         planes = np.concatenate([planes[SIDE:], np.full((SIDE, n, n), np.nan, np.float32)])
@@ -113,7 +113,10 @@ def sampled_bricks(field: NetworkField, n: int, reach: tuple[int, int], dj: Modu
 
 
 def _near_density(field: NetworkField, n: int, dj: ModuleType, progress: Progress) -> np.ndarray:
-    """Return the places (k, 3), z first, of all bricks of n³ voxels near density."""
+    """Return the places (k, 3), z first, of all bricks of n³ voxels near density.
+
+    Only the unit sphere is looked at, since rays are marched nowhere else.
+    """
     survey = min(n, SURVEY)
     z, y, x = np.ogrid[:survey, :survey, :survey]
     half = (survey - 1) / 2

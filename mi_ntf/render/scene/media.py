@@ -48,7 +48,7 @@ class NRFMedium(Protocol):
 class InstancedMedium:
     """A field as an instance of a shape group places it; all but its `frame` is that of the `medium` in the group."""
 
-    is_nrf = False
+    is_nrf = False  # the medium itself stands in the group, not in the scene
 
     def __init__(self, medium: NRFMedium, frame: Frame) -> None:
         self.medium, self.frame = medium, frame

@@ -22,9 +22,8 @@ from .choosing import Choice, Chooser
 from .composition import IN_SMOKE, Composition
 from .context import RenderContext
 
-CHUNK = 1 << 17
-"""Camera rays in flight on a processor, which bounds the memory at about 400 MiB for any image and number of lights. A
-GPU takes twice as many."""
+CHUNK = 1 << 18
+"""Camera rays in flight, which bounds the memory at about half a GiB for any image and number of lights."""
 
 
 def render(context: RenderContext, scene: mi.Scene, sensor: mi.Sensor, seed: int | UInt32, spp: int, develop: bool,
@@ -160,8 +159,7 @@ def _trace(context: RenderContext, composition: Composition, pixels: Reconstruct
     """Trace one pass: for each run of lights all camera rays, in chunks of pixels; return False if it was stopped."""
     camera = pixels.camera
     alpha = mi.has_flag(camera.film.flags(), mi.FilmFlags.Alpha)
-    chunk = CHUNK << int(dr.backend_v(mi.Float) == dr.JitBackend.CUDA)
-    rays_in_flight = (context.rays_in_flight or chunk) // (IN_SMOKE if composition.smoke else 1)
+    rays_in_flight = (context.rays_in_flight or CHUNK) // (IN_SMOKE if composition.smoke else 1)
     chunks = range(0, camera.count, max(1, rays_in_flight // camera.spp))
     runs, cache = range(len(composition.runs)), context.sample_cache
     for number, (run, first) in enumerate(itertools.product(runs, chunks)):
