@@ -90,14 +90,15 @@ def sampled_bricks(field: NetworkField, n: int, reach: tuple[int, int], dj: Modu
                    ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield parts of all bricks near density: places (k, 3), z first, and ln σ of their voxels, at least `LOG_FLOOR`.
 
-    `reach`: as in :func:`at_bricks`. `log_density`: function to sample in place of the field's own.
+    `reach`: as in :func:`at_bricks`. `log_density`: function to sample in place of the field's own. A voxel that
+    several bricks read is evaluated once.
     """
     function = log_density or field.log_density
     places = _near_density(field, n, dj, lambda done: progress(done / 2))
-    planes = np.full((reach[1] - reach[0], n, n), np.nan, np.float32)  # of voxels that a layer of bricks reads
+    slab = np.full((reach[1] - reach[0], n, n), np.nan, np.float32)  # voxels that a layer of bricks reads
     for layer in range(bricks_per_side(n)):
         progress((1 + layer / bricks_per_side(n)) / 2)
-        planes = np.concatenate([planes[SIDE:], np.full((SIDE, n, n), np.nan, np.float32)])
+        slab = np.concatenate([slab[SIDE:], np.full((SIDE, n, n), np.nan, np.float32)])
         part = places[places[:, 0] == layer]
         if not len(part):
             continue
@@ -105,10 +106,10 @@ def sampled_bricks(field: NetworkField, n: int, reach: tuple[int, int], dj: Modu
         y, x = (np.clip(SIDE * part[:, axis, None] + np.arange(*reach), 0, n - 1) for axis in (1, 2))
         read = np.zeros((n, n), bool)
         read[y[:, :, None], x[:, None, :]] = True
-        missing = np.isnan(planes) & read
+        missing = np.isnan(slab) & read
         plane, place = np.divmod(np.flatnonzero(missing), n * n)
-        planes[missing] = at_voxels(lambda p: [function(p)], 1, z[plane] * (n * n) + place, n, dj)[:, 0]
-        samples = planes[:, y[:, :, None], x[:, None, :]].swapaxes(0, 1)
+        slab[missing] = at_voxels(lambda p: [function(p)], 1, z[plane] * (n * n) + place, n, dj)[:, 0]
+        samples = slab[:, y[:, :, None], x[:, None, :]].swapaxes(0, 1)
         yield part, np.maximum(samples, LOG_FLOOR)
 
 
