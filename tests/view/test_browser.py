@@ -135,6 +135,7 @@ def test_a_light_is_dragged(page, served, tmp_path):
 def test_the_scenes_camera_is_one_click_away_and_is_what_is_saved(page, served):
     address, path = served
     page.goto(address)
+    begun(page)  # until then it shows the picture of the page before
     before = rested(page)
     page.evaluate("window.shown.clear()")
     button(page, "See all lights").click()
