@@ -43,11 +43,12 @@ class Noisy:
         self.build, self.rate, self.noise, self.bias, self.calls = build, rate, noise, bias, []
 
     def __call__(self, samples, seed):
-        took = max(self.rate * samples, 1e-5) + (0 if self.calls else self.build)
+        build = 0 if self.calls else self.build
+        took = max(self.rate * samples, 1e-5) + build
         self.calls.append((samples, seed))
         time.sleep(took)
         noise = self.noise / np.sqrt(samples) * np.random.default_rng(seed).normal(size=TRUTH.image.shape)
-        return TRUTH.image * (1 + self.bias) + noise, took
+        return TRUTH.image * (1 + self.bias) + noise, took, build
 
 
 def follow(render, share, mesh=None, truth=TRUTH):
@@ -74,6 +75,7 @@ def test_a_way_uses_its_share_and_not_much_more():
     assert 0.2 < time.perf_counter() - start < 0.5  # its last pass is half of all before it at least
     assert len(follow(Noisy(build=0.5, rate=1e-3), 0.1).points) == 1  # one pass, whatever it takes
     assert len(follow(Noisy(build=0.15, rate=1e-3), 0.1).points) > 2  # a quarter of the share is left for samples
+    assert len(follow(Noisy(rate=0.08), 0.1).points) == 1  # no second pass fits, and nothing was built
 
 
 def test_a_way_ends_where_samples_change_its_error_no_more():
@@ -139,7 +141,7 @@ def test_the_xml_of_a_way_renders_the_same_picture(folder, subject, way):
     (folder / "pasted.xml").write_text(text[:begin] + ours + text[end:])
     pasted = mi.load_file(str(folder / "pasted.xml"))
     render = references.renderer(subject, way, 1)
-    ours, _ = render(2, 5)
+    ours, *_ = render(2, 5)
     np.testing.assert_array_equal(np.array(once(pasted, pasted.integrator(), 2, 5)[0])[..., :3], ours)
 
 
@@ -154,7 +156,7 @@ def test_the_command_of_a_way_runs_and_renders_the_way(folder, subject):
     done = run_program(*shlex.split(text), "-m", VARIANT, cwd=folder)
     assert done.returncode == 0, done.stderr
     found = np.array(mi.Bitmap(str(folder / "picture.exr")))[..., :3]
-    ours, _ = references.renderer(subject, way, 1)(3, 0)
+    ours, *_ = references.renderer(subject, way, 1)(3, 0)
     np.testing.assert_allclose(found, ours, atol=2e-3)  # its film has half precision
 
 

@@ -31,8 +31,10 @@ class Renderer:
     compile: float = 0.0
     peak: int = 0
 
-    def __call__(self, samples: int, seed: int) -> tuple[np.ndarray, float]:
-        """Return a picture (h, w, 3) of so many samples a pixel, and its seconds without compilation.
+    def __call__(self, samples: int, seed: int) -> tuple[np.ndarray, float, float]:
+        """Return a picture (h, w, 3) of so many samples a pixel, its seconds, and those that built its maps.
+
+        Neither contains compilation.
 
         Raises MiNtfError where a pixel is not finite.
         """
@@ -42,7 +44,7 @@ class Renderer:
             raise MiNtfError("the picture has pixels that are not finite")
         self.compile += times["compile_seconds"]
         self.peak = max(self.peak, times["peak_bytes"])
-        return pixels, max(times["wall_seconds"] - times["compile_seconds"], 1e-4)
+        return pixels, max(times["wall_seconds"] - times["compile_seconds"], 1e-4), times["build_seconds"]
 
 
 @dataclass
@@ -71,8 +73,8 @@ class Curve:
         self.pictures |= {str(mark): mean.image for mark in TIMES if seconds <= mark}
 
 
-def follow(render: Callable[[int, int], tuple[np.ndarray, float]], truth: Truth, mesh: Truth | None, budget: float,
-           tell: Callable[[float], None]) -> Curve:
+def follow(render: Callable[[int, int], tuple[np.ndarray, float, float]], truth: Truth, mesh: Truth | None,
+           budget: float, tell: Callable[[float], None]) -> Curve:
     """Render passes until `budget` seconds are used, compilation excluded, or noise no longer matters.
 
     Noise no longer matters below that of the reference or below a tenth of the bias. Every pass doubles the samples, so
@@ -82,8 +84,8 @@ def follow(render: Callable[[int, int], tuple[np.ndarray, float]], truth: Truth,
     Parameters
     ----------
     render
-        Function of samples and a seed that returns a picture and seconds, such as a :class:`Renderer`. It builds its
-        maps in the first pass, which is rendered whatever it takes.
+        Function of samples and a seed that returns a picture, its seconds, and those that built its maps, such as a
+        :class:`Renderer`. It builds its maps in the first pass, which is rendered whatever it takes.
     truth, mesh
         The reference, and the captured mesh if there is one.
     tell
@@ -93,20 +95,21 @@ def follow(render: Callable[[int, int], tuple[np.ndarray, float]], truth: Truth,
     seconds, samples = 0.0, 1
     with map_cache.in_memory():
         while samples:
-            picture, duration = render(samples, 2 * mean.pictures)  # references have odd seeds
+            picture, duration, building = render(samples, 2 * mean.pictures)  # references have odd seeds
             seconds += duration
             mean.add(picture, samples)
             if other:
                 other.add(picture, samples)
             curve.add(seconds, mean, other)
             tell(curve.points[-1]["error"])
-            if mean.pictures == 1 and budget / 2 < seconds < 2 * budget:
+            if mean.pictures == 1 and budget / 2 < building < 2 * budget:
                 budget = max(budget, seconds + budget / 4)
             noise, bias = (e.value for e in mean.split()) if mean.pictures > 1 else (1.0, 0.0)
             if seconds >= budget or noise < max(truth.noise, bias / 10):
                 break
-            fit = (budget - seconds) / duration * samples if mean.pictures > 1 else 1.0
-            mark = next(((t - seconds) / duration * samples for t in TIMES if t > seconds), 0.0)
+            per_sample = max(duration - building, 1e-4) / samples
+            fit = (budget - seconds) / per_sample
+            mark = next(((t - seconds) / per_sample for t in TIMES if t > seconds), 0.0)
             samples = following(mean.samples, fit, mark, LARGEST_PASS // picture[..., 0].size)
     return curve
 

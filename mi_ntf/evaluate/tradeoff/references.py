@@ -128,6 +128,6 @@ def _traced(path: Path, subject: Subject, shrink: int, seconds: float) -> np.nda
     scene = scene_file.load(path, subject.parameters, subject.env, change=shrinker(shrink), strict=False)
     images: list[np.ndarray] = []
     while len(images) < 4 or time.perf_counter() - start < seconds:
-        image, _ = Renderer(scene, scene.integrator())(MESH_SAMPLES, 2 * len(images) + 1)
+        image, *_ = Renderer(scene, scene.integrator())(MESH_SAMPLES, 2 * len(images) + 1)
         images.append(image)
     return np.stack(images)

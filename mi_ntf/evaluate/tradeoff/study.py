@@ -124,7 +124,7 @@ class Study:
 
     def _probe(self, render: Renderer) -> None:
         """Time a small render, the same in each call."""
-        _, seconds = render(self.state.lines["reference"]["probe"], 1)
+        _, seconds, _ = render(self.state.lines["reference"]["probe"], 1)
         self._add(f"probe {len(self.lines('probe'))}", {"seconds": seconds})
 
     def _try(self, way: Way, shrink: int, seconds: float) -> None:
@@ -145,7 +145,7 @@ class Study:
             curve = follow(render, self.truth, self.mesh, seconds, lambda e: self._tell(f"{way.title}: error {e:.1%}"))
             end = curve.points[-1]
             if len(curve.points) == 1:
-                row["note"] += (f"A single pass takes longer than this way's part of the budget, {seconds:.0f} s, so "
+                row["note"] += (f"A second pass does not fit into this way's part of the budget, {seconds:.0f} s, so "
                                 "its noise and bias are not known.")
             if way.plugin == "nrf":
                 row["command"] = render_command(self.subject.path, self.subject.parameters, properties, end["samples"],

@@ -70,22 +70,23 @@ class TransmittanceVolume:
         """Fill the rays `texel` with τ, up to MAX_OPTICAL_DEPTH.
 
         σ is taken at the middle of each cell in occupied space, or of the cell's part on this side of the light at
-        `end`.
+        `end`. All entries begin as 1, so empty space before the first matter is skipped.
         """
         hit, m, h = spheres.chord(ops, o, d)
-        inverse = safe_inverse(d)
+        inverse = safe_inverse(tuple(-c for c in d))
 
         def body(j: UInt32, depth: Float, active: Mask) -> tuple[Array, ...]:
             near = self._radius - self.dj.Float(j) * self._cell
             length = dr.clip(end - near + self._cell, 0, self._cell)
             t = near - self._cell + 0.5 * length
             place = self.volume.place(tuple(mi + t * di for mi, di in zip(m, d, strict=True)))
-            # Entries behind the last light are written too, since all entries begin as 1.
-            matter = active & (dr.abs(t) < h) & (depth < MAX_OPTICAL_DEPTH)
-            matter &= self.volume.clear_distance(place, inverse) <= 0
+            clear = dr.select(dr.abs(t) < h, self.volume.clear_distance(place, inverse), dr.maximum(t - h, 0))
+            matter = active & (dr.abs(t) < h) & (depth < MAX_OPTICAL_DEPTH) & (clear <= 0)
             depth = depth + density_where(matter, self.volume, place) * length
-            dr.scatter(self.values, dr.exp(-depth), texel * self._n + j, active)
-            return j + 1, depth, active & (j + 1 < self._n)
+            dark = depth > 0
+            dr.scatter(self.values, dr.exp(-depth), texel * self._n + j, active & dark)
+            j += 1 + dr.select(dark, 0, self.dj.UInt32(dr.minimum(clear / self._cell, self._n)))
+            return j, depth, active & (j < self._n) & (dark | (t > -h))
 
         zero = dr.zeros(self.dj.Float, dr.width(texel))
         state = (dr.zeros(self.dj.UInt32, dr.width(texel)), zero, hit & (self._n > 0))
