@@ -99,7 +99,10 @@ def planes_of(vertices: np.ndarray, faces: np.ndarray, most: int = 16) -> np.nda
     rows = np.column_stack([normal, np.einsum("ij,ij->i", normal, a)])
     merged: list[np.ndarray] = []
     for row in rows:
-        if not any(row[:3] @ other[:3] > 1 - 1e-8 for other in merged):
+        parallel = [other for other in merged if row[:3] @ other[:3] > 1 - 1e-8]
+        if any(abs(other[3] - row[3]) > 1e-5 * size for other in parallel):
+            return None
+        if not parallel:
             merged.append(row)
         if len(merged) > most:
             return None

@@ -186,3 +186,9 @@ def test_names_and_lights():
         aovs.channel_names(("visibility_lights",), 512)
     with pytest.raises(MiNtfError, match="this scene has none"):
         aovs.channel_names(("visibility",), 0)
+
+
+@pytest.mark.parametrize("output", ["visibility", "visibility_lights"])
+def test_no_visibility_where_no_light_is_scattered(ball, output):
+    with pytest.raises(MiNtfError, match="max_depth is 1, at which fields scatter no light"):
+        layers(ball, output, max_depth=1)

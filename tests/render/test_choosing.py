@@ -219,3 +219,21 @@ def test_the_log_of_a_limited_render_is_one_line_and_its_trials_are_at_level_deb
     assert len(trials) > 1 and not any(trial["name"] in text for trial in trials if not trial["taken"]
                                        for text in lines["info"])
     assert len([text for text in lines["debug"] if "nrf integrator" in text]) >= len(trials)
+
+
+def test_what_is_left_out_of_a_view_is_in_the_next(blobs, monkeypatch):
+    """Frames share the method; what one picture lacks may fill the next, which another camera, or a change, shows."""
+    clock(monkeypatch, lambda s: 1.0 - 0.5 * bool(s.without_media))
+    aside = mi.ScalarTransform4f().translate([9, 0, 0]).scale(0.3)
+    shapes = {"aside": scenes.ball(blobs, to_world=aside) | {"to_world": aside}}
+    loaded = scenes.scene(blobs, nrf(max_error=0.2, max_depth=2), {"light": scenes.light("directional")}, size=32,
+                          spp=8, shapes=shapes)
+    camera = mi.traverse(loaded.sensors()[0])
+    before = camera["to_world"]
+    seen = []
+    for offset in (0, 9):
+        camera["to_world"] = mi.Transform4f(mi.ScalarTransform4f().translate([offset, 0, 0])) @ before
+        camera.update()
+        seen.append(float(scenes.render(loaded)[..., 3].mean()))
+        seen.append(loaded.integrator().context.choice.settings.without_media)
+    assert seen[1] == (0,) and seen[0] > 0.1 and seen[2] > 0.01 and 0 not in seen[3]

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from helpers import fields, scenes, ztest
 
+from mi_ntf import Field
 from mi_ntf.core import field_file
 from mi_ntf.core.architecture import Similarity
 from mi_ntf.render.maps import map_cache
@@ -139,3 +140,30 @@ def test_a_hundred_instances_are_a_hundred_loads(blobs):
     np.testing.assert_array_equal(image, load)
     assert image[..., 3].mean() > 0.05 and np.abs(moved - image).max() > 0.1
     assert compiled == []
+
+
+@pytest.mark.parametrize(("kind", "kinds"), [("skins", [2]), ("smoke", [1, 1, 1, 1])])
+def test_a_reflectance_that_was_set_is_that_of_one_instance(blobs, kind, kinds):
+    """Four media of one field, of which one becomes red; smoke of different reflectance is no single medium."""
+    grid = Field.from_grid(np.full((8, 8, 8), 4.0), 0.9, ((-1, -1, -1), (1, 1, 1)))
+    shapes = {}
+    for i in range(4):
+        own = (blobs, scenes.SIMILARITY) if kind == "skins" else (grid.path, Similarity((0.0, 0.0, 0.0), 1.8))
+        shapes[f"at_{i}"] = scenes.ball(*own, to_world=place(i)) | {"to_world": place(i)}
+    loaded = scenes.scene(None, scenes.nrf(), {"light": {"type": "constant"}}, shapes=shapes)
+    parameters = mi.traverse(loaded)
+    key = next(key for key in parameters.keys() if key.startswith("at_0.") and key.endswith("albedo"))
+    albedo = np.array(parameters[key])
+    albedo[..., 1:] = 0
+    parameters[key] = mi.TensorXf(albedo)
+    parameters.update()
+    assert [len(getattr(medium, "kinds", [medium])) for medium in many.joined(find_media(loaded))] == kinds
+
+
+def test_far_instances_are_no_single_medium(blobs):
+    """Single precision cannot place the cells of small fields in a sphere around all of them."""
+    places = [mi.ScalarTransform4f().translate([x, 0, 0])
+              for x in (0, 3, 6, 9, 1e5, 1e5 + 3, 1e5 + 6, 1e5 + 9, -1e6)]
+    loaded = scenes.scene(None, scenes.nrf(), {}, shapes=instances(blobs, places))
+    media = many.joined(find_media(loaded))
+    assert [len(getattr(medium, "members", [medium])) for medium in media] == [1, 4, 4]

@@ -281,3 +281,39 @@ def test_prb_knows_no_derivative_by_a_lights_place(soft):
     with pytest.raises((MiNtfError, RuntimeError)) as caught:
         dr.backward(dr.mean(mi.render(loaded, parameters, spp=1), axis=None))
     assert "ntf emitter: gradients by position of its light: prb leaves them out" in str(root(caught.value))
+
+
+@pytest.mark.parametrize("visibility", ["raymarch", "transmittance_atlas", "transmittance_map"])
+def test_shadows_follow_a_density_that_was_set(blobs, visibility):
+    """Two lights share a medium by name, of which Mitsuba tells one alone that it has changed."""
+    medium = f'<medium type="nrf" id="field"><string name="filename" value="{blobs}"/></medium>'
+    method = f'<string name="visibility" value="{visibility}"/>'
+    lights = "".join(f'<emitter type="ntf">{method}<emitter type="point"><point name="position" value="{x}, 3, -1"/>'
+                     '</emitter><ref id="field"/></emitter>' for x in (0, 1))
+    inner = mi.load_string(f'<scene version="3.0.0">{medium}{lights}</scene>')
+    assert follows(inner, "field.log_density", -20.0, mi.Point3f(0.3, -3.4, 1.6))
+
+
+def test_shadows_follow_a_stock_medium_that_was_set():
+    body = ('<shape type="sphere" id="body"><bsdf type="null"/><medium type="homogeneous" name="interior">'
+            '<float name="sigma_t" value="4"/></medium></shape>')
+    light = '<emitter type="ntf"><emitter type="point"><point name="position" value="{}, 4, 0"/></emitter>{}</emitter>'
+    inner = mi.load_string('<scene version="3.0.0">' + light.format(0, body) + light.format(1, '<ref id="body"/>')
+                           + "</scene>")
+    key = next(key for key in mi.traverse(inner).keys() if "sigma_t" in key)
+    assert follows(inner, key, 0.0, mi.Point3f(0, -4, 0))
+
+
+def follows(scene, key: str, value: float, point) -> bool:
+    """Return True if each light of a scene is dimmed at a point, and no more once parameter `key` is `value`."""
+    parameters = mi.traverse(scene)
+    it = dr.zeros(mi.SurfaceInteraction3f)
+    it.p = point
+
+    def brightness():
+        return [float(light.sample_direction(it, mi.Point2f(0.5))[1].x[0]) for light in scene.emitters()]
+
+    before = brightness()
+    parameters[key] = 0 * parameters[key] + value
+    parameters.update()
+    return all(b < 0.5 * a for b, a in zip(before, brightness(), strict=True))

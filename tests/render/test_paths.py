@@ -2,6 +2,7 @@
 
 from functools import cache
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import scipy.stats
 from helpers import fields, pictures, scenes, ztest
 
 from mi_ntf.core.architecture import Similarity
+from mi_ntf.render.transport import camera_light
 
 ALBEDO = 0.9
 """Of the furnace: a closed ball that shines and reflects alike everywhere, so that every radiance is a known sum."""
@@ -119,3 +121,19 @@ def test_a_mirrored_lamp_is_dimmed_by_the_field_before_it(smoke, across, chord):
         "ball": pictures.ball(smoke, resolution=128)}, spp=1)  # fmt: skip
     # The sphere's surface cuts voxels of 1/64: 0.013 of optical depth at most.
     np.testing.assert_allclose(image[..., :3], 3 * np.exp(-chord), rtol=0.02)
+
+
+@pytest.mark.parametrize("bsdf", ["diffuse", "conductor"])
+def test_a_single_path_on_a_surface(smoke, monkeypatch, bsdf):
+    """A picture where one camera ray of all meets the surface: the sample of its BSDF ended the process."""
+    widths = []
+    plain = camera_light.join
+    monkeypatch.setattr(camera_light, "join", lambda parts: (
+        widths.append([dr.width(paths.pixel) for paths in parts]), plain(parts))[1])
+    scene = mi.load_dict({
+        "type": "scene", "integrator": {"type": "nrf", "visibility": "raymarch", "max_depth": 3},
+        "sensor": pictures.camera((0, 0, 6), fov=40.0, size=33),
+        "bead": {"type": "sphere", "center": [0, 0, 2], "radius": 0.06, "bsdf": {"type": bsdf}},
+        "field": pictures.ball(smoke, resolution=16), "lamp": {"type": "point", "position": [2, 2, 4]}})
+    assert scenes.render(scene, 0, 1)[..., :3].max() > 0
+    assert widths and all(parts[0] == 1 for parts in widths)

@@ -11,6 +11,7 @@ import trimesh
 from helpers import scenes, ztest
 
 from mi_ntf.core.errors import MiNtfError
+from mi_ntf.infer.convex import planes_of
 from mi_ntf.render.scene.media import find_media
 
 POINT = {"type": "point", "position": [2, 3, 2], "intensity": {"type": "rgb", "value": [30, 25, 20]}}
@@ -317,3 +318,16 @@ def test_the_same_medium_is_sampled_once(blobs):
     parameters[key] = 2.0
     parameters.update()
     assert find_media(loaded)[0].source.majorant == pytest.approx(first.source.majorant / 2)
+
+
+@pytest.mark.parametrize(("outline", "triangles"), [
+    ([(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)], [(0, 1, 2), (0, 2, 3), (0, 3, 4), (0, 4, 5)]),
+    ([(0, 0), (3, 0), (3, 2), (2, 2), (2, 1), (1, 1), (1, 2), (0, 2)],
+     [(0, 1, 4), (0, 4, 5), (0, 5, 6), (0, 6, 7), (1, 2, 3), (1, 3, 4)])], ids=["L", "U"])
+def test_a_step_makes_a_mesh_concave(rng, outline, triangles):
+    """Faces of a step are parallel to the outer ones, whatever their order."""
+    body = trimesh.creation.extrude_triangulation(np.array(outline, float), np.array(triangles), 1.0)
+    for _ in range(20):
+        assert planes_of(body.vertices, body.faces[rng.permutation(len(body.faces))]) is None
+    whole = body.convex_hull
+    assert planes_of(whole.vertices, whole.faces) is not None

@@ -66,3 +66,9 @@ def test_scenes_of_shapes_share_one_emitter():
     ball = mi.load_dict({"type": "sphere"})
     one, other = (surfaces._built([ball]) for _ in range(2))
     assert one.emitters()[0].ptr == other.emitters()[0].ptr
+
+
+def test_nothing_shines_at_depth_0(blobs):
+    lamp = {"lamp": {"type": "sphere", "center": [1.5, 0.5, 0.3], "radius": 0.3, "emitter": {"type": "area"}}}
+    loaded = scenes.scene(blobs, {"type": "nrf", "visibility": "raymarch", "max_depth": 0}, lamp, size=16)
+    assert not scenes.render(loaded)[..., :3].any()

@@ -167,6 +167,30 @@ def test_baked_into_the_file(path, bakes, cache, capsys):
     assert_same(loaded.load(str(copy), None), field)
 
 
+def test_the_fields_of_a_scene_are_baked_as_its_media_ask(path, bakes, cache, tmp_path, capsys):
+    def scene(*resolutions):
+        media = "".join(f'<medium type="nrf" id="{i}"><string name="filename" value="{path}"/>{r}'
+                        f'<transform name="to_world"><translate x="{9 * i}"/></transform></medium>'
+                        f'<shape type="sphere"><transform name="to_world"><translate x="{9 * i}"/></transform>'
+                        f'<point name="center" value="0.4, -0.2, 0.3"/><float name="radius" value="1.5"/>'
+                        f'<bsdf type="null"/><ref name="interior" id="{i}"/></shape>'
+                        for i, r in enumerate(resolutions))
+        file = tmp_path / "scene.xml"
+        file.write_text(f'<scene version="3.0.0"><integrator type="nrf"/>{media}</scene>')
+        return str(file)
+
+    coarse = '<integer name="resolution" value="48"/>'
+    for own, resolution in (("", None), (coarse, 48)):
+        assert cli.main(["bake", scene(own, own), "--baked", "--json"]) == 0
+        count = len(bakes)
+        loaded._load.cache_clear()
+        user_cache.clear()
+        loaded.load(str(path), resolution)
+        assert len(bakes) == count
+    assert cli.main(["bake", scene("", coarse), "--baked"]) == 1
+    assert "differ in resolution" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("change", ["index", "words", "missing", "hull", "version"])
 def test_voxels_in_a_file_that_are_wrong_are_not_used(path, bakes, monkeypatch, change):
     """Crafted ones would be read outside of their memory."""

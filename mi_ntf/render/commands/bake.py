@@ -102,7 +102,12 @@ def bake_fields(path: Path, parameters: dict[str, str], environment: Environment
     if path.suffix != ".safetensors":
         with progress.Stage(f"reading {path}"):
             media = find_media(load_scene(path, parameters, environment))
-        resolutions: dict[str, int | None] = {m.path: m.field.grid.resolution for m in media if m.field.trained}
+        trained = [m for m in media if m.field.trained]
+        resolutions: dict[str, int | None] = {m.path: m.resolution for m in trained}
+        for medium in trained:
+            if medium.resolution != resolutions[medium.path]:
+                raise MiNtfError(f"{path}: media of {medium.path} differ in resolution, but a file holds those of one; "
+                                 "give all the same")
         if not resolutions:
             raise MiNtfError(f"{path} holds no trained field, and voxels of other fields are read as they are; render "
                              "it without baking")

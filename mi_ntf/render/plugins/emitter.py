@@ -33,7 +33,8 @@ derivative with respect to the place of a light of one point or direction, and i
 
 Smoke and fog of Mitsuba (``homogeneous``, ``heterogeneous``) have no bounds of their own. In place of an ``nrf`` medium
 the emitter then holds the shape that they fill, with the medium called ``interior``. A nested shape is not in the
-scene, where stock ``path`` would take it for an opaque surface.
+scene, where stock ``path`` would take it for an opaque surface. If it is there by ``<ref>`` too, change its medium by
+the key of an ``ntf``: Mitsuba tells no emitter of changes by the key of the scene's shape.
 
 The ``nrf`` integrator takes the bare light if the medium is in the scene, since it casts the shadows of media itself.
 Stock ``volpath`` casts them, too, if the medium fills a shape in the scene: give it the bare light.
@@ -59,8 +60,10 @@ tracers).
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
+from weakref import WeakSet
 
 import drjit as dr
 import mitsuba as mi
@@ -77,6 +80,8 @@ from . import properties
 
 T = TypeVar("T")
 
+_emitters_by_caster: dict[int, WeakSet[Any]] = defaultdict(WeakSet)
+"""Emitters by the ``id`` of the medium or shape that casts their shadow. They keep it in memory."""
 NEVER = 1e18
 """Density of every direction that emitter sampling reports, in 1/sr. The power heuristic then gives no weight to light
 on rays of BSDF samples. Its square is still a float32."""
@@ -98,6 +103,7 @@ def emitter_class() -> type:
             self.m_flags = int(self.inner.flags())
             self.m_needs_sample_2 = self.m_needs_sample_3 = False
             self.bare = self._sampled_at_rest = self._changing = False
+            _emitters_by_caster[id(self._caster)].add(self)
             self._prepare()
 
         def _prepare(self) -> None:
@@ -113,9 +119,9 @@ def emitter_class() -> type:
                 self.medium.followers.add(self)
             self._march = building.march(self.medium, None, Options(2 / building.samples(self.medium)))
 
-        def follow(self) -> None:
-            """Make the map of the light anew, if there is one, since the medium has moved."""
-            if REGISTRY[_method_name(self.visibility, self.inner)].sampled:
+        def follow(self, field_changed: bool) -> None:
+            """Adapt to a medium that has moved. Only the map of the light, if there is one, depends on the place."""
+            if field_changed or REGISTRY[_method_name(self.visibility, self.inner)].sampled:
                 self._prepare()
 
         def sample_direction(self, it: mi.Interaction3f, sample: mi.Point2f, active: Mask = True
@@ -191,7 +197,8 @@ def emitter_class() -> type:
             self._changing = True
             mi.Emitter.parameters_changed(self, keys)
             self._changing = False
-            self._prepare()
+            for emitter in _emitters_by_caster[id(self._caster)]:  # Mitsuba tells one of them alone
+                emitter._prepare()
 
         def to_string(self) -> str:
             return f"NTFEmitter[\n  visibility = {self.visibility},\n  emitter = {self.inner}\n]"

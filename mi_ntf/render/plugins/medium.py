@@ -108,10 +108,10 @@ REPRESENTATIONS = ("grid", "network")
 
 
 class Follower(Protocol):
-    """Object that depends on the place of a medium."""
+    """Object that depends on the place and the field of a medium."""
 
-    def follow(self) -> None:
-        """Adapt to the new place."""
+    def follow(self, field_changed: bool) -> None:
+        """Adapt to the new place, and to the new field if it has changed."""
 
 
 class Reflects(Protocol):
@@ -171,10 +171,10 @@ def medium_class(phase_class: type) -> type:
             to_world = read.placement("to_world")
             self._scale = read.number("scale", 1.0, *SCALES)
             self.representation = read.choice("representation", "grid", REPRESENTATIONS)
-            resolution = read.whole("resolution", 0, 16, 1024) or None
+            self.resolution = read.whole("resolution", 0, 16, 1024) or None
             read.flag("sample_emitters", True)
             self.shadow_catcher = read.flag("shadow_catcher", False)
-            self.field: LoadedField = loaded.load(path, resolution)
+            self.field: LoadedField = loaded.load(path, self.resolution)
             if self.shadow_catcher and not self.field.emissive:
                 raise MiNtfError(f"nrf medium: shadow_catcher is true, but {path} emits no light of its own; leave it "
                                  "out, or import the splats with --emissive")
@@ -227,7 +227,7 @@ def medium_class(phase_class: type) -> type:
             if changed or not keys or "to_world" in keys:
                 self._place(np.array(dr.detach(self.to_world).matrix, np.float64).reshape(4, 4))
                 for emitter in self.followers:
-                    emitter.follow()
+                    emitter.follow(changed)
 
         @property
         def parameters(self) -> FieldParameters:

@@ -25,6 +25,9 @@ FEWEST = 4
 """Least number of fields that are one medium. Fewer are media of their own, whose densities each kernel contains."""
 WIDEST = 2.0
 """Largest ratio of sizes in one medium, since cells of a march are as long as the smallest field needs."""
+FARTHEST = 1000.0
+"""Largest extent of one medium, in radii of its smallest field. Single precision then places a point to a twentieth of
+a cell, 1/500 of a radius."""
 MARGIN = 1.002
 """Radius of the sphere around all instances over the least one, since marches leave out rays that graze a sphere."""
 
@@ -51,9 +54,9 @@ class Crowd:
         radius = MARGIN * float((np.linalg.norm(origin - centre, axis=1) + length).max())
         self.frame = Frame(Similarity(tuple(centre), radius), np.eye(4), 1.0)
         rotation = np.array([m.frame.rotation for m in members])
-        sources = list({id(m.source): m for m in members})
-        self.kinds = list({id(m.source): m for m in members}.values())
-        field_index = np.array([sources.index(id(m.source)) for m in members])
+        kinds = {_content(m): m for m in members}
+        self.kinds = list(kinds.values())
+        field_index = np.array([list(kinds).index(_content(m)) for m in members])
         self.copies = Copies((origin - centre) / radius, rotation, length / radius, field_index, module_of(mi.Float))
         self.finest = float(length.min()) / radius
         self._instances = Instances([m.source for m in self.kinds], self.copies, [m.reflectance for m in self.kinds])
@@ -69,6 +72,11 @@ class Crowd:
         return InstancedVisibility(present, self.copies) if present else None
 
 
+def _content(medium: NRFMedium) -> tuple[int, int]:
+    """Return numbers that are the same for media of equal density and reflectance, set values included."""
+    return id(medium.source), id(medium.field)
+
+
 def _kind(medium: NRFMedium) -> tuple[int, ...]:
     """Return numbers that are the same for media that may be one: those of one field, and all opaque baked surfaces."""
     field = medium.field
@@ -76,7 +84,19 @@ def _kind(medium: NRFMedium) -> tuple[int, ...]:
         return 2, id(medium)  # casts shadows on the others of its kind
     if isinstance(medium.source, GridField) and field.softness.opaque and field.phase is None:
         return 0, int(field.retro is None), int(field.tail is None), int(field.grid.gloss > MIN_GLOSS)
-    return 1, id(medium.source)
+    return 1, *_content(medium)
+
+
+def _near(media: list[NRFMedium]) -> list[list[NRFMedium]]:
+    """Return `media` in parts whose extent is at most ``FARTHEST``, halved along the longest side until they are."""
+    places = np.array([m.frame.origin for m in media])
+    low, high = places.min(0), places.max(0)
+    if len(media) < FEWEST or np.linalg.norm(high - low) <= FARTHEST * min(m.frame.length for m in media):
+        return [media]
+    axis = int(np.argmax(high - low))
+    upper = places[:, axis] > (low + high)[axis] / 2
+    halves = ([m for m, u in zip(media, upper, strict=True) if u == side] for side in (False, True))
+    return [part for half in halves for part in _near(half)]
 
 
 def joined(media: Sequence[NRFMedium]) -> list[NRFMedium]:
@@ -88,6 +108,6 @@ def joined(media: Sequence[NRFMedium]) -> list[NRFMedium]:
             groups[-1].append(medium)
         else:
             groups.append([medium])
-    crowds = [Crowd(group) for group in groups if len(group) >= FEWEST]
+    crowds = [Crowd(part) for group in groups for part in _near(group) if len(part) >= FEWEST]
     members = {id(m) for crowd in crowds for m in crowd.members}
     return [m for m in media if id(m) not in members] + [cast(NRFMedium, crowd) for crowd in crowds]

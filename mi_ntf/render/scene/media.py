@@ -23,7 +23,8 @@ class NRFMedium(Protocol):
     """Attributes of the ``nrf`` medium plugin, whose class exists once a variant is set.
 
     `source`: density, of the baked voxels or of the networks, as `representation` says; `path`: the field file;
-    `shadow_catcher`: shadows of others darken the light that the field emits.
+    `resolution`: voxels per side that the scene asks for, None: the default, or a medium of Mitsuba; `shadow_catcher`:
+    shadows of others darken the light that the field emits.
     """
 
     field: LoadedField
@@ -31,6 +32,7 @@ class NRFMedium(Protocol):
     source: Density
     representation: str
     path: str
+    resolution: int | None
     shadow_catcher: bool
 
     @property

@@ -69,6 +69,7 @@ class StockMedium:
     """
 
     representation = "grid"
+    resolution = None
     shadow_catcher = False
 
     def __init__(self, shape: mi.Shape, medium: mi.Medium, name: str) -> None:

@@ -268,12 +268,13 @@ class _CameraLight:
         Returns the paths that scatter there if `lit`.
         """
         index: UInt32 = dr.compress(self.hit.is_valid())
-        if not dr.width(index) or not (lit or surfaces.shining or surfaces.transmitting):
+        shining = surfaces.shining and self.scene.settings.max_depth != 0
+        if not dr.width(index) or not (lit or shining or surfaces.transmitting):
             return []
         paths = replace(camera.take(index), rng=self._random(dr.gather(mi.UInt32, self.number, index), 1))
         hit = dr.gather(type(self.hit), self.hit, index)
         si = hit.compute_surface_interaction(mi.Ray3f(paths.ray))
-        if surfaces.shining and self.first_run:
+        if shining and self.first_run:
             walk.add(paths, si.emitter(self.scene.scene).eval(si))
         if not (lit or surfaces.transmitting):
             return []

@@ -53,6 +53,11 @@ def name(settings: Settings, original: Settings) -> str:
     return settings.visibility + "".join(text for text, applies in details.items() if applies)
 
 
+def is_complete(settings: Settings, march: Settings) -> bool:
+    """Return True if `settings` leave nothing out of the picture by `march`."""
+    return replace(settings, visibility=march.visibility, map_components=march.map_components) == march
+
+
 def _no_bounces(now: Composition) -> Settings | None:
     return replace(now.settings, max_depth=2) if now.effects.bounces else None
 

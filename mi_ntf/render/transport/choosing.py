@@ -18,6 +18,7 @@ import mitsuba as mi
 from ...core.quantities import duration
 from ...infer.visibility import REGISTRY
 from .. import log
+from ..scene.recent import Version
 from ..scene.settings import Limits, Settings
 from . import candidates, effects
 from .bounced import Patches
@@ -48,12 +49,14 @@ class Trial:
 class Choice:
     """Settings to render with, the trials in order, and the best trial; None: no pilot was needed.
 
-    `key`: frames with an equal key are rendered alike.
+    `key`: pictures with an equal key are rendered alike. `method_key`: frames with an equal one share the method if
+    `frames` says so, but not what is left out.
     """
 
     settings: Settings
     trials: Sequence[Trial] = ()
     best: Trial | None = None
+    method_key: tuple[object, ...] = ()
     key: tuple[object, ...] = ()
 
     @property
@@ -89,8 +92,8 @@ class Chooser:
         if not self._limits.error and (named or not self._limits.seconds):
             return self._composed(self._settings), Choice(self._settings)
         first = self._composed(self._settings if named else replace(self._settings, visibility="raymarch"))
-        key = self._settings, self._limits, self._rays, tuple(first.lights.kinds), len(first.lights.rows.power)
-        if self._previous and self._previous.key == key:
+        keys = self._keys(first)
+        if self._previous and self._may_keep(self._previous, first, *keys):
             return self._composed(self._previous.settings), self._previous
         needs = first.effects
         small = PILOT_FRACTION * self._rays * self._settings.frames < RAYS
@@ -113,7 +116,7 @@ class Chooser:
         if self._by_time and each > self._time_left():
             log.warn(f"nrf integrator: time_budget is {duration(self._limits.seconds)}, but one sample a pixel takes "
                      f"about {duration(each)} by {composition.effects.visibility}; that will be rendered")
-        return composition, Choice(composition.settings, self._trials, self._best, key)
+        return composition, Choice(composition.settings, self._trials, self._best, *keys)
 
     def explain(self) -> tuple[Composition, Choice]:
         """Return the same with a prediction even if no limit requires a pilot."""
@@ -122,6 +125,19 @@ class Chooser:
             return composition, choice
         self._begin(composition, composition.effects.reason)
         return composition, replace(choice, best=self._best)
+
+    def _keys(self, first: Composition) -> tuple[tuple[object, ...], tuple[object, ...]]:
+        """Return what the speed of methods follows from, and all that a picture depends on: places, lights, camera."""
+        rows = first.lights.rows
+        method = (self._settings, self._limits, self._rays, tuple(first.lights.kinds), len(rows.power),
+                  tuple(m.field.appearance for m in first.media))
+        return method, (method, Version(self._scene, self._sensor))
+
+    def _may_keep(self, previous: Choice, first: Composition, method_key: tuple[object, ...], key: tuple[object, ...]
+                  ) -> bool:
+        """Return True if the choice for a `previous` picture is one for this picture too."""
+        complete = candidates.is_complete(previous.settings, first.settings)
+        return previous.key == key or (complete and self._settings.frames > 1 and previous.method_key == method_key)
 
     def _composed(self, settings: Settings) -> Composition:
         composition = Composition(self._scene, settings, self._sensor, self._spp, self._patches)

@@ -68,6 +68,9 @@ def _render(context: RenderContext, scene: mi.Scene, sensor: mi.Sensor, seed: in
     if attached and context.aovs:
         raise MiNtfError(f"gradients by {attached[0]} of a field: not supported with aovs, which would leave them out; "
                          "detach it, or render without aovs")
+    if 0 <= context.settings.max_depth < 2 and any(name in aovs.OF_LIGHTS for name in context.aovs):
+        raise MiNtfError(f"nrf integrator: max_depth is {context.settings.max_depth}, at which fields scatter no light "
+                         "and aovs of visibility have no value; give 2 or more, or -1")
     picture = aovs.Picture(camera, context.aovs, context.light_count) if context.aovs else None
     film.prepare(picture.names if picture else [])
     halves = _Halves(film, len(picture.names) if picture else 0)

@@ -171,9 +171,10 @@ class Walk:
         ray, weight, pdf, crossed = surfaces.scatter(si, paths.rng, active)
         weight = paths.weight * weight
         scattered = replace(paths, ray=ray, weight=weight, pdf=pdf)
+        # Kept apart from the next kernel again: LLVM refuses the sample of a single path, fused, and ends the process.
+        dr.eval(ray, weight, pdf, crossed, paths.rng.state)
         if not surfaces.transmitting:
             return scattered, None
-        dr.eval(scattered.ray, weight, pdf, crossed, paths.rng.state)
         straight = replace(paths, ray=ray, weight=weight, distance=paths.distance + si.t)
         straight = straight.take(dr.compress(crossed & (dr.max(weight) > 0)))
         weight = dr.select(crossed, 0, weight)
