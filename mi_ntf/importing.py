@@ -64,7 +64,7 @@ def import_grid(source: Path, output: Path, scale: float = 1.0, albedo: str | No
         if albedo is not None:
             numbers = _numbers(albedo)
             constant = 1.0 if numbers is None else _triple(numbers)
-            grid = Grid(grid.density, grid.bounds, None if numbers else grids.read_albedo(Path(albedo)))
+            grid = Grid(grid.density, grid.bounds, None if numbers else grids.read_albedo(Path(albedo), order))
         if bounds is not None:
             grid = Grid(grid.density, box_of(bounds), grid.albedo)
         contents = of_grid(grids.checked(grid, str(source)), constant, phase, source.name)
@@ -90,6 +90,9 @@ def of_grid(grid: Grid, albedo: ArrayLike = 1.0, phase: float = 0.0, source: str
         raise MiNtfError(f"the phase function's g is {phase:g}, expected −{voxels.MAX_PHASE} to {voxels.MAX_PHASE}")
     density, colour = _at_least_two(grid.density), grid.albedo
     matter = density > 0
+    # A few outliers of a network would take the digits of all others, since voxels have 16 bits.
+    edges = np.ptp(grid.bounds, axis=0) / density.shape[::-1]
+    density = np.minimum(density, np.float32(bricks.OPAQUE / edges.min()))
     reflectance = None
     if colour is not None:
         colour = _at_least_two(colour)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import ctypes
 import json
+import os
 import re
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -49,6 +50,9 @@ def main(args: argparse.Namespace) -> None:
     if args.watch:
         _watch(Path(args.scenes[0]), output, render, args.tev)
         return
+    if output and len(args.scenes) > 1:
+        raise MiNtfError(f"-o {output} is one image, but {len(args.scenes)} scenes are given; leave it out, or render "
+                         "one at a time")
     for scene in args.scenes:
         with progress.Stage(f"rendering {scene}", shown=False):  # Mitsuba's log shows the progress
             render(Path(scene))
@@ -89,9 +93,7 @@ def render_file(path: Path, parameters: dict[str, str], *, sensor_index: int = 0
     if image.suffix.lower() == ".png":
         _write_png(film, image, exposure)
     else:
-        film.write(str(image))
-    if image.suffix.lower() == ".exr":
-        _annotate(image, getattr(scene.integrator(), "achieved", {}))
+        _write_film(film, image, getattr(scene.integrator(), "achieved", {}))
     return film
 
 
@@ -102,6 +104,19 @@ def _destination(film: mi.Film, scene: Path, output: Path | None) -> Path:
     image = scene.with_suffix(suffix) if output is None else output if output.suffix else output.with_suffix(suffix)
     files.check(image, (suffix, ".png"))
     return image
+
+
+def _write_film(film: mi.Film, path: Path, achieved: Mapping[str, object]) -> None:
+    """Write a film in its own format, and an EXR with what `achieved` holds."""
+    with files.replacing(path) as temporary:
+        named = temporary.with_suffix(path.suffix)  # film plugins replace other suffixes
+        try:
+            film.write(str(named))
+            if path.suffix.lower() == ".exr":
+                _annotate(named, achieved)
+            os.replace(named, temporary)
+        finally:
+            named.unlink(missing_ok=True)
 
 
 def _write_png(film: mi.Film, path: Path, exposure: float) -> None:

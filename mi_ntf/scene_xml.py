@@ -111,29 +111,35 @@ class Includes:
                     parent[position : position + 1] = list(content)
                 elif not os.path.isabs(name := include.get("filename", "")):
                     base = next(base for base in folders if (base / substitute(name, self.defaults)).is_file())
-                    include.set("filename", Path(os.path.relpath(base / name, self.folder)).as_posix())
+                    include.set("filename", relative(base / name, self.folder))
         if source.parent != self.folder:
             for element in root.findall("path"):
-                place = os.path.relpath(source.parent / element.get("value", ""), self.folder)
-                element.set("value", Path(place).as_posix())
+                element.set("value", relative(source.parent / element.get("value", ""), self.folder))
 
     def reached(self, root: ET.Element, every: bool = True, source: Path | None = None,
-                folders: tuple[Path, ...] = ()) -> Iterator[ET.Element]:
+                folders: tuple[Path, ...] = (), seen: set[Path] | None = None) -> Iterator[ET.Element]:
         """Yield the contents of all includes in `root`, an element of the inlined main scene, and of theirs.
 
-        With `every`, a name with $parameters stands for all files that it may name, else for that of the defaults.
-        `source` and `folders` are given for included files.
+        With `every`, a name with $parameters stands for all scene files that it may name, else for that of the
+        defaults. `source` and `folders` are given for included files, and `seen`, the files so far.
         """
+        seen = set() if seen is None else seen
         source = source or self.folder / "scene.xml"
         folders = self._folders(root, source, folders)
         for include in root.iter("include"):
             path = self._find(include, source, folders)
             name = pattern(Path(include.get("filename", "")).name)
             for other in sorted(path.parent.iterdir()):
-                if other == path or (every and name.fullmatch(other.name)):
-                    content = self._parse(other)
+                if other == path or (every and other not in seen and name.fullmatch(other.name)):
+                    seen.add(other)
+                    try:
+                        content = self._parse(other)
+                    except MiNtfError:
+                        if other == path:
+                            raise
+                        continue  # a name may fit other files than scenes
                     yield content
-                    yield from self.reached(content, every, other, folders)
+                    yield from self.reached(content, every, other, folders, seen)
 
     def _parse(self, path: Path) -> ET.Element:
         content = parse(path, included=True)
@@ -143,7 +149,7 @@ class Includes:
 
     def _folders(self, root: ET.Element, source: Path, others: tuple[Path, ...]) -> tuple[Path, ...]:
         """Return the folders in which includes of the file `source` are sought: its own, <path>s, and the `others`."""
-        paths = [source.parent / p.get("value", "") for p in reversed(root.findall("path"))]
+        paths = [source.parent / substitute(p.get("value", ""), self.defaults) for p in reversed(root.findall("path"))]
         return source.parent, *paths, *(others or (self.folder,))
 
     def _find(self, include: ET.Element, source: Path, folders: tuple[Path, ...]) -> Path:
@@ -155,23 +161,30 @@ class Includes:
         raise MiNtfError(f"{source}: included file {name!r} does not exist beside it{hint}")
 
 
+def relative(place: Path, folder: Path) -> str:
+    """Return the path of `place` from `folder`, with slashes; links among their folders are followed first."""
+    place, folder = Path(place).absolute(), Path(folder).resolve()
+    return Path(os.path.relpath(place.parent.resolve() / place.name, folder)).as_posix()
+
+
 def move_paths(root: ET.Element, old: Path, new: Path, defaults: dict[str, str],
                moved: ET.Element | None = None) -> None:
     """Rewrite relative paths of the folder `old` for the folder `new`, except that of the element `moved`."""
     if old.resolve() == new.resolve():
         _search_here_first(root)
         return
-    nodes = [(e, "value") for e in root.iter("string") if e.get("name") == "filename"]
+    nodes = [(e, "value") for e in root.iter("string") if e.get("name") in ("filename", "map_file")]
     nodes += [(e, "filename") for e in root.iter() if e.tag in ("include", "spectrum")]
     nodes += [(e, "value") for e in root.iter("path")]
     for element, attribute in nodes:
         value = element.get(attribute, "")
+        meant = substitute(value, defaults)
         # Other files are found by a <path>, which is rewritten itself.
-        if element is not moved and not os.path.isabs(value) and (old / substitute(value, defaults)).exists():
-            element.set(attribute, Path(os.path.relpath(old / value, new)).as_posix())
+        if element is not moved and not os.path.isabs(meant) and (old / meant).exists():
+            element.set(attribute, relative(old / value, new))
     if root.find("include") is not None:
         # Mitsuba looks for the files that an include names in the main scene's folder, so that folder stays known.
-        root.insert(0, ET.Element("path", value=Path(os.path.relpath(old, new)).as_posix()))
+        root.insert(0, ET.Element("path", value=relative(old, new)))
     _search_here_first(root)
 
 

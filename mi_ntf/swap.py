@@ -1,6 +1,5 @@
 """`mi-ntf swap`: copy of a scene in which a field replaces the meshes. It works on XML alone."""
 
-import os
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -42,9 +41,9 @@ def swap(scene: Path, field: Path, out: Path, shapes: str = "", parameters: dict
 
     `shapes` chooses them as the option ``--shapes`` does: by names, by ``not:`` and names, or all ("" by default).
     Shapes that emit light or hold a sensor stay. `parameters` become the defaults of $names. The field sits in one
-    bounding ``sphere``, "field", with a ``null`` BSDF and the centre and radius of the capture. The integrator becomes
-    ``nrf`` with ``<default name="visibility" value="auto"/>``. It keeps `hide_emitters`, the channels of ``aov`` that
-    ``nrf`` has, and `max_depth`, also where it was the old integrator's default.
+    bounding ``sphere``, "field", with a ``null`` BSDF and the centre and radius of the capture. An integrator other
+    than ``nrf`` becomes ``nrf`` with ``<default name="visibility" value="auto"/>``. It keeps `hide_emitters`, the
+    channels of ``aov`` that ``nrf`` has, and `max_depth`, also where it was the old integrator's default.
 
     Sensors, films, emitters, parameters and includes stay. An include that holds shapes or the integrator is inlined,
     with the defaults of ``$parameters`` in its name. BSDFs, textures and groups that nothing refers to any more are
@@ -59,7 +58,7 @@ def swap(scene: Path, field: Path, out: Path, shapes: str = "", parameters: dict
     root = scene_xml.parse(scene)
     scene_xml.set_defaults(root, parameters or {})
     content = _Content(root, scene)
-    sphere = _bounding_sphere(similarity, os.path.relpath(field, out.parent))
+    sphere = _bounding_sphere(similarity, scene_xml.relative(field, out.parent))
     replaced, unchanged = content.replace(shapes, sphere)
     sphere.set("id", content.free_name("field"))
     notes = _replace_integrator(root, content.defaults)
@@ -186,7 +185,7 @@ def _bounding_sphere(similarity: Similarity, filename: str) -> ET.Element:
     ET.SubElement(shape, "float", name="radius", value=repr(similarity.radius))
     ET.SubElement(shape, "bsdf", type="null")
     medium = ET.SubElement(shape, "medium", type="nrf", name="interior")
-    ET.SubElement(medium, "string", name="filename", value=Path(filename).as_posix())
+    ET.SubElement(medium, "string", name="filename", value=filename)
     return shape
 
 
@@ -195,6 +194,8 @@ def _replace_integrator(root: ET.Element, defaults: dict[str, str]) -> list[str]
 
     Returns sentences about what cannot be kept.
     """
+    if any(scene_xml.substitute(e.get("type", ""), defaults) == "nrf" for e in root.findall("integrator")):
+        return []  # of the scene of another field
     new = ET.Element("integrator", type="nrf")
     ET.SubElement(new, "string", name="visibility", value="$visibility")
     old = root.findall("integrator")

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_ntf import cli
+from mi_ntf import cli, launcher
 
 ROOT = Path(__file__).parents[1]
 SCENE = """<scene version="3.0.0">
@@ -68,3 +68,22 @@ def test_git_ignores_pictures_beside_the_shipped_scenes():
     pictures = [str(path.with_suffix(".exr").relative_to(ROOT)) for path in scenes]
     done = subprocess.run(["git", "check-ignore", *pictures], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.stdout.splitlines() == pictures and pictures
+
+
+def test_a_picture_that_cannot_be_written_leaves_the_old_one(scene, monkeypatch, capsys):
+    assert render() == 0
+    image = scene.with_suffix(".exr")
+    before = image.read_bytes()
+
+    def fail(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(launcher, "_annotate", fail)
+    assert render() == 1
+    assert image.read_bytes() == before and "No space left" in capsys.readouterr().err
+    assert {path.name for path in image.parent.glob(f"{image.name}*")} == {image.name}
+
+
+def test_one_image_of_several_scenes_is_refused(scene, capsys):
+    assert render("-o", "both.exr", "scene.xml") == 1
+    assert "is one image, but 2 scenes are given" in capsys.readouterr().err

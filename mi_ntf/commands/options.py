@@ -151,7 +151,9 @@ def print_report(report: Report, as_json: bool, print_table: Callable[[Report], 
     progress.give_way()
     if as_json:
         data = asdict(report) if is_dataclass(report) and not isinstance(report, type) else report
-        print(json.dumps(data, indent=2, default=str))
+        text = json.dumps(data, default=str)
+        # JSON has no NaN and no infinity.
+        print(json.dumps(json.loads(text, parse_constant=lambda _: None), indent=2))
     else:
         print_table(report)
 

@@ -54,9 +54,9 @@ def read_header(path: Path) -> Header | None:
 
 
 def check_stored(image: "Image.Image", path: Path) -> None:
-    """Raise MiNtfError if Pillow would turn the pixels of the `image` of `path` when it loads them."""
+    """Raise MiNtfError if Pillow or OpenCV would turn the pixels of the `image` of `path` when they load them."""
     if image.format == "TIFF" and _orientation(image) != 1:  # Pillow 13 even mixes up the rows of some
-        raise MiNtfError(f"{path}: TIFF of 8 bits with Exif orientation {_orientation(image)} is not read; take the "
+        raise MiNtfError(f"{path}: TIFF with Exif orientation {_orientation(image)} is not read; take the "
                          f"tag out with `exiftool -Orientation= {path}`, which leaves the pixels as they are stored")
 
 

@@ -5,6 +5,7 @@ with its extension in another case, and with any other extension that is read if
 """
 
 import json
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TypeGuard
@@ -95,7 +96,7 @@ def mask_places(masks: Path, name: str) -> list[Path]:
     relative = Path(name)
     if relative.is_absolute() or not relative.name:
         return []
-    if len(relative.parts) > 1 and relative.parts[0].startswith("images"):
+    if len(relative.parts) > 1 and re.fullmatch(r"images(_\d+)?", relative.parts[0]):
         relative = Path(*relative.parts[1:])
     base = masks / relative
     return [*(base.with_name(f"{stem}{end}.png") for end in ("", "_mask", ".mask") for stem in (base.stem, base.name)),

@@ -59,6 +59,7 @@ class Grid:
 def checked(grid: Grid, source: str) -> Grid:
     """Return `grid` in single precision. Raises MiNtfError if a value is out of range or the form is wrong."""
     density = _real(grid.density, f"{source}: the density")
+    density = density[..., 0] if density.ndim == 4 and density.shape[3] == 1 else density
     if density.ndim != 3 or 0 in density.shape:
         raise MiNtfError(f"{source}: the density has the shape {density.shape}, expected three axes, z, y, x")
     _within(density, 0, 1e30, f"{source}: the density", "finite numbers from 0; raw outputs of a network need their "
@@ -99,12 +100,18 @@ def read(path: Path, order: Order = "zyx") -> Grid:
     return checked(grid, str(path))
 
 
-def read_albedo(path: Path) -> np.ndarray:
-    """Read the albedo (z, y, x, channels) of a ``.vol`` or ``.npy`` file; its box is not used. Raises MiNtfError."""
+def read_albedo(path: Path, order: str = "zyx") -> np.ndarray:
+    """Read the albedo (z, y, x, channels) of a ``.vol`` or ``.npy`` file; its box is not used. Raises MiNtfError.
+
+    `order` is that of the axes of ``.npy`` files, zyx or xyz.
+    """
     path = Path(path)
     if not path.is_file() or path.suffix.lower() not in (".vol", ".npy"):
         raise MiNtfError(f"{path} is no albedo; give a number, r,g,b, or a .vol or .npy file of 1 or 3 channels")
-    return _vol_values(path)[0] if path.suffix.lower() == ".vol" else _npy(path)
+    if path.suffix.lower() == ".vol":
+        return _vol_values(path)[0]
+    values = _npy(path)
+    return values.swapaxes(0, 2) if order == "xyz" and values.ndim in (3, 4) else values
 
 
 def write_vol(path: Path, density: np.ndarray, bounds: np.ndarray) -> None:

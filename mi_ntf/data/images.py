@@ -156,6 +156,7 @@ def _read_tiff(path: Path) -> Decoded:
     premultiplied, profile = False, None
     try:
         with exif.open_image(path, ("TIFF",)) as image:
+            exif.check_stored(image, path)
             tags = getattr(image, "tag_v2", {})
             bits, premultiplied = tags.get(258, (1,)), 1 in tags.get(338, ())  # BitsPerSample, ExtraSamples
             profile = image.info.get("icc_profile")

@@ -107,7 +107,7 @@ def check_views(views: list[View], center: np.ndarray | None) -> None:
     """
     c2w = np.stack([v.c2w for v in views])
     place, forward = c2w[:, :3, 3], -c2w[:, :3, 2]
-    if len(views) > 1 and np.ptp(place, axis=0).max() < 1e-5 * np.abs(place).max():
+    if len(views) > 1 and np.ptp(place, axis=0).max() <= 1e-12 * np.abs(place).max():
         raise MiNtfError(f"{views[0].where}: all {len(views)} cameras stand at {place.mean(0).round(4).tolist()}; the "
                          "object must be seen from several places. If these are world-to-camera matrices, invert them")
     center = nearest_point(place, forward) if center is None else center

@@ -130,7 +130,7 @@ def _load(folder: Path, data: DataSet, views: Views, say: Say, size: int | None,
     else:
         (center, radius), source = data.sphere, "'unit_sphere' of the data set"
     poses.check_outside(every(views), center, radius, source)
-    lights = {name: np.stack([v.c2w[:3, 3] if v.light_pos is None else v.light_pos for v in split]).astype(np.float32)
+    lights = {name: np.stack([v.c2w[:3, 3] if v.light_pos is None else v.light_pos for v in split])
               for name, split in views.items()}
     first = views["train"][0]
     if note:

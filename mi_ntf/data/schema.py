@@ -106,7 +106,7 @@ class Split:
     c2w: np.ndarray  # (N, 4, 4) float64, OpenGL axes
     focal: np.ndarray  # (N, 2) fx and fy in pixels, float64
     principal: np.ndarray  # (N, 2) cx and cy in pixels from the top left corner, float64
-    light_pos: np.ndarray  # (N, 3) world units
+    light_pos: np.ndarray  # (N, 3) world units, float64
     light_intensity: np.ndarray  # (N, 3) W/sr
     center: np.ndarray  # (3,); field = (world - center) / radius
     radius: float

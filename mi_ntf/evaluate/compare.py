@@ -29,6 +29,8 @@ def compare(image: Path, reference: Path, picture: Path | None = None) -> Json:
     """
     if picture is not None:
         compare_picture.check(picture)
+        if picture.resolve() in (image.resolve(), reference.resolve()):
+            raise MiNtfError(f"{picture} is one of the images to compare; choose another name for the picture")
     a, b = read_image(image), read_image(reference)
     if a.shape != b.shape:
         raise MiNtfError(f"{image} has {_size(a)} pixels, {reference} has {_size(b)}; render both at one size")
@@ -154,6 +156,9 @@ def _read_png(path: Path) -> np.ndarray:
 
     try:
         with Image.open(path, formats=["PNG"]) as file:
+            if file.mode.startswith("I"):  # Pillow would clip 16 bits of grey to 8
+                grey = np.asarray(file, np.float32)[..., None] / 65535
+                return np.concatenate([np.repeat(metrics.linear(grey), 3, -1), np.ones_like(grey)], -1)
             encoded = np.asarray(file.convert("RGBA"), np.float32) / 255
     except (OSError, SyntaxError) as error:  # Pillow's own type derives from OSError
         raise MiNtfError(f"image {path} is no readable PNG ({error}); make it anew") from None

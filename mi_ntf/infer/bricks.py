@@ -16,6 +16,8 @@ SIDE = 8
 """Cells along an edge of a brick. A brick holds the 9³ voxels around its cells, so neighbours share a face."""
 LINE, LAYER, WORDS = SIDE, SIDE * (SIDE + 1), SIDE * (SIDE + 1) ** 2
 """Words of a line of voxels, of a layer of lines, and of a brick, for each channel."""
+OPAQUE = 16.0
+"""Upper bound of a voxel's optical depth. More would cost digits elsewhere, since voxels have 16 bits."""
 PART = 4096
 """Number of bricks that are packed together."""
 FARTHEST = 15
@@ -162,7 +164,7 @@ def pack(values: np.ndarray, places: np.ndarray, octants: np.ndarray, resolution
     if count:
         low, high = (pick(bound, extreme((0, 2, 3, 4))) for pick, bound, extreme in (
             (np.minimum, low, values.min), (np.maximum, high, values.max)))
-    step = np.maximum(high - low, np.float32(1e-6)) / 0xFFFF
+    step = np.where(high > low, high - low, np.float32(1)) / np.float32(0xFFFF)
     result = np.zeros((count + 1, channels, SIDE + 1, SIDE + 1, SIDE), np.uint32)
     for channel in range(channels):
         for first in range(0, count, PART):  # bounds the memory

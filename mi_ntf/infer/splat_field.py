@@ -10,6 +10,7 @@ from ..core.ops import Tensors
 from ..core.splats import Splats
 from ..core.voxels import Voxels
 from .bake import Progress
+from .bricks import OPAQUE, SIDE
 from .splat_voxels import Lattice, SplatSums
 
 VISIBLE = 1 / 255
@@ -26,8 +27,6 @@ MOST_COLOURS = 192
 """Largest number of the reflectance's voxels along the longest side."""
 COLOUR_BLUR = 0.75
 """Smallest standard deviation of a splat in the reflectance, voxels: wide enough that no density lies outside of it."""
-OPAQUE = 16.0
-"""Upper bound of a voxel's optical depth. More would cost digits elsewhere, since voxels have 16 bits."""
 FAR = 0.01
 """Fraction of the splats on either side, along each axis, that may be far away from the others."""
 MOST_BLOCKS = 64_000
@@ -108,12 +107,14 @@ def lattice_of(splats: Splats, resolution: int | None, longer: float = 1.0, boun
     low, high = (splats.centres - reach).min(0), (splats.centres + reach).max(0)
     if bounds is not None:
         low, high = np.maximum(low, bounds[0]), np.minimum(high, bounds[1])
-    scales = np.sort(splats.scales.astype(np.float64), axis=1)
+    longest = float((high - low).max())
+    # A splat larger than the box, such as one of the sky, has no more weight than the box is wide.
+    scales = np.minimum(np.sort(splats.scales.astype(np.float64), axis=1), longest)
     area = splats.opacities * scales[:, 1] * scales[:, 2]
     order = np.argsort(shortest)
     thin = shortest[order][np.searchsorted(np.cumsum(area[order]), THIN * area.sum())]
-    longest = float((high - low).max())
-    size = longer * (longest / resolution if resolution else max(FINER * thin, longest / MOST_VOXELS))
+    finest = min(max(FINER * thin, longest / MOST_VOXELS), longest / SIDE)
+    size = longer * (longest / resolution if resolution else finest)
     counts = np.ceil((high - low) / size).astype(int) + 6  # the splats' tails, and an empty voxel
     ratio = _ratio(splats, counts, size)
     counts = -(-counts // ratio) * ratio

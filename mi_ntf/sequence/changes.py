@@ -9,9 +9,9 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.errors import MiNtfError
+from ..render.scene.environment_option import KINDS
 from .timeline import Frame, Values
 
-ENVIRONMENTS = ("envmap", "constant", "sunsky")
 AIMED = ("spot", "projector")
 
 
@@ -24,7 +24,7 @@ def apply(nodes: Iterable[mi.parser.SceneNode], frame: Frame) -> None:
     for name, values in frame.lights.items():
         _place_light(_emitter(emitters, name), name, values)
     if frame.environment:
-        _turn_environment([e for e in emitters if e.plugin_name() in ENVIRONMENTS], frame.environment)
+        _turn_environment([e for e in emitters if e.plugin_name() in KINDS], frame.environment)
 
 
 def _place_camera(sensors: Sequence[mi.Properties], camera: Values) -> None:
@@ -36,6 +36,8 @@ def _place_camera(sensors: Sequence[mi.Properties], camera: Values) -> None:
         if not 0 < camera["fov"] < 180:
             raise MiNtfError(f"camera.fov is {camera['fov']:g}, expected an angle above 0 and below 180 degrees")
         props["fov"] = camera["fov"]
+        if "focal_length" in props:
+            del props["focal_length"]
     if "origin" in camera:
         props["to_world"] = _look_at(camera["origin"], camera["target"], camera.get("up", [0.0, 1.0, 0.0]), "camera")
 
@@ -84,13 +86,16 @@ def _place_light(props: mi.Properties, name: str, values: Values) -> None:
 def _turn_environment(emitters: Sequence[mi.Properties], values: Values) -> None:
     if len(emitters) != 1:
         raise MiNtfError(f"the timeline turns the environment, but the scene has {len(emitters)} of them; expected one "
-                         f"emitter among {', '.join(ENVIRONMENTS)}")
+                         f"emitter among {', '.join(KINDS)}")
     axis = values.get("axis", [0.0, 1.0, 0.0])
     if not np.linalg.norm(axis) > 0:
         raise MiNtfError(f"environment.axis is {axis}, expected a vector other than 0")
     props = emitters[0]
     if props.plugin_name() != "constant":
-        props["to_world"] = mi.ScalarTransform4f().rotate(axis, values["degrees"]) @ _to_world(props)
+        turn = mi.ScalarTransform4f().rotate(axis, values["degrees"])
+        props["to_world"] = turn @ _to_world(props)
+        if "sun_direction" in props:  # in the scene's coordinates
+            props["sun_direction"] = np.array(turn @ mi.ScalarVector3f(props["sun_direction"])).tolist()
 
 
 def _to_world(props: mi.Properties) -> mi.ScalarTransform4f:

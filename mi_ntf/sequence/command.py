@@ -76,6 +76,8 @@ def frames_of(timeline_file: Path | None, table: Path | None, fixed: dict[str, s
 def tasks_of(scene: Path, folder: Path, frames: list[Frame], variant: str = "",
              environment: Environment | None = None) -> list[Task]:
     """Return one task for each frame."""
+    if environment and environment.file:
+        environment = replace(environment, file=environment.file.absolute())  # workers may run in another folder
     return [Task(str(scene), str(folder), frame, len(frames), variant, environment) for frame in frames]
 
 

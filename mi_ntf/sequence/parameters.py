@@ -18,7 +18,7 @@ def read(path: str | Path, fixed: dict[str, str] | None = None) -> Timeline:
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
             reader = csv.reader(file, strict=True)
-            rows = [(reader.line_num, row) for row in reader if any(row)]
+            rows = [(reader.line_num, row) for row in reader if row]
     except OSError as error:
         raise MiNtfError(f"parameters {path} cannot be read ({error.strerror}); give a CSV file") from None
     except (csv.Error, UnicodeDecodeError) as error:

@@ -10,7 +10,6 @@ import hashlib
 import json
 import time
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 
 import mitsuba as mi
@@ -19,7 +18,7 @@ from numpy.typing import DTypeLike
 
 from .. import __version__, bridge
 from ..core.errors import MiNtfError, sentence
-from ..render import log, user_cache
+from ..render import user_cache
 from ..render.maps import map_cache
 from ..render.scene import changed, environment_option, scene_file
 from ..render.scene.environment_option import Environment
@@ -94,24 +93,8 @@ def _parsed(task: Task) -> tuple[mi.parser.ParserState, str]:
         changes.apply(state.nodes, task.frame)
         digest = hashlib.sha256(json.dumps([__version__, mi.__version__, task.frame.values()]).encode())
         digest.update(mi.parser.write_string(state).encode())
-        for node in state.nodes:
-            for name in node.props:
-                if "file" in name and node.props.type(name) == mi.Properties.Type.String:
-                    digest.update(_content(Path(log.resolve(node.props[name]))))
+        digest.update(changed.content_of_files(state))
     return state, digest.hexdigest()
-
-
-def _content(path: Path) -> bytes:
-    """Return a hash of a file's content, empty where it is missing: the plugin that needs it raises the error."""
-    if not path.is_file():
-        return b""
-    stat = path.stat()
-    return _hashed(path, stat.st_mtime_ns, stat.st_size)
-
-
-@lru_cache(maxsize=256)
-def _hashed(path: Path, _time: int, _size: int) -> bytes:
-    return hashlib.sha256(path.read_bytes()).digest()
 
 
 def _for_many(state: mi.parser.ParserState, count: int) -> mi.parser.ParserState:

@@ -82,11 +82,12 @@ class Bounced:
         # All photographs at once, three columns each.
         views, count = len(self.power), len(x)
         albedo = networks.reflectance(_tensor(x)).diffuse_albedo(networks.fresnel).cpu().numpy()
-        direct = self._direct(marched, x, normal).transpose(1, 0, 2).reshape(count, -1)
-        light = radiosity.solve(hits.reshape(count, -1), np.tile(albedo, (1, views)), direct, -1)
+        direct = self._direct(marched, x, normal).transpose(1, 0, 2).reshape(count, 3 * views)
+        by_patch = hits.reshape(count, SIDE**2)
+        light = radiosity.solve(by_patch, np.tile(albedo, (1, views)), direct, -1)
         light = np.pad(light, [(0, 1), (0, 0)]).reshape(count + 1, views, 3).transpose(1, 0, 2)
         self.table = torch.as_tensor(np.where(table < 0, count, table))
-        self.open = _tensor(np.append((hits.reshape(count, -1) < 0).mean(1), 1.0))
+        self.open = _tensor(np.append((by_patch < 0).mean(1), 1.0))
         self.light = torch.as_tensor(np.ascontiguousarray(light, np.float32))
 
     def _direct(self, marched: TransmittanceTargets, x: np.ndarray, normal: np.ndarray) -> np.ndarray:

@@ -34,7 +34,7 @@ class Gains:
     @torch.no_grad()
     def resume(self, gains: torch.Tensor) -> None:
         """Go on from the `gains` (views, 3) of an earlier run."""
-        self.logs.copy_(gains.log())
+        self.logs.copy_(gains.clamp(min=1e-6).log())
 
     def all(self) -> torch.Tensor:
         """Return the gains (views, 3)."""

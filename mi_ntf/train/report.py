@@ -90,7 +90,7 @@ def judge(field: FieldView, data: TrainingData, gains: torch.Tensor | None, note
     report["photographs"] = {"moved": round(agreement.moved, 3)}
     if gains is not None:
         names = data.train.names or tuple(map(str, range(len(gains))))
-        values = ([round(v, 4) for v in row] for row in gains.tolist())
+        values = ([float(f"{v:.4g}") for v in row] for row in gains.tolist())
         report["photographs"]["gains"] = dict(zip(names, values, strict=True))
     bounced = field.light.bounced
     if bounced is not None and bounced.room is not None:

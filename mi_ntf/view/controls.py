@@ -252,7 +252,9 @@ class Controls:
             return
         view, center = event.client.camera, self.session.center
         positions = [light.position for light in self.session.lights if light.can_move]
-        reach = max([float(np.linalg.norm(p - center)) for p in positions], default=0.0)
+        if not positions:
+            return
+        reach = max(float(np.linalg.norm(p - center)) for p in positions)
         back = np.array(view.position, np.float64) - center
         back *= (0.5 * reach + reach / np.tan(min(float(view.fov), 2.0) / 2)) / max(float(np.linalg.norm(back)), 1e-9)
         view.position, view.look_at = tuple(center + back), tuple(center)

@@ -1,6 +1,5 @@
 """XML of a scene that was changed in a view."""
 
-import os
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -54,9 +53,9 @@ def save(session: Session, out: Path, environment: Path | None = None, camera: b
     if environment:
         for light in session.lights:
             if light.can_turn:
-                place = os.path.relpath(environment, out.parent)
+                place = scene_xml.relative(environment, out.parent)
                 _replace(_element(root, session, light, values), ("filename", "bitmap"),
-                         ET.Element("string", name="filename", value=Path(place).as_posix()))
+                         ET.Element("string", name="filename", value=place))
     if camera:
         _write_pose(root, session)
     for name in ("visibility", "max_depth"):

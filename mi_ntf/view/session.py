@@ -73,7 +73,7 @@ class Session:
         self.lights = lights_of(self.scene, self.parameters, np.array(self.pose.up))
         context = getattr(self.scene.integrator(), "context", None)
         assert isinstance(context, RenderContext)  # load_scene refuses other integrators than nrf
-        self.settings = self.initial_settings = replace(context.settings, frames=FRAMES)
+        self.settings = self.initial_settings = replace(context.settings, frames=FRAMES, map_file="")
         self._common = [light.number for light in self.lights[MAX_LAYERS:]]
         width, height = (int(n) for n in self.sensor.film().crop_size())
         self.aspect = width / height  # of the scene's own picture

@@ -102,7 +102,10 @@ class Viewer:
     def _preview(self, changes: dict[str, tuple[str, Callable[[], object]]]) -> None:
         kinds = {kind for kind, _ in changes.values()}
         for _, do in changes.values():
-            do()
+            try:
+                do()
+            except (MiNtfError, RuntimeError, OSError) as error:  # such as a file that exists; the picture stays
+                self.tell(f"Error: {sentence(error)}")
         if kinds <= {"shown"}:
             if self._frame is not None:
                 self._display(self._frame)

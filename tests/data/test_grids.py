@@ -223,3 +223,12 @@ def test_openvdb_has_cubes(tmp_path, openvdb):
     """Voxels of three lengths are refused with a remedy."""
     with pytest.raises(MiNtfError, match=r"write a \.vol file"):
         vdb.write(tmp_path / "a.vdb", Z_FIRST, BOX)
+
+
+def test_the_axes_of_an_albedo_are_turned_with_those_of_its_density(tmp_path):
+    np.save(tmp_path / "albedo.npy", np.moveaxis(COLOURS, (0, 1, 2), (2, 1, 0)))
+    np.testing.assert_array_equal(grids.read_albedo(tmp_path / "albedo.npy", "xyz"), COLOURS)
+
+
+def test_a_density_of_one_channel(tmp_path):
+    assert (grids.read(saved(tmp_path, density=Z_FIRST[..., None])).density == Z_FIRST).all()

@@ -149,3 +149,11 @@ def test_photographs_of_200_megapixels(tmp_path, recwarn):
     with pytest.raises(MiNtfError, match=r"a.png: image of mode '1'; write it"):  # its pixels would fill a gigabyte
         images.decode(tmp_path / "a.png")
     assert not recwarn.list
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("tag", [3, 6])
+def test_tiff_that_libraries_would_turn_is_refused(tmp_path, dtype, tag):
+    Image.fromarray(np.zeros((4, 6), dtype)).save(tmp_path / "a.tif", tiffinfo={274: tag})
+    with pytest.raises(MiNtfError, match=f"TIFF with Exif orientation {tag} is not read"):
+        images.decode(tmp_path / "a.tif")

@@ -233,3 +233,11 @@ def test_large_photographs_are_read_one_at_a_time(tmp_path):
     memory, stored = peak(many(tmp_path, "a.jpg", 5, 4000, 3000, k1=0.04, k2=-0.01), 768)
     assert stored == 5 * 768 * 576 * 4
     assert memory < 650e6, f"{memory / 1e6:.0f} MB"
+
+
+def test_masks_of_folders_of_photographs_are_told_apart(tmp_path):
+    """Only `images` and its smaller copies have masks without a folder."""
+    left, right, whole, small = (file_names.mask_places(tmp_path, f"{folder}/a.jpg")
+                                 for folder in ("images_left", "images_right", "images", "images_4"))
+    assert tmp_path / "images_left" / "a.png" in left and not set(left) & set(right)
+    assert whole == small and tmp_path / "a.png" in whole

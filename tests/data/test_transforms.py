@@ -186,3 +186,20 @@ def test_absolute_names_of_another_machine(tmp_path, place):
     assert splits["test"].names == ("images/frame_00015.png",)
     assert f"assumed: 16 photographs are not at the places that {tmp_path}/transforms.json names (first {place}" in (
         messages.replace("\\\\", "\\"))
+
+
+def test_data_sets_far_from_the_origin(tmp_path):
+    """Georeferenced coordinates; a flash at the lens stays there."""
+    forms.nerfstudio(tmp_path)
+    plain = load(tmp_path)[0]["train"]
+
+    def move(data):
+        for frame in data["frames"]:
+            matrix = np.array(frame["transform_matrix"])
+            matrix[:3, 3] += [4.5e5, 5.4e6, 100.0]
+            frame["transform_matrix"] = matrix.tolist()
+
+    edit_file(tmp_path, move)
+    far = load(tmp_path)[0]["train"]
+    np.testing.assert_allclose(far.center - plain.center, [4.5e5, 5.4e6, 100.0], atol=1e-2)
+    np.testing.assert_allclose(far.light_pos, far.c2w[:, :3, 3], rtol=0, atol=1e-6)

@@ -1,11 +1,14 @@
 """Reading images as `mi-ntf compare` does, and its error texts."""
 
+import json
+
 import numpy as np
 import OpenEXR
 import pytest
 from helpers.variants import VARIANT
 from skimage import io
 
+from mi_ntf.commands import options
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.evaluate import metrics
 from mi_ntf.evaluate.compare import compare, compare_arrays, print_table, read_image
@@ -159,3 +162,26 @@ def test_table_shows_every_metric(capsys, monkeypatch):
     assert text.count("0.125") == 3 * len(METRICS) and "HDR-FLIP" in text and "PSNR, dB" in text
     assert "aligned: red, green, blue times 0.5000, 1.0000, 2.0000" in text and "object: 25.0%" in text
     assert "picture: a.png" in text and max(map(len, text.splitlines())) <= 80
+
+
+def test_grey_png_of_16_bits(tmp_path):
+    from PIL import Image
+
+    levels = np.linspace(0, 65535, 64).astype(np.uint16).reshape(8, 8)
+    Image.fromarray(levels).save(tmp_path / "a.png")
+    expected = metrics.linear(levels / np.float32(65535))
+    for channel in range(3):
+        np.testing.assert_allclose(read_image(tmp_path / "a.png")[..., channel], expected, atol=1e-5)
+
+
+def test_the_picture_is_none_of_the_images(tmp_path, rgba):
+    write_exr(tmp_path / "a.exr", rgba)
+    (tmp_path / "b.png").write_bytes(b"kept")
+    with pytest.raises(MiNtfError, match="is one of the images to compare"):
+        compare(tmp_path / "a.exr", tmp_path / "b.png", tmp_path / "b.png")
+    assert (tmp_path / "b.png").read_bytes() == b"kept"
+
+
+def test_figures_that_are_no_numbers_are_null_in_json(capsys):
+    options.print_report({"psnr": float("inf"), "error": float("nan")}, True, print)
+    assert json.loads(capsys.readouterr().out, parse_constant=pytest.fail) == {"psnr": None, "error": None}

@@ -160,3 +160,14 @@ def test_nothing_to_import_is_said_in_a_sentence():
         of_splats(faint)
     with pytest.raises(MiNtfError, match="resolution is 8, expected 16 to 2048"):
         of_splats(splats, 8)
+
+
+def test_a_splat_larger_than_the_box_leaves_the_voxels_fine():
+    """A floater in a box of bounds counts as much as the box is wide, and the box does not grow by its reach."""
+    splats = round_splats()
+    large = Splats(*(np.concatenate([values, values[:1]]) for values in vars(splats).values()))
+    large.scales[-1] = 50.0
+    bounds = np.array([[-1.5] * 3, [1.5] * 3])
+    alone, beside = (of_splats(s, bounds=bounds)[0] for s in (splats, large))
+    assert min(beside.counts) > 0.5 * min(alone.counts)
+    assert (np.abs([beside.low, beside.high]) < 1.9).all()

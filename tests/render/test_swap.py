@@ -397,3 +397,47 @@ def test_mitsuba_loads_a_swapped_scene_from_another_folder(folder):
     scene = mi.load_file(str(out))
     assert scene.environment() is not None and len(scene.emitters()) == 2
     assert scene.sensors()[0].sampler().sample_count() == 64
+
+
+def test_an_absolute_value_of_a_name_stays(folder):
+    (folder / "mesh.xml").write_text(
+        f'<scene version="3.9.0"><default name="env" value="{folder / "env.exr"}"/><shape type="cube"/>'
+        '<emitter type="envmap"><string name="filename" value="$env"/></emitter></scene>')
+    root = _swap(folder, folder.parent / "elsewhere" / "o.xml")
+    assert root.find("emitter/string").get("value") == "$env"
+
+
+def test_paths_follow_the_links_of_folders(folder, tmp_path):
+    """Mitsuba opens ../f.safetensors in the folder that a link leads to."""
+    deep = tmp_path / "real" / "deep"
+    deep.mkdir(parents=True)
+    (tmp_path / "link").symlink_to(deep)
+    root = _swap(folder, tmp_path / "link" / "o.xml")
+    for place in root.findall(".//medium/string[@name='filename']") + root.findall("emitter/string"):
+        assert (deep / place.get("value")).is_file()
+
+
+@pytest.mark.parametrize("name", ["$light.xml", "$light"])
+def test_a_name_of_an_include_that_fits_all_files(folder, name):
+    """It fits the scene itself, files of other forms, and pictures."""
+    (folder / "damaged.xml").write_text("<scene")
+    default = "light_point" if name.endswith(".xml") else "light_point.xml"
+    (folder / "mesh.xml").write_text(
+        f'<scene version="3.9.0"><default name="light" value="{default}"/><include filename="{name}"/>'
+        '<shape type="cube"/></scene>')
+    assert _swap(folder, folder / "o.xml").find("include").get("filename") == name
+
+
+def test_names_in_paths(folder):
+    (folder / "parts").mkdir()
+    (folder / "light_point.xml").rename(folder / "parts" / "light_point.xml")
+    (folder / "mesh.xml").write_text(
+        '<scene version="3.9.0"><default name="dir" value="parts"/><path value="$dir"/>'
+        '<include filename="light_point.xml"/><shape type="cube"/></scene>')
+    assert _swap(folder, folder / "o.xml").find("include") is not None
+
+
+def test_an_nrf_integrator_stays(folder):
+    """Another object of a scene with a field becomes a field too."""
+    kept, notes = integrator(folder, '<integrator type="nrf"><float name="max_error" value="0.02"/></integrator>')
+    assert kept == {"max_error": "0.02"} and not notes

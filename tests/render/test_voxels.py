@@ -220,3 +220,19 @@ def test_voxels_reflect_as_a_surface(tmp_path):
                                       hide_emitters=True) for f in (field, mi_ntf.Field.load(trained)))
     assert expected.mean() > 0.01
     assert abs(found.mean() / expected.mean() - 1) < 0.05
+
+
+def test_outliers_do_not_take_the_digits_of_a_grid():
+    """One voxel of 10⁶ beside a density of 2."""
+    density = np.full((16, 16, 16), 2.0)
+    density[0, 0, 0] = 1e6
+    field = mi_ntf.Field.from_grid(density, bounds=((-1, -1, -1), (1, 1, 1)))
+    assert field.density([[0.5, 0.5, 0.5]]) == pytest.approx(2.0, rel=1e-3)
+
+
+@pytest.mark.parametrize("size", [1e-9, 1e12])
+def test_density_has_the_same_digits_at_any_scale(size):
+    """A cube of edge `size` and optical depth 1."""
+    field = mi_ntf.Field.from_grid(np.full((2, 2, 2), 1 / size), bounds=((0, 0, 0), (size, size, size)))
+    tau = field.transmittance(size * np.array([[0.5, 0.5, -1.0]]), [[0.0, 0.0, 1.0]])
+    assert tau == pytest.approx(np.exp(-1), rel=2e-3)

@@ -17,7 +17,8 @@ from mi_ntf import cli, launcher
 from mi_ntf.core.errors import MiNtfError
 from mi_ntf.evaluate.compare import read_image
 from mi_ntf.render.maps import map_cache
-from mi_ntf.sequence import command, image_file, work
+from mi_ntf.render.scene.environment_option import Environment
+from mi_ntf.sequence import changes, command, image_file, work
 from mi_ntf.sequence.timeline import Frame
 
 CIRCLE = """frames = 4
@@ -246,3 +247,25 @@ def test_killed_three_times_it_ends_as_if_undisturbed(scene, circle, tmp_path):
         process.wait()
     subprocess.run([*program, "killed"], cwd=tmp_path, check=True, capture_output=True)
     assert contents(tmp_path / "killed") == contents(tmp_path / "whole")
+
+
+@pytest.mark.parametrize("kind", ["sunsky", "timed_sunsky"])
+def test_the_sun_turns_with_its_sky(kind):
+    emitter = mi.Properties(kind)
+    emitter["sun_direction"] = [1.0, 0.0, 0.5]
+    changes._turn_environment([emitter], {"axis": [0.0, 0.0, 1.0], "degrees": 90.0})
+    np.testing.assert_allclose(np.array(emitter["sun_direction"]).ravel(), [0, 1, 0.5], atol=1e-6)
+
+
+def test_an_angle_of_view_replaces_a_focal_length():
+    sensor = mi.Properties("perspective")
+    sensor["focal_length"] = "50mm"
+    changes._place_camera([sensor], {"fov": 30.0})
+    assert sensor["fov"] == 30.0 and "focal_length" not in sensor
+
+
+def test_workers_find_an_environment_in_any_folder(scene, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    mi.Bitmap(np.ones((2, 4, 3), np.float32)).write("e.exr")
+    (task,) = command.tasks_of(scene(), tmp_path / "out", [Frame(0)], environment=Environment(Path("e.exr")))
+    assert task.environment.file == tmp_path / "e.exr"

@@ -131,3 +131,10 @@ def test_a_wrong_table_is_one_clear_error(tmp_path, text, says):
         parameters.read(path)
     with pytest.raises(MiNtfError, match="cannot be read"):
         parameters.read(tmp_path / "none.csv")
+
+
+def test_a_line_of_empty_cells_is_a_frame_of_defaults(tmp_path):
+    path = tmp_path / "p.csv"
+    path.write_text("spp,res\n1,8\n,\n\n2,8\n")
+    assert [frame.parameters for frame in parameters.read(path).frames] == [
+        {"spp": "1", "res": "8"}, {}, {"spp": "2", "res": "8"}]

@@ -1,6 +1,7 @@
 """Light that bounces between parts of the object, as the trainer sees it: against closed forms and the renderer."""
 
 import copy
+import dataclasses
 
 import numpy as np
 import pytest
@@ -174,3 +175,12 @@ def test_the_same_patches_as_ever(spheres, light):
     assert torch.equal(again.table, once.table) and torch.equal(again.light, once.light)
     assert len(again.light[0]) - 1 == len(np.unique(again.table[again.table < again.light.shape[1] - 1]))
     assert again.table.shape == (6, *[radiosity.CELLS] * 3)
+
+
+def test_no_skin_in_sight(spheres):
+    """An emptied field has no patches, and no light between them."""
+    networks_, marched = spheres
+    empty = bounced.Bounced(shots.flash(FLASH, marched), POWER)
+    aside = camera_rays(16)
+    empty.update(networks_, marched, dataclasses.replace(aside, o=aside.o + 10.0), 0)
+    assert empty.light.shape == (2, 1, 3) and not empty.light.any()

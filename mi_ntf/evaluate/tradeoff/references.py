@@ -1,5 +1,6 @@
 """References of a study: the same field by a converged ``raymarch``, and the captured mesh, path-traced."""
 
+import math
 import re
 import time
 from collections.abc import Callable
@@ -51,12 +52,15 @@ def _rate(render: Renderer) -> float:
     return max(many - few, 0.1 * many) / 6
 
 
-def choose_shrink(subject: Subject, seconds: float) -> int:
+def choose_shrink(subject: Subject, seconds: float, whole: bool = False) -> int:
     """Return the power of two by which pictures are shrunk, so that a reference takes no more than `seconds`.
 
-    The time is judged by a pilot with a small picture, and pictures are not shrunk further than that.
+    The time is judged by a pilot with a small picture, and pictures are not shrunk further than that. With `whole`,
+    each of their pixels covers whole pixels of the scene's own picture.
     """
     pilot: int = max(1, 2 ** int(np.log2(max(min(subject.size) / SMALLEST, 1))))
+    if whole:
+        pilot = math.gcd(pilot, *subject.size)
     per_sample = _rate(renderer(subject, marched(subject), pilot))
     shrink = pilot
     while shrink > 1 and SAMPLES * per_sample * (2 * pilot / shrink) ** 2 <= seconds:
@@ -129,5 +133,8 @@ def _traced(path: Path, subject: Subject, shrink: int, seconds: float) -> np.nda
     images: list[np.ndarray] = []
     while len(images) < 4 or time.perf_counter() - start < seconds:
         image, *_ = Renderer(scene, scene.integrator())(MESH_SAMPLES, 2 * len(images) + 1)
+        if image.shape[1::-1] != subject.pixels(shrink):
+            raise MiNtfError(f"reference {path} renders {image.shape[1]}×{image.shape[0]} pixels where the study's "
+                             f"scene has {subject.pixels(shrink)}; give both films one size")
         images.append(image)
     return np.stack(images)

@@ -139,7 +139,7 @@ def _pictures(sheet: Page, result: Json, reference: np.ndarray, pictures: Pictur
         pairs = []
         for row in result["ways"]:
             image = pictures[row["way"]].get(str(mark))
-            if image is None or 2 * row["points"][-1]["seconds"] < mark:
+            if image is None or not row["points"] or 2 * row["points"][-1]["seconds"] < mark:
                 continue
             point = [p for p in row["points"] if p["seconds"] <= mark][-1]
             heat = colormaps["inferno"](np.clip(2 * np.abs(image - reference).mean(-1) / rms, 0, 1))[..., :3]

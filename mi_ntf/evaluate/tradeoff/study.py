@@ -36,7 +36,7 @@ class Study:
         self.subject, self.budget = subject, budget
         self._mesh_path = reference or (None if subject.env else references.shipped(subject.path, subject.parameters))
         self._needs_mesh = reference is not None
-        stamp = reference and [str(reference), reference.stat().st_mtime_ns]
+        stamp = self._mesh_path and [str(self._mesh_path), self._mesh_path.stat().st_mtime_ns]
         self.state = State(out, {"scene": subject.key(), "version": __version__, "machine": machine(),
                                  "budget": budget, "reference": stamp})
         self._start: float = time.perf_counter() - max(line.get("clock", 0.0) for line in self.state.lines.values())
@@ -99,7 +99,8 @@ class Study:
         subject, lines, seconds = self.subject, self.state.lines, REFERENCE * self.budget
         if "picture" not in lines:
             self._tell("choice of the picture's size")
-            self._add("picture", {"shrink": references.choose_shrink(subject, seconds / 2)})
+            whole = self._mesh_path is not None
+            self._add("picture", {"shrink": references.choose_shrink(subject, seconds / 2, whole)})
         shrink = lines["picture"]["shrink"]
         width, height = subject.pixels(shrink)
         way = references.marched(subject)

@@ -92,11 +92,13 @@ class Subject:
         return width, height
 
     def key(self) -> str:
-        """Return a hash of the scene's text, with includes and $names inserted, and of its fields."""
+        """Return a hash of the scene's text, with includes and $names inserted, and of its files and fields."""
         state = changed.parsed(self.path, self.parameters)
         environment_option.apply(self.env, state, self.path)
+        with changed.beside(self.path):
+            content = changed.content_of_files(state)
         text = mi.parser.write_string(state)
-        return hashlib.sha256(repr((text, [m.field.digest for m in self.media])).encode()).hexdigest()
+        return hashlib.sha256(repr((text, content, [m.field.digest for m in self.media])).encode()).hexdigest()
 
 
 def shrinker(shrink: int) -> Callable[["Node"], None]:

@@ -62,7 +62,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
-from typing import Any, TypeVar, cast
+from typing import TypeVar, cast
 from weakref import WeakSet
 
 import drjit as dr
@@ -77,10 +77,11 @@ from ..lights.emitter_samples import SHARP, fully_sampled
 from ..maps import building
 from ..scene.media import NRFMedium, medium_inside
 from . import properties
+from .medium import Follower
 
 T = TypeVar("T")
 
-_emitters_by_caster: dict[int, WeakSet[Any]] = defaultdict(WeakSet)
+_emitters_by_caster: dict[int, WeakSet[Follower]] = defaultdict(WeakSet)
 """Emitters by the ``id`` of the medium or shape that casts their shadow. They keep it in memory."""
 NEVER = 1e18
 """Density of every direction that emitter sampling reports, in 1/sr. The power heuristic then gives no weight to light
@@ -198,7 +199,7 @@ def emitter_class() -> type:
             mi.Emitter.parameters_changed(self, keys)
             self._changing = False
             for emitter in _emitters_by_caster[id(self._caster)]:  # Mitsuba tells one of them alone
-                emitter._prepare()
+                emitter.follow(True)
 
         def to_string(self) -> str:
             return f"NTFEmitter[\n  visibility = {self.visibility},\n  emitter = {self.inner}\n]"

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
 from typing import TypeAlias
 
 import mitsuba as mi
 
 from ...core.errors import MiNtfError
+from .. import log
 
 Node: TypeAlias = "mi.parser.SceneNode"
 ParsedScene: TypeAlias = "mi.parser.ParserState"
@@ -29,6 +32,29 @@ def parsed(path: Path, parameters: dict[str, str], strict: bool = True) -> Parse
     """Return the parsed XML file, with `parameters` for its $names."""
     with beside(path):
         return mi.parser.parse_file(_config(strict), str(path), **parameters)
+
+
+def content_of_files(state: ParsedScene) -> bytes:
+    """Return a hash of the content of all files that a parsed scene names; call it within :func:`beside`."""
+    digest = hashlib.sha256()
+    for node in state.nodes:
+        for name in node.props:
+            if "file" in name and node.props.type(name) == mi.Properties.Type.String:
+                digest.update(_content(Path(log.resolve(node.props[name]))))
+    return digest.digest()
+
+
+def _content(path: Path) -> bytes:
+    """Return a hash of a file's content, empty where it is missing: the plugin that needs it raises the error."""
+    if not path.is_file():
+        return b""
+    stat = path.stat()
+    return _hashed(path, stat.st_mtime_ns, stat.st_size)
+
+
+@lru_cache(maxsize=256)
+def _hashed(path: Path, _time: int, _size: int) -> bytes:
+    return hashlib.sha256(path.read_bytes()).digest()
 
 
 def instantiated(path: Path, state: ParsedScene, strict: bool = True) -> mi.Scene:
