@@ -111,6 +111,7 @@ def track(value: object, size: int, name: str) -> Keys | Circle:
 
 
 def _components(value: object, size: int, name: str) -> Array:
+    """Return a value that does not change."""
     parts = value if isinstance(value, list) else [value]
     if len(parts) != size or not all(is_number(p) for p in parts):
         raise MiNtfError(f"{name} is {shown(value)}, expected {'a number' if size == 1 else '[x, y, z]'}, "
@@ -120,7 +121,10 @@ def _components(value: object, size: int, name: str) -> Array:
 
 def _circle(table: Mapping[str, object], name: str) -> Circle:
     check_names(table, ("start", "centre", "axis", "degrees"), name)
-    start, centre, axis = (track(table.get(key, default), 3, f"{name}.{key}").at(0) for key, default in
+    for key in ("start", "centre", "axis"):
+        if isinstance(table.get(key), dict):
+            raise MiNtfError(f"{name}.{key} is {shown(table[key])}, expected [x, y, z]; degrees alone can have keys")
+    start, centre, axis = (_components(table.get(key, default), 3, f"{name}.{key}") for key, default in
                            (("start", None), ("centre", None), ("axis", [0, 1, 0])))
     if not np.linalg.norm(axis) > 0:
         raise MiNtfError(f"{name}.axis is {table['axis']}, expected a vector other than 0")

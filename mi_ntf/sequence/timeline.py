@@ -140,7 +140,7 @@ def _parameter(value: object, name: str) -> Callable[[int], str]:
     keys = value.get("keys") if isinstance(value, dict) else None
     key_values = [k[1] for k in keys if isinstance(k, list) and len(k) == 2] if isinstance(keys, list) else []
     is_step = isinstance(value, dict) and value.get("interpolation", "step") == "step"
-    if isinstance(keys, list) and any(isinstance(v, str | bool) for v in key_values):
+    if isinstance(keys, list) and len(key_values) == len(keys) and any(isinstance(v, str | bool) for v in key_values):
         if not is_step:
             raise MiNtfError(f'{name}: texts cannot be interpolated, so interpolation must be "step"')
         positions = track({"keys": [[k[0], i] for i, k in enumerate(keys)], "interpolation": "step"}, 1, name)

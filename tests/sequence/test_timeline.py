@@ -95,6 +95,9 @@ def test_what_a_timeline_says_of_its_frames(tmp_path):
     ("frames = 2\n[parameters]\na = { keys = [] }", r"parameters.a: keys is \[\]"),
     ("frames = 2\n[parameters]\na = { keys = [[0, 1]], interpolation = 'cubic' }", "interpolation is 'cubic'"),
     ("frames = 2\n[parameters]\na = { keys = [[0, 'x'], [1, 'y']], interpolation = 'linear' }", "texts cannot be"),
+    ("frames = 2\n[parameters]\na = { keys = [[0, 'x'], 5] }", r"parameters.a: keys is \[\[0, 'x'\], 5\]"),
+    ("frames = 2\n[lights.a]\nposition = { start = { keys = [[0, [1, 0, 0]]] }, centre = [0, 0, 0], degrees = "
+     "{ keys = [[0, 0], [1, 9]] } }", r"start is .*, expected \[x, y, z\]; degrees alone can have keys"),
     ("frames = 2\n[camera]\norigin = [0, 0, 1]", "camera needs both origin and target"),
     ("frames = 2\n[lights.a]\nposition = [0, 0]", r"lights.a.position is \[0, 0\], expected \[x, y, z\]"),
     ("frames = 2\n[lights.a]\nposition = [0, 0, nan]", "expected"),
