@@ -259,8 +259,9 @@ def splats(values: Values) -> str:
     """Return the figures of Gaussian splats that were imported as voxels."""
     header = ["splats", "import, s", "import, GiB", "field, MB", "random rays, RMS error", "grazing rays, RMS error",
               "shadow, rel. RMSE", "tracing over atlas, seconds"]
-    rows = [[f"{int(count):,}".replace(",", " "), f"{row['import']['seconds']:.1f}", f"{row['import']['gibibytes']:.2f}",
-             f"{row['import']['megabytes']:.0f}", f"{row['transmittance']['random']:.1e}",
+    rows = [[f"{int(count):,}".replace(",", " "), f"{row['import']['seconds']:.1f}",
+             f"{row['import']['gibibytes']:.2f}", f"{row['import']['megabytes']:.0f}",
+             f"{row['transmittance']['random']:.1e}",
              f"{row['transmittance']['grazing']:.1e}", percent(row["shadow"]),
              f"{row['lookup']['ratio']['median']:.0f} ×"]
             for count, row in values.items()]
