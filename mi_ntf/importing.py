@@ -1,5 +1,6 @@
 """`mi-ntf import`: a grid of another program as a field of voxels."""
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -117,7 +118,7 @@ def print_summary(report: Imported) -> None:
     low, high = ("(" + ", ".join(f"{value:.6g}" for value in corner) + ")" for corner in (report.low, report.high))
     print(f"field: {report.file} ({' × '.join(map(str, report.voxels))} voxels from {low} to {high})",
           f"extinction: up to {report.extinction:.4g} per scene unit; phase function of asymmetry {report.phase:g}",
-          f"next: mi-ntf info {report.file} prints the sphere of the nrf medium", sep="\n")
+          f"next: mi-ntf info {shlex.quote(report.file)} prints the sphere of the nrf medium", sep="\n")
 
 
 def _at_least_two(values: np.ndarray) -> np.ndarray:

@@ -1,5 +1,6 @@
 """`mi-ntf import` of Gaussian splats: a field of voxels of a ``.ply`` or ``.spz`` file."""
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -95,4 +96,4 @@ def print_summary(report: ImportedSplats) -> None:
         corners = ",".join(f"{value:.4g}" for corner in report.crowded for value in corner)
         print(f"note: a few splats are far away from the others and make the box {smaller:.0f} times as long, so its "
               f"voxels may be coarse; --bounds={corners} leaves them out")
-    print(f"next: mi-ntf info {report.file} prints the sphere of the nrf medium")
+    print(f"next: mi-ntf info {shlex.quote(report.file)} prints the sphere of the nrf medium")

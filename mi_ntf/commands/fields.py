@@ -57,7 +57,7 @@ class Capture:
                          workers=self.workers)
         earlier = f", {report['kept']} of them from an earlier run" if report["kept"] else ""
         print(f"photographs: {self.folder} ({report['rendered'] + report['kept']}{earlier})",
-              f"next: mi-ntf train {self.folder} -o field.safetensors --minutes 10", sep="\n")
+              f"next: mi-ntf train {shlex.quote(str(self.folder))} -o field.safetensors --minutes 10", sep="\n")
 
 
 @dataclass

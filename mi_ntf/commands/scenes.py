@@ -1,5 +1,6 @@
 """Commands that render scenes or prepare them: swap, render, view, bake, cache, sequence."""
 
+import shlex
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -35,7 +36,8 @@ class Swap:
         report = swap(self.scene, self.field_file, self.output, self.shapes, parameters)
         for note in report.notes:
             print(f"mi-ntf: {note}", file=sys.stderr)
-        print(report, f"scene: {self.output}", f"next: mitsuba -m llvm_ad_rgb {self.output}", sep="\n")
+        command = shlex.join(["mitsuba", "-m", "llvm_ad_rgb", str(self.output)])
+        print(report, f"scene: {self.output}", f"next: {command}", sep="\n")
 
 
 @dataclass

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -27,7 +28,7 @@ def print_summary(report: Refined) -> None:
     """Print where the field and its page are, and what the refinement has brought."""
     output = Path(report.file)
     print(f"field: {output}", f"page: {output.with_suffix('.html')} (open it in a browser)", verdict(report),
-          f"next: mi-ntf info {output}", sep="\n")
+          f"next: mi-ntf info {shlex.quote(str(output))}", sep="\n")
 
 
 def write(output: Path, report: Refined, before: Sequence[Comparison], after: Sequence[Comparison],
