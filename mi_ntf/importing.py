@@ -79,7 +79,8 @@ def of_grid(grid: Grid, albedo: ArrayLike = 1.0, phase: float = 0.0, source: str
             ) -> tuple[Voxels, Tensors, Tensors | None]:
     """Return header, density and reflectance of a field of voxels, the arguments of :func:`mi_ntf.core.voxels.save`.
 
-    `grid` is a checked one; `albedo` counts where it has none. Raises MiNtfError if a number is out of range.
+    `grid` is a checked one; `albedo` counts where it has none. Extinction is limited to ``bricks.OPAQUE`` over a
+    voxel's shortest edge. Raises MiNtfError if a number is out of range.
     """
     constant = np.asarray(albedo, np.float64)
     if constant.shape not in ((), (1,), (3,)):

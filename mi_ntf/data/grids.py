@@ -100,10 +100,10 @@ def read(path: Path, order: Order = "zyx") -> Grid:
     return checked(grid, str(path))
 
 
-def read_albedo(path: Path, order: str = "zyx") -> np.ndarray:
+def read_albedo(path: Path, order: Order = "zyx") -> np.ndarray:
     """Read the albedo (z, y, x, channels) of a ``.vol`` or ``.npy`` file; its box is not used. Raises MiNtfError.
 
-    `order` is that of the axes of ``.npy`` files, zyx or xyz.
+    `order` is that of the axes of ``.npy`` files.
     """
     path = Path(path)
     if not path.is_file() or path.suffix.lower() not in (".vol", ".npy"):

@@ -107,11 +107,17 @@ def check_views(views: list[View], center: np.ndarray | None) -> None:
     """
     c2w = np.stack([v.c2w for v in views])
     place, forward = c2w[:, :3, 3], -c2w[:, :3, 2]
-    if len(views) > 1 and np.ptp(place, axis=0).max() <= 1e-12 * np.abs(place).max():
+    given = center is not None
+    center = nearest_point(place, forward) if center is None else center
+    to_center = np.zeros_like(place) if center is None else center - place
+    ahead = np.einsum("ni,ni->n", forward, to_center)
+    # Georeferenced coordinates are far larger than the distances of cameras. Without a given centre these count only if
+    # all cameras face it: axes that begin at one place meet there, and rounding puts that point behind some of them.
+    lengths = to_center if given or (ahead > 0).all() else place
+    if len(views) > 1 and np.ptp(place, axis=0).max() <= 1e-5 * np.abs(lengths).max():
         raise MiNtfError(f"{views[0].where}: all {len(views)} cameras stand at {place.mean(0).round(4).tolist()}; the "
                          "object must be seen from several places. If these are world-to-camera matrices, invert them")
-    center = nearest_point(place, forward) if center is None else center
-    if center is not None and (np.einsum("ni,ni->n", forward, center - place) < 0).all():
+    if center is not None and (ahead < 0).all():
         raise MiNtfError(f"{views[0].where}: this and all {len(views)} cameras look away from the object at "
                          f"{center.round(4).tolist()}; OpenGL axes are expected (x right, y up, looks along -z), "
                          "these seem to be OpenCV's: negate the second and third column of every rotation")

@@ -111,7 +111,7 @@ def track(value: object, size: int, name: str) -> Keys | Circle:
 
 
 def _components(value: object, size: int, name: str) -> Array:
-    """Return a value that does not change."""
+    """Return a number or a vector of a timeline as (size,). Raises MiNtfError if it has another form."""
     parts = value if isinstance(value, list) else [value]
     if len(parts) != size or not all(is_number(p) for p in parts):
         raise MiNtfError(f"{name} is {shown(value)}, expected {'a number' if size == 1 else '[x, y, z]'}, "

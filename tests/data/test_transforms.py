@@ -203,3 +203,16 @@ def test_data_sets_far_from_the_origin(tmp_path):
     far = load(tmp_path)[0]["train"]
     np.testing.assert_allclose(far.center - plain.center, [4.5e5, 5.4e6, 100.0], atol=1e-2)
     np.testing.assert_allclose(far.light_pos, far.c2w[:, :3, 3], rtol=0, atol=1e-6)
+
+
+def test_cameras_at_one_place_with_rounding(tmp_path):
+    """World-to-camera matrices with six digits, without the sphere of the object."""
+    forms.nerfstudio(tmp_path)
+
+    def invert(data):
+        for frame in data["frames"]:
+            frame["transform_matrix"] = np.linalg.inv(frame["transform_matrix"]).round(6).tolist()
+
+    edit_file(tmp_path, invert)
+    with pytest.raises(MiNtfError, match=r"cameras stand at .*invert them"):
+        load(tmp_path)

@@ -5,6 +5,7 @@ import time
 import numpy as np
 import pytest
 
+from mi_ntf.core.errors import MiNtfError
 from mi_ntf.view.camera import Pose
 from mi_ntf.view.session import Frame
 from mi_ntf.view.viewer import FAST, REST, SLOW, Viewer
@@ -95,3 +96,17 @@ def test_the_picture_points_to_lights_off_view():
     drag(viewer, previews=1)
     assert not shown[0].any()
     assert shown[1].shape == (512, 512, 3) and shown[1][:, -60:].any() and not shown[1][:, :-60].any()
+
+
+def test_a_refused_action_leaves_the_picture():
+    """Such as saving under a name that exists; the other changes are made."""
+    def refuse():
+        raise MiNtfError("it exists")
+
+    told, shown, done = [], [], []
+    viewer = Viewer(Renderer(), lambda picture, _: shown.append(picture), told.append)
+    drag(viewer, previews=1)
+    viewer.change("save", refuse, "shown")
+    viewer.change("exposure", lambda: done.append(1), "shown")
+    viewer.step()
+    assert done == [1] and len(shown) == 2 and "Error: it exists" in told

@@ -82,7 +82,7 @@ from .medium import Follower
 T = TypeVar("T")
 
 _emitters_by_caster: dict[int, WeakSet[Follower]] = defaultdict(WeakSet)
-"""Emitters by the ``id`` of the medium or shape that casts their shadow. They keep it in memory."""
+"""Emitters by the ``id`` of the medium or shape that casts their shadow. An id is used again once they are gone."""
 NEVER = 1e18
 """Density of every direction that emitter sampling reports, in 1/sr. The power heuristic then gives no weight to light
 on rays of BSDF samples. Its square is still a float32."""
@@ -198,8 +198,11 @@ def emitter_class() -> type:
             self._changing = True
             mi.Emitter.parameters_changed(self, keys)
             self._changing = False
-            for emitter in _emitters_by_caster[id(self._caster)]:  # Mitsuba tells one of them alone
-                emitter.follow(True)
+            before = self.medium.source
+            self._prepare()
+            if self.medium.source is not before:  # Mitsuba tells one alone of the emitters behind a shape
+                for emitter in _emitters_by_caster[id(self._caster)] - {self}:
+                    emitter.follow(True)
 
         def to_string(self) -> str:
             return f"NTFEmitter[\n  visibility = {self.visibility},\n  emitter = {self.inner}\n]"
