@@ -79,8 +79,9 @@ def of_grid(grid: Grid, albedo: ArrayLike = 1.0, phase: float = 0.0, source: str
             ) -> tuple[Voxels, Tensors, Tensors | None]:
     """Return header, density and reflectance of a field of voxels, the arguments of :func:`mi_ntf.core.voxels.save`.
 
-    `grid` is a checked one; `albedo` counts where it has none. Extinction is limited to ``bricks.OPAQUE`` over a
-    voxel's shortest edge. Raises MiNtfError if a number is out of range.
+    `grid` is a checked one; `albedo` counts where it has none. Where a voxel has an optical depth above
+    ``bricks.OPAQUE`` and 65 times the median density, its density is lowered to the larger of both limits. Raises
+    MiNtfError if a number is out of range.
     """
     constant = np.asarray(albedo, np.float64)
     if constant.shape not in ((), (1,), (3,)):
@@ -92,9 +93,10 @@ def of_grid(grid: Grid, albedo: ArrayLike = 1.0, phase: float = 0.0, source: str
         raise MiNtfError(f"the phase function's g is {phase:g}, expected −{voxels.MAX_PHASE} to {voxels.MAX_PHASE}")
     density, colour = _at_least_two(grid.density), grid.albedo
     matter = density > 0
-    # A few outliers of a network would take the digits of all others, since voxels have 16 bits.
-    edges = np.ptp(grid.bounds, axis=0) / density.shape[::-1]
-    density = np.minimum(density, np.float32(bricks.OPAQUE / edges.min()))
+    limit = bricks.OPAQUE / (np.ptp(grid.bounds, axis=0) / density.shape[::-1]).min()
+    if density.max() > limit:
+        # A few outliers of a network would take the digits of all others. The median keeps three of voxels' 16 bits.
+        density = np.minimum(density, np.float32(max(limit, 0xFFFF / 1000 * np.median(density[matter]))))
     reflectance = None
     if colour is not None:
         colour = _at_least_two(colour)

@@ -62,5 +62,5 @@ def test_a_reference_of_another_size_is_refused_before_the_ways(folder, tmp_path
     scene = tmp_path / "mesh.xml"
     scene.write_text((folder / "one.xml").read_text().replace('value="24"', 'value="40"')
                      .replace('value="ball.safetensors"', f'value="{folder}/ball.safetensors"'))
-    with pytest.raises(MiNtfError, match="renders 40×40 pixels where the study's scene has"):
+    with pytest.raises(MiNtfError, match="renders 40×40 pixels where the study's scene has 24×24;"):
         references.captured(ways.Subject(folder / "one.xml", {}), scene, 1, 0.1)

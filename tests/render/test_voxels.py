@@ -230,6 +230,12 @@ def test_outliers_do_not_take_the_digits_of_a_grid():
     assert field.density([[0.5, 0.5, 0.5]]) == pytest.approx(2.0, rel=1e-3)
 
 
+def test_dense_matter_is_no_outlier():
+    """Voxels of optical depth 5000 that are all alike keep their extinction, which rays through corners see."""
+    field = mi_ntf.Field.from_grid(np.full((2, 2, 2), 1e4), bounds=((0, 0, 0), (1, 1, 1)))
+    assert field.density([[0.5, 0.5, 0.5]]) == pytest.approx(1e4, rel=1e-3)
+
+
 @pytest.mark.parametrize("size", [1e-9, 1e12])
 def test_density_has_the_same_digits_at_any_scale(size):
     """A cube of edge `size` and optical depth 1."""

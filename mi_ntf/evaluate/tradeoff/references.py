@@ -133,8 +133,9 @@ def _traced(path: Path, subject: Subject, shrink: int, seconds: float) -> np.nda
     images: list[np.ndarray] = []
     while len(images) < 4 or time.perf_counter() - start < seconds:
         image, *_ = Renderer(scene, scene.integrator())(MESH_SAMPLES, 2 * len(images) + 1)
-        if image.shape[1::-1] != subject.pixels(shrink):
+        width, height = subject.pixels(shrink)
+        if image.shape[:2] != (height, width):
             raise MiNtfError(f"reference {path} renders {image.shape[1]}×{image.shape[0]} pixels where the study's "
-                             f"scene has {subject.pixels(shrink)}; give both films one size")
+                             f"scene has {width}×{height}; give both films one size")
         images.append(image)
     return np.stack(images)
